@@ -87,8 +87,8 @@ def test_probabilities_belong_to_points_not_to_their_order(seed, n):
 def test_averages_equal_a_hand_computation():
     xyz, _, dimensions = scene(1500, 20.0)
     net = net_with()
-    predicted = net.predict(PredictRequest(xyz, dimensions), lambda p: p)
-    (found,) = predicted.blocks
+    request = PredictRequest(xyz, dimensions)
+    (found,) = net.predict(request, lambda p: p)
     columns = scaled(xyz, dimensions, net.inputs, net.mean, net.scale)
     np.testing.assert_allclose(columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5)
     circles = Circles(xyz, TINY.points, net.spacing, columns)
@@ -102,8 +102,8 @@ def test_averages_equal_a_hand_computation():
     for i, part in enumerate(each):
         np.testing.assert_allclose(found.result[i], np.mean(part, axis=0), rtol=1e-9)
         np.testing.assert_allclose(found.variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
-    assert predicted.report.figures["batches"] == len(circles)
-    assert predicted.report.figures["batches_per_point"]["least"] == coverage(circles).min()
+    assert request.report.figures["batches"] == len(circles)
+    assert request.report.figures["batches_per_point"]["least"] == coverage(circles).min()
     assert found.variance[coverage(circles) > 1].max() > 0
 
 
@@ -162,7 +162,7 @@ def test_absurd_weights_give_an_error_not_nan():
     weights = {name: array * np.float32(1e30) for name, array in net.weights.items()}
     xyz, _, dimensions = scene(300, 8.0)
     with np.errstate(all="ignore"), pytest.raises(ModelError, match="not numbers"):
-        dataclasses.replace(net, weights=weights).predict(PredictRequest(xyz, dimensions), lambda p: p)
+        next(dataclasses.replace(net, weights=weights).predict(PredictRequest(xyz, dimensions), lambda p: p))
 
 
 # ---- files ------------------------------------------------------------------------------------------------

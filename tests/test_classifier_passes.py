@@ -194,25 +194,25 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.base.report import Report
-    from pdal_stages.classifier.algorithms import Block, PredictResult
-    from pdal_stages.classifier.passes import Passes
+    from pdal_stages.classifier.algorithms import Block
+    from pdal_stages.classifier.passes import predict
+
+    first = two.passes[0]
 
     class Whole:
-        plan = two.passes[0].plan
+        plan = first.plan
         features = context = None
 
         def predict(self, request, finish):
-            predicted = two.passes[0].predict(request, lambda p: p)
             p = np.zeros((len(request.xyz), 3))
-            for block in predicted.blocks:
+            for block in predict((first,), (3,), (None,), request, lambda p: p):
                 p[block.rows] = block.result
             rows = slice(None) if request.rows is None else request.rows
-            return PredictResult([Block(rows, finish(p[rows]))], Report({"batches": 1}))
+            request.report.figures["batches"] = 1
+            yield Block(rows, finish(p[rows]))
 
     xyz, _, dimensions = other
-    model = type(two)((two.passes[0],), two.classes, two.info)
-    object.__setattr__(model, "algorithm", Passes((Whole(), two.passes[1]), (3, 3)))
+    model = type(two)((Whole(), two.passes[1]), two.classes, two.info)
     same(everything(two, xyz, dimensions), everything(model, xyz, dimensions))
     inner = (np.abs(xyz[:, :2] - 30) < 8).all(axis=1)
     part = everything(model, xyz, dimensions, inner)

@@ -26,8 +26,8 @@ from pdal_stages.classifier import (
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.context import count_shares
 from pdal_stages.classifier.modelfile import shipped
-from pdal_stages.classifier.passes import weighed
-from pdal_stages.classifier.refinement import EVEN, blended, trust
+from pdal_stages.classifier.passes import predict
+from pdal_stages.classifier.refinement import EVEN, Blend, trust, weighed
 from pdal_stages.classifier.trainoptions import MOST_PASSES
 from pdal_stages.features import FeatureEngine
 from pdal_stages.features.cells import WHOLE
@@ -64,7 +64,7 @@ def by_hand(said, grown, before, labeled, trusted):
 
 @given(shares(3), shares(2), st.sampled_from([(2, 6), (2, 17), (17, 64)]), st.floats(0.0, 1.0))
 def test_blended_equals_the_rule(said, grown, labeled, trusted):
-    got = blended(said, grown, BEFORE, labeled, trusted)
+    got = Blend(BEFORE, labeled, trusted)(said, grown)
     assert np.allclose(got.sum(axis=1), 1.0, atol=1e-9) and (got >= 0).all()
     assert np.allclose(got, by_hand(said, grown, BEFORE, labeled, trusted), atol=1e-9)
     codes = sorted({*BEFORE, *labeled})
@@ -74,8 +74,8 @@ def test_blended_equals_the_rule(said, grown, labeled, trusted):
 
 @given(shares(3), shares(3))
 def test_without_trust_the_base_stands(said, grown):
-    assert np.allclose(blended(said, grown, BEFORE, BEFORE, 0.0), said, atol=1e-12)
-    assert np.allclose(blended(said, grown, BEFORE, BEFORE, 1.0), grown, atol=1e-9)
+    assert np.allclose(Blend(BEFORE, BEFORE, 0.0)(said, grown), said, atol=1e-12)
+    assert np.allclose(Blend(BEFORE, BEFORE, 1.0)(said, grown), grown, atol=1e-9)
 
 
 @example(
@@ -83,7 +83,7 @@ def test_without_trust_the_base_stands(said, grown):
 )  # the base knows hardly anything else
 @given(shares(3), shares(2), st.sampled_from([6, 17]), st.floats(0.0, 1.0))
 def test_a_target_alone_changes(said, grown, target, trusted):
-    got = blended(said, grown, BEFORE, (1, target), trusted, target)
+    got = Blend(BEFORE, (1, target), trusted, target)(said, grown)
     codes = sorted({*BEFORE, target})
     assert np.allclose(got.sum(axis=1), 1.0, atol=1e-9)
     others = [code for code in BEFORE if code != target]
@@ -245,9 +245,7 @@ def of_the_base(base, xyz, dimensions):
     """What a base hands on of every point of a cloud without voxels, as it is counted."""
     out = np.empty((len(xyz), len(base.classes)), np.uint16)
     request = PredictRequest(xyz, dimensions)
-    for rows, shares, _ in base.algorithm.predict(
-        request, lambda p: count_shares(weighed(p, base.factors))
-    ).blocks:
+    for rows, shares, _ in predict(*base.asked, request, lambda p: count_shares(weighed(p, base.factors))):
         out[rows] = shares
     return out
 
@@ -287,20 +285,24 @@ def test_two_passes_equal_the_passes_by_hand(base):
 def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monkeypatch):
     from test_classifier_context import reference
 
-    kept, inner = [], foresttraining._ForestTraining._context
+    kept, inner = [], foresttraining._ForestTraining._around
 
-    def keep(self, folds, held_out):
-        kept.append((self, folds, held_out, inner(self, folds, held_out)))
-        return kept[-1][3]
+    def keep(self, number, held_out=(), folds=None):
+        found = inner(self, number, held_out, folds)
+        if number:
+            kept.append((self, folds, held_out, found))
+        return found
 
-    monkeypatch.setattr(foresttraining._ForestTraining, "_context", keep)
+    monkeypatch.setattr(foresttraining._ForestTraining, "_around", keep)
     model = on_top(base, passes=2, voxel=0, n=300)
     ((passes, folds, (forests,), context),) = kept
     (cloud,) = passes.clouds
     xyz, fold = cloud.xyz, folds.points(cloud.xyz, cloud.flight)
     values = computed(passes.features, xyz, cloud.dimensions)
     read = np.hstack([values, (of_the_base(base, xyz, cloud.dimensions) / WHOLE).astype(np.float32)])
-    grown = np.array([forests[k].predict_proba(read[i : i + 1])[0] for i, k in enumerate(fold.tolist())])
+    grown = np.array(
+        [forests[k].forest.predict_proba(read[i : i + 1])[0] for i, k in enumerate(fold.tolist())]
+    )
     own = read[:, values.shape[1] :].astype(float)
     own /= own.sum(axis=1, keepdims=True)
     first = model.passes[-2]

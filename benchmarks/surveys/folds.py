@@ -133,9 +133,7 @@ class LeaveOneOut:
         self, cloud: TrainingCloud, shares: npt.NDArray[np.uint16], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float32]:
         """(m, columns) of some of a cloud's points."""
-        out = np.empty((len(rows), len(CONTEXT.tokens) * len(self.classes)), np.float32)
-        CONTEXT.tables(cloud.xyz, shares).fill(rows, out)
-        return out
+        return CONTEXT.columns_of(cloud.xyz, shares)(rows)
 
     def _training(self, without: str) -> dict[str, Any]:
         """What a model file says of its training."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -12,9 +12,8 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
-from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.algorithms import ArrayRule, Block, Column, InputPlan, PredictRequest, PredictResult
+from ..classifier.algorithms import ArrayRule, Block, Column, InputPlan, PredictRequest
 from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz
 from .circles import Circles, halo_m
@@ -118,8 +117,8 @@ class AlsNet:
 
     def predict(
         self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
-    ) -> PredictResult:
-        """Mean probabilities over all batches a point is in [WM19]; see ``Algorithm.predict``.
+    ) -> Iterator[Block]:
+        """Mean probabilities over all batches a point is in [WM19], through `finish`, in one block.
 
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
@@ -128,13 +127,12 @@ class AlsNet:
             with_returns(self.inputs, request.xyz, request.dimensions, request.threads),
             len(request.xyz),
         )
-        report = Report({name: number for name, number in missing.items() if number})
-        if not request.count:
-            return PredictResult((), report)
-        mean, variance, counted = self._means(request, values)
-        rows = slice(None) if request.rows is None else request.rows
-        report.figures |= counted
-        return PredictResult([Block(rows, finish(mean), variance)], report)
+        figures = request.report.figures
+        figures.update({name: number for name, number in missing.items() if number})
+        if request.count:
+            mean, variance, counted = self._means(request, values)
+            figures.update(counted)
+            yield Block(slice(None) if request.rows is None else request.rows, finish(mean), variance)
 
     def _means(
         self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]

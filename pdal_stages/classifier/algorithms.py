@@ -1,22 +1,28 @@
-"""What a classifier of clouds is, whatever is inside: one interface, and the names under which kinds are known."""
+"""What kinds of classifiers of clouds share: what they are asked and answer, and the names by which they are known.
+
+A kind is a class with ``name``, ``rules`` (of its arrays in a model file; a name that ends in ``*`` stands for many),
+``gives_variance``, ``plan``, ``features`` and ``context`` (None without), ``from_file(entry, arrays, codes)``,
+``to_file(codes)``, ``arrays()`` and ``columns(codes)``. It has ``probabilities(read, rows)`` where it has features, and
+else ``predict(request, finish)``, which yields blocks. What trains it is a module with ``optional_inputs`` (each with the
+dimensions it needs), ``reports_training``, ``own_options(given)``, ``inputs(options)``, ``outputs(options)`` and
+``train(clouds, options, progress)``.
+"""
 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
-from ..base.outputs import Output
 from ..base.report import Report
-from ..features import FeaturePlan
 from ..features.index import CellGrid
 
-#: Each kind by its word in manifests and options: its Algorithm and its Trainer, imported when asked for.
+#: Each kind by its word in manifests and options: its class, and what trains it, imported when asked for.
 ALGORITHMS = {
     "random_forest": (
         "pdal_stages.classifier.featureforest:FeatureForest",
@@ -24,15 +30,12 @@ ALGORITHMS = {
     ),
     "alsnet": ("pdal_stages.alsnet.algorithm:AlsNet", "pdal_stages.alsnet.training"),
 }
+#: A forest on top of other passes, which only training on a base makes.
+REFINED = "refined_forest"
 
 
-#: Passes that training makes by itself, on top of others.
-ON_TOP = {"refined_forest": "pdal_stages.classifier.refinement:RefinedForest"}
-
-
-@dataclass(frozen=True)
-class ArrayRule:
-    """What an algorithm expects of one of its arrays."""
+class ArrayRule(NamedTuple):
+    """What a kind expects of one of its arrays."""
 
     dtypes: tuple[str, ...]  #: allowed types, as NumPy writes them: ``<f4``
     ndim: int  #: number of axes
@@ -72,6 +75,7 @@ class PredictRequest:
     memory_mb: float = 512.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
+    report: Report = field(default_factory=Report)  #: what is counted, complete when all blocks are read
 
     @property
     def count(self) -> int:
@@ -80,106 +84,25 @@ class PredictRequest:
 
 
 class Block(NamedTuple):
-    """Some of the points wanted.
-
-    `rows` index the cloud, `result` is what the asker's function made of their probabilities, `variance` is the
-    (b,) variance of a class's probability where the algorithm has one.
-    """
+    """Some of the points wanted: their rows, what the asker's function made of their probabilities (b, classes), and where
+    the kind has it the variance (b,) of a class's probability."""
 
     rows: Any
     result: Any
     variance: npt.NDArray[np.floating] | None = None
 
 
-@dataclass(eq=False)
-class PredictResult:
-    """Blocks that hold every point wanted once, and what was counted, complete when all blocks are read."""
-
-    blocks: Iterable[Block]
-    report: Report = field(default_factory=Report)
-
-
-class Algorithm(Protocol):
-    """A trained classifier of clouds."""
-
-    name: ClassVar[str]  #: the word in the manifest
-    #: of a model file's arrays; a name that ends in ``*`` stands for many
-    rules: ClassVar[Mapping[str, ArrayRule]]
-    gives_variance: ClassVar[bool]  #: whether its blocks have a variance
-    #: what it computes of the points, which a next pass may share; None where it has its own way
-    features: Any
-
-    @property
-    def plan(self) -> FeaturePlan | InputPlan: ...
-
-    @classmethod
-    def from_file(
-        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
-    ) -> Any:
-        """Made from what a model file says of a pass, everything checked; `codes` are the classes."""
-
-    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
-        """What a model file says of it beside its arrays: what the schema asks of a pass, but for its scores."""
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays a model file stores."""
-
-    def columns(self, codes: Sequence[int]) -> Sequence[Column]:
-        """Its inputs, for people."""
-
-    def predict(
-        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
-    ) -> PredictResult:
-        """Classify.
-
-        Parameters
-        ----------
-        request : PredictRequest
-        finish : function
-            Called with the (b, classes) float64 probabilities of a block, which it may change, in a worker's
-            thread where there are any; its result stands in the block.
-        """
-
-
-class Trainer(Protocol):
-    """How a kind is trained: a module with these functions.
-
-    It says itself what it needs and gives: the rooms above ask it, and know no kind by its name.
-
-    `options` are ``TrainingOptions``, `clouds` ``TrainingCloud``s, and what comes out is a ``Model``: all of them rooms
-    that stand on this one.
-    """
-
-    #: inputs used too where the user names none, and the dimensions that the points must have for each
-    optional_inputs: Mapping[str, tuple[str, ...]]
-    #: whether the record of its training, such as a curve, belongs into a run's report
-    reports_training: bool
-
-    def own_options(self, given: Any) -> Any:
-        """The kind's own options, checked; None where it has none."""
-
-    def inputs(self, options: Any) -> tuple[str, ...]:
-        """Dimensions it uses as inputs, X, Y and Z among them."""
-
-    def outputs(self, options: Any) -> list[Output]:
-        """Files it writes beside the model."""
-
-    def train(self, clouds: Sequence[Any], options: Any, progress: bool) -> Any: ...
-
-
-def algorithm(name: str) -> type[Algorithm]:
+def algorithm(name: str) -> Any:
     """The class of a kind by its name; ModelError where there is none."""
-    if name in ON_TOP:
-        return pkgutil.resolve_name(ON_TOP[name])
-    if name not in ALGORITHMS:
+    if name not in (*ALGORITHMS, REFINED):
         raise ModelError(
             "the model uses an algorithm this release does not know",
             found=repr(name)[:60],
             cure="Update pdal-stages",
         )
-    return pkgutil.resolve_name(ALGORITHMS[name][0])
+    return pkgutil.resolve_name(ALGORITHMS["random_forest" if name == REFINED else name][0])
 
 
-def trainer(name: str) -> Trainer:
+def trainer(name: str) -> Any:
     """What trains a kind, one of :data:`ALGORITHMS`."""
     return pkgutil.resolve_name(ALGORITHMS[name][1])

@@ -9,48 +9,33 @@ costs as much in a dense cloud as in a sparse one.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from ..base.jit import njit
 from ..base.threads import map_blocks
 from ..features.cells import WHOLE, cell_keys, cell_means, take_means
 from ..features.neighborhoods import SIDES
 
-
-@dataclass(frozen=True)
-class ContextKind:
-    """What a word of a context token means: cells in space or columns of them, probabilities or votes."""
-
-    axes: int
-    votes: bool
-    text: str
-
-
-#: Word of a token, which the side of a cell in meters follows.
-CELLS = {
-    "box": ContextKind(3, False, "mean probabilities of the points in 3 x 3 x 3 cells around the point's"),
-    "column": ContextKind(2, False, "mean probabilities of the points in 3 x 3 columns, of any height, around the point's"),
-    "boxvotes": ContextKind(3, True, "share of the points in 3 x 3 x 3 cells whose most probable class it is"),
-    "columnvotes": ContextKind(2, True, "share of the points in 3 x 3 columns whose most probable class it is"),
-}  # fmt: skip
+#: Word of a token, which the side of a cell in meters follows: axes of the cells (3 x 3 x 3 around the point's, or 3 x 3
+#: columns of any height), and whether it reads the share of votes for each class in place of mean probabilities.
+CELLS = {"box": (3, False), "column": (2, False), "boxvotes": (3, True), "columnvotes": (2, True)}
 
 #: The token of the point's own probabilities.
 OWN = "own"
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(NamedTuple):
     """One token's cells."""
 
-    token: str
     side: float
-    kind: ContextKind
+    axes: int
+    votes: bool
 
 
 @dataclass(frozen=True)
@@ -68,10 +53,10 @@ class Context:
         parts = tokens.split(",") if isinstance(tokens, str) else list(tokens)
         return cls(tuple(dict.fromkeys(str(part).strip() for part in parts if str(part).strip())))
 
-    @property
-    def scales(self) -> tuple[Scale, ...]:
-        """The tokens that have cells."""
-        found = []
+    @cached_property
+    def scales(self) -> dict[str, Scale]:
+        """Of the tokens that have cells."""
+        found = {}
         for token in self.tokens:
             match = re.fullmatch(rf"({'|'.join(CELLS)})(\d+(?:\.\d+)?)", token)
             if token != OWN and (match is None or float(match[2]) not in SIDES):
@@ -82,18 +67,18 @@ class Context:
                     f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8",
                 )
             if match:
-                found.append(Scale(token, float(match[2]), CELLS[match[1]]))
-        return tuple(found)
+                found[token] = Scale(float(match[2]), *CELLS[match[1]])
+        return found
 
     @property
     def reach(self) -> float:
         """Meters, along x or y, to the farthest point that can matter."""
-        return 2.0 * max((scale.side for scale in self.scales), default=0.0)
+        return 2.0 * max((scale.side for scale in self.scales.values()), default=0.0)
 
     @property
     def strip(self) -> float:
         """Width in meters of strips such that a point's cells all lie in its own and the two beside it."""
-        return max((scale.side for scale in self.scales), default=SIDES[-1])
+        return max((scale.side for scale in self.scales.values()), default=SIDES[-1])
 
     def names(self, codes: Sequence[int]) -> tuple[str, ...]:
         """Columns, token by token, in each the classes of these codes: ``Probability_2_box0_5``."""
@@ -101,12 +86,10 @@ class Context:
             f"Probability_{code}_{token.replace('.', '_')}" for token in self.tokens for code in codes
         )
 
-    # ---- computing -----------------------------------------------------------------------------------------
-
-    def tables(
+    def columns_of(
         self, xyz: npt.NDArray[np.float64], shares: npt.NDArray[np.uint16], threads: int | None = None
-    ) -> Tables:
-        """Everything that :meth:`Tables.fill` needs for these points.
+    ) -> Callable[[npt.NDArray[np.int64]], npt.NDArray[np.float32]]:
+        """A function that gives the columns of some of these points.
 
         Parameters
         ----------
@@ -117,42 +100,33 @@ class Context:
         """
 
         def means(scale: Scale):
-            return cell_means(xyz[:, : scale.kind.axes], shares, scale.side, scale.kind.votes)
+            return cell_means(xyz[:, : scale.axes], shares, scale.side, scale.votes)
 
-        parts = map_blocks(means, self.scales, threads)
-        return Tables(self.tokens, shares, dict(zip((s.token for s in self.scales), parts, strict=True)))
+        found = map_blocks(means, list(self.scales.values()), threads)
+        cells, classes = dict(zip(self.scales, found, strict=True)), shares.shape[1]
 
+        def columns(points: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+            out = np.empty((len(points), len(self.tokens) * classes), np.float32)
+            for k, token in enumerate(self.tokens):
+                part = out[:, k * classes : (k + 1) * classes]
+                if token == OWN:
+                    part[:] = shares[points] / WHOLE
+                else:
+                    take_means(*cells[token], points, part)
+            return out
 
-@dataclass(frozen=True, eq=False)
-class Tables:
-    """Means of cells, and the cell of each point, for every token."""
+        return columns
 
-    tokens: tuple[str, ...]
-    shares: npt.NDArray[np.uint16]
-    cells: dict[str, tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]]
-
-    def fill(self, points: npt.NDArray[np.int64], out: npt.NDArray[np.float32]) -> None:
-        """Write the columns of some points (rows of what the tables were made of) into `out`."""
-        classes = self.shares.shape[1]
-        for k, token in enumerate(self.tokens):
-            part = out[:, k * classes : (k + 1) * classes]
-            if token == OWN:
-                take_shares(self.shares, points, part)
-            else:
-                take_means(*self.cells[token], points, part)
+    def own(self, columns: npt.NDArray[np.float32], classes: int) -> npt.NDArray[np.float64]:
+        """(n, classes) of these columns: the point's own probabilities."""
+        first = self.tokens.index(OWN) * classes
+        said = columns[:, first : first + classes].astype(np.float64)
+        return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
 
 
 def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
     """Probabilities (n, classes) in 65535ths."""
     return np.rint(np.asarray(probabilities) * WHOLE).astype(np.uint16)
-
-
-@njit
-def take_shares(shares, points, out):
-    """The points' own probabilities."""
-    for i in range(len(points)):
-        for c in range(shares.shape[1]):
-            out[i, c] = float(shares[points[i], c]) / WHOLE
 
 
 def around(

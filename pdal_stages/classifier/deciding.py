@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,85 +83,64 @@ class Prediction:
     report: Report
 
 
-class Decided(NamedTuple):
-    """What was decided of a block of points."""
-
-    code: npt.NDArray[np.uint8]
-    reliability: npt.NDArray[np.floating]
-    margin: npt.NDArray[np.floating]
-    probabilities: npt.NDArray[np.floating] | None
-
-    def taken(self, place: npt.NDArray[np.int64]) -> Decided:
-        """The rows of these places."""
-        probabilities = None if self.probabilities is None else self.probabilities[place]
-        return Decided(self.code[place], self.reliability[place], self.margin[place], probabilities)
-
-
-def decide(p: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], options: PredictionOptions) -> Decided:
-    """The winner of each row of probabilities (n, classes); of equal ones the class that comes first."""
+def decide(
+    p: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], options: PredictionOptions
+) -> dict[str, npt.NDArray[Any]]:
+    """The winner of each row of probabilities (n, classes), of equal ones the first class, and what is asked for."""
     best = p.argmax(axis=1)
     win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
-    lead = win
-    if options.margin and p.shape[1] > 1:
-        lead = win - np.partition(p, -2, axis=1)[:, -2]
-    return Decided(codes[best], win, lead, p if options.probabilities else None)
+    out = {"classification": codes[best], "reliability": win}
+    if options.margin:
+        out["margin"] = win - np.partition(p, -2, axis=1)[:, -2] if p.shape[1] > 1 else win
+    return {**out, "probabilities": p} if options.probabilities else out
 
 
-class Outcome:
-    """The arrays of a :class:`Prediction` while blocks are written into them; `current`: (n,) classes of the points now."""
+def empty(
+    n: int, classes: int, current: npt.NDArray[np.uint8] | None, options: PredictionOptions
+) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a :class:`Prediction` before anything is decided; `current`: (n,) classes of the points now."""
+    out: dict[str, npt.NDArray[Any]] = {
+        "classification": np.zeros(n, np.uint8) if current is None else current.copy(),
+        "reliability": np.zeros(n, np.float32),
+    }
+    asked = {"margin": options.margin, "variance": options.variance}
+    out.update({name: np.zeros(n, np.float32) for name, wanted in asked.items() if wanted})
+    if options.probabilities:
+        out["probabilities"] = np.zeros((n, classes), np.float32)
+    return out
 
-    def __init__(
-        self, n: int, classes: int, current: npt.NDArray[np.uint8] | None, options: PredictionOptions
-    ) -> None:
-        self._current, self._options = current, options
-        self._least = np.full(256, options.reject_below or 0.0, np.float32)
-        for code, limit in (options.limits or {}).items():
-            self._least[code] = max(self._least[code], limit)
-        self.rejected = 0
-        self.classification = np.zeros(n, np.uint8) if current is None else current.copy()
-        self.reliability = np.zeros(n, np.float32)
-        self.margin = np.zeros(n, np.float32) if options.margin else None
-        self.variance = np.zeros(n, np.float32) if options.variance else None
-        self.probabilities = np.zeros((n, classes), np.float32) if options.probabilities else None
 
-    def write(self, rows: Any, decided: Decided, variance: npt.NDArray[np.floating] | None = None) -> None:
-        """Write what is known of a block: `rows` index the cloud."""
-        if self.variance is not None and variance is not None:
-            self.variance[rows] = variance
-        self.reliability[rows] = decided.reliability
-        if self.margin is not None:
-            self.margin[rows] = decided.margin
-        if self.probabilities is not None:
-            self.probabilities[rows] = decided.probabilities
-        low = (
-            self.reliability[rows] < self._least[decided.code]
-        )  # as stored, so that users can find the same points
-        self.rejected += int(np.count_nonzero(low))
-        if self._options.rejected_code is not None:
-            instead: Any = np.uint8(self._options.rejected_code)
+def judged(
+    out: dict[str, npt.NDArray[Any]],
+    asked: npt.NDArray[np.bool_],
+    ignored: int,
+    current: npt.NDArray[np.uint8] | None,
+    options: PredictionOptions,
+    report: Report,
+) -> Prediction:
+    """The result: of the points that were `asked` for (n,) the unsure ones are rejected; so many others were `ignored`."""
+    code = out["classification"]
+    least = np.full(256, options.reject_below or 0.0, np.float32)
+    for one, limit in (options.limits or {}).items():
+        least[one] = max(least[one], limit)
+    low = np.zeros(0, np.int64)
+    if least.any():
+        low = np.flatnonzero(asked & (out["reliability"] < least[code]))
+        if options.rejected_code is not None:
+            code[low] = options.rejected_code
         else:
-            instead = np.uint8(UNCLASSIFIED) if self._current is None else self._current[rows]
-        self.classification[rows] = np.where(low, instead, decided.code)
-
-    def prediction(self, asked: npt.NDArray[np.bool_], ignored: int, counted: Report) -> Prediction:
-        """The result once all blocks are written.
-
-        `asked` (n,) are the points that were to be classified; so many others were `ignored`.
-        """
-        n, count = len(asked), int(np.count_nonzero(asked))
-        code, number = np.unique(self.classification[asked], return_counts=True)
-        report = Report(
-            {
-                "points": n,
-                "classified": count - self.rejected,
-                "rejected": self.rejected,
-                "outside_where": n - ignored - count,
-                **({"ignored": ignored} if ignored else {}),
-                "classes": {str(int(c)): int(m) for c, m in zip(code, number, strict=True)},
-            }
-        )
-        report.merge(counted)
-        return Prediction(
-            self.classification, self.reliability, self.margin, self.probabilities, self.variance,
-            count, self.rejected, report,
-        )  # fmt: skip
+            code[low] = UNCLASSIFIED if current is None else current[low]
+    count, codes = int(np.count_nonzero(asked)), np.bincount(code[asked], minlength=256)
+    whole = Report(
+        {
+            "points": len(asked),
+            "classified": count - len(low),
+            "rejected": len(low),
+            "outside_where": len(asked) - ignored - count,
+            **({"ignored": ignored} if ignored else {}),
+            "classes": {str(one): int(codes[one]) for one in np.flatnonzero(codes).tolist()},
+        }
+    )
+    whole.merge(report)
+    more = {name: out.get(name) for name in ("margin", "probabilities", "variance")}
+    return Prediction(code, out["reliability"], **more, classified=count, rejected=len(low), report=whole)

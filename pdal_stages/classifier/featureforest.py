@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
-from ..base.report import Report
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.index import CellGrid
 from ..features.names import GROUPS, RELATIVE
-from .algorithms import ArrayRule, Block, Column, PredictRequest, PredictResult
-from .context import Context
+from .algorithms import REFINED, ArrayRule, Column, PredictRequest
+from .context import OWN, Context
 from .dimensions import gather, with_returns
 from .forest import Forest
+from .refinement import Blend
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,36 +48,14 @@ class Features:
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Features:
-        """From what a manifest says of a pass; passes that read the same share one object."""
-        keys = ("features", "shape_bins", "copt_threshold", "feature_seed")
-        return shared_features(json.dumps({key: entry[key] for key in keys}))
-
-    def engine(
-        self, xyz: npt.NDArray[np.float64], threads: int | None = None, grid: CellGrid | None = None
-    ) -> FeatureEngine:
-        """What computes them over a cloud; `grid`: its index, where there is one of the right cells."""
-        return FeatureEngine(
-            xyz,
-            self.plan,
-            bins=self.bins,
-            copt_threshold=self.copt_threshold,
-            seed=self.seed,
-            threads=threads,
-            grid=grid if grid is not None and grid.cell == self.plan.cell else None,
+        """From what a manifest says of a pass."""
+        bins = entry["shape_bins"]
+        return cls(
+            FeaturePlan.from_dict(entry["features"]),
+            None if bins is None else ShapeBins.from_dict(bins),
+            entry["copt_threshold"],
+            entry["feature_seed"],
         )
-
-
-@lru_cache(maxsize=4)
-def shared_features(text: str) -> Features:
-    """What a manifest says of features, as JSON."""
-    entry = json.loads(text)
-    bins = entry["shape_bins"]
-    return Features(
-        FeaturePlan.from_dict(entry["features"]),
-        None if bins is None else ShapeBins.from_dict(bins),
-        entry["copt_threshold"],
-        entry["feature_seed"],
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +65,14 @@ class FeatureForest:
     features: Features
     forest: Forest
     context: Context | None = None  #: what it reads of the pass before, after the features
+    blend: Blend | None = None  #: of a forest on top of a base: how it changes what is said before
 
-    name: ClassVar[str] = "random_forest"
     rules: ClassVar[Mapping[str, ArrayRule]] = Forest.rules
     gives_variance: ClassVar[bool] = False
+
+    @property
+    def name(self) -> str:
+        return "random_forest" if self.blend is None else REFINED
 
     @property
     def plan(self) -> FeaturePlan:
@@ -109,13 +88,28 @@ class FeatureForest:
         """Made from what a model file says of a pass, everything checked."""
         features = Features.from_dict(entry)
         context = Context(tuple(entry["context"])) if entry["context"] else None
-        check_names(features.plan, () if context is None else context.names(codes), entry)
-        return cls(features, Forest.from_arrays(arrays, len(entry["feature_names"]), len(codes)), context)
+        blend = None
+        if entry["algorithm"] == REFINED:
+            blend = Blend.from_dict(entry["parameters"], codes)
+            if context is None or OWN not in context.tokens:
+                raise ModelError(f"a refined forest must read '{OWN}'", found=entry["context"][:10])
+        labeled = codes if blend is None else blend.labeled
+        forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labeled))
+        made = cls(features, forest, context, blend)
+        names, expected = entry["feature_names"], [column.name for column in made.columns(codes)]
+        if expected != names or list(made.plan.dimensions) != entry["dimensions"]:
+            odd = [f"'{a}' where '{b}' belongs" for a, b in zip(names, expected, strict=False) if a != b]
+            raise ModelError(
+                "the model's features, or their order, are not those its neighborhoods give in this release",
+                found=odd[0] if odd else f"{len(names)} features, {len(expected)} belong",
+                cure="Train the model again with this release",
+            )
+        return made
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """What a model file says of it beside its arrays."""
         return {
-            "parameters": self.forest.parameters(),
+            "parameters": self.forest.parameters() | ({} if self.blend is None else self.blend.to_dict()),
             "feature_names": [column.name for column in self.columns(codes)],
             "dimensions": list(self.plan.dimensions),
             "context": [] if self.context is None else list(self.context.tokens),
@@ -128,7 +122,7 @@ class FeatureForest:
 
     def classes_before(self, codes: Sequence[int]) -> list[int]:
         """Classes of the pass before, whose probabilities it reads; `codes` are its own."""
-        return list(codes)
+        return list(codes if self.blend is None else self.blend.before)
 
     def columns(self, codes: Sequence[int]) -> list[Column]:
         """The features; a histogram's bins are one feature."""
@@ -158,30 +152,22 @@ class FeatureForest:
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64] | None = None
     ) -> npt.NDArray[np.float64]:
         """Probabilities (b, classes) of points by their features and context; `rows`, which they are, plays no part."""
-        return self.forest.predict_proba(values)
-
-    def predict(
-        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
-    ) -> PredictResult:
-        """Classify; see ``Algorithm.predict``. Not for one that reads context, which :class:`Passes` gives it."""
-        features_here = CloudFeatures(self.features, request)
-        blocks = features_here.blocks(
-            request.rows, lambda values, rows: finish(self.probabilities(values)), progress=request.progress
-        )
-        return PredictResult((Block(rows, result) for rows, result in blocks), features_here.report)
+        grown = self.forest.predict_proba(values)
+        if self.blend is None or self.context is None:
+            return grown
+        return self.blend(self.context.own(values[:, len(self.plan.names) :], len(self.blend.before)), grown)
 
 
 class CloudFeatures:
-    """Features of a request's points, block by block; `report` has what was counted."""
+    """Features of a request's points, block by block; what is counted goes into its report."""
 
     def __init__(self, features: Features, request: PredictRequest) -> None:
         self.features, self._request = features, request
-        self.report = Report()
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
         self._dimensions = with_returns(names, request.xyz, request.dimensions, request.threads)
         _, counted = gather(names, self._dimensions, len(request.xyz), request.rows)
-        self.report.figures.update({name: number for name, number in counted.items() if number})
+        request.report.figures.update({name: number for name, number in counted.items() if number})
 
     def blocks(
         self,
@@ -191,38 +177,30 @@ class CloudFeatures:
         progress: Any = None,
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
         """Yield (rows, ``apply(values, rows)``) for some rows (None: all points); `apply` runs in workers' threads."""
-        asked = self._request
-        if not (len(asked.xyz) if rows is None else len(rows)):
+        asked, features, report = self._request, self.features, self._request.report
+        n = len(asked.xyz)
+        if not (n if rows is None else len(rows)):
             return
         if self._engine is None:
-            self._engine = self.features.engine(asked.xyz, asked.threads, asked.grid)
-        engine = self._engine
-        names, known, n = self.features.plan.dimensions, self._dimensions, len(asked.xyz)
-        yield from engine.blocks(
+            grid = asked.grid
+            self._engine = FeatureEngine(
+                asked.xyz,
+                features.plan,
+                bins=features.bins,
+                copt_threshold=features.copt_threshold,
+                seed=features.seed,
+                threads=asked.threads,
+                grid=grid if grid is not None and grid.cell == features.plan.cell else None,
+            )
+        yield from self._engine.blocks(
             queries=rows,
-            dimensions=lambda some: gather(names, known, n, some)[0],
+            dimensions=lambda some: gather(features.plan.dimensions, self._dimensions, n, some)[0],
             threads=asked.threads,
             memory_mb=max(asked.memory_mb * memory_share, 16.0),
             progress=progress,
             apply=apply,
         )
-        few = engine.report.figures["fewer_than_three"]
-        if any(few.values()):
-            self.report.figures["fewer_than_three"] = {
-                token: number for token, number in few.items() if number
-            }
-        self.report.beyond_halo.update(engine.report.beyond_halo)
-
-
-def check_names(plan: FeaturePlan, context: Sequence[str], entry: Mapping[str, Any]) -> None:
-    """Refuse a pass whose columns are not those its plan and its context give."""
-    names, expected = entry["feature_names"], [*plan.names, *context]
-    if expected == names and list(plan.dimensions) == entry["dimensions"]:
-        return
-    pairs = zip([*names, *entry["dimensions"]], [*expected, *plan.dimensions], strict=False)
-    first = next((f"'{a}' where '{b}' belongs" for a, b in pairs if a != b), None)
-    raise ModelError(
-        "the model's features, or their order, are not those its neighborhoods give in this release",
-        found=first or f"{len(names)} features, {len(expected)} belong",
-        cure="Train the model again with this release",
-    )
+        few = {token: k for token, k in self._engine.report.figures["fewer_than_three"].items() if k}
+        if few:
+            report.figures.setdefault("fewer_than_three", {}).update(few)
+        report.beyond_halo.update(self._engine.report.beyond_halo)

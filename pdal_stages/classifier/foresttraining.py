@@ -6,6 +6,8 @@ import math
 import platform
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,16 +22,16 @@ from ..features.engine import fit_clouds
 from ..features.returns import SOURCES
 from .algorithms import PredictRequest
 from .clouds import TrainingCloud, densities, label_classes, listed
-from .context import Context
-from .dimensions import WHERE_THERE, gather, required, with_returns
-from .featureforest import FeatureForest, Features
+from .context import OWN, Context
+from .dimensions import WHERE_THERE, gather, required
+from .featureforest import CloudFeatures, FeatureForest, Features
 from .forest import Forest, TreeOptions, grow_forest
-from .holdout import BLOCK, FoldForests, Folds, figures, sample_context, split
+from .holdout import BLOCK, Folds, figures, split
 from .model import Model
-from .passes import weighed
-from .refinement import Below, Blend, blended, held_by_base, on_top
+from .passes import FoldForests, sample_context
+from .refinement import Blend, on_top, trust, weighed
 from .sampling import draw_samples
-from .sureness import Sureness, counted
+from .sureness import Sureness
 from .trainoptions import PER_TREE, TrainingOptions, feature_plan
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
@@ -66,30 +68,24 @@ class _ForestTraining:
 
     def __init__(self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> None:
         self.started = time.perf_counter()
-        self.clouds, self.options, self.progress = clouds, options, progress
-        _check_groups(clouds, options)  # before any work: a dimension may be missing
-        plan = feature_plan(options)
+        self.clouds, self.options, self.base = clouds, options, options.base
+        self.progress = partial(Progress, enabled=progress)
+        if options.groups and required((options.groups,)) != (options.groups,):
+            raise OptionError(
+                "'groups' must name a dimension other than coordinates and what is made of them",
+                found=options.groups,
+            )
+        for cloud in clouds if options.groups else ():  # before any work: it may be missing
+            gather((options.groups,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name)
         self.labeled = label_classes(clouds, options, progress)
         self.codes = self.labeled.classes.codes
         self.flights = [cloud.flight for cloud in clouds]
         shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds]
         total = sum(map(len, clouds)) * (1 + len(self.codes))  # which are read for each class
-        with Progress(total, "drawing samples", enabled=progress) as bar:
+        with self.progress(total, "drawing samples") as bar:
             self.samples = draw_samples(
                 self.labeled, len(self.codes), options.count, options.seed, shares, progress=bar
             )
-        used = [clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
-        bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
-        self.features = Features(plan, bins, threshold, options.seed)
-        self.context = Context(tuple(options.context))
-        self.counts: dict[str, int] = {}
-        self.own = self._features_of_samples()
-        self.below = (
-            None if options.base is None else Below(options.base, clouds, self.samples, options, progress)
-        )
-        #: What the first pass reads of the samples.
-        self.first = self.own if self.below is None else _beside(self.own, self.below.columns)
-        self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
         weight = self.samples.weight
         drawn = np.bincount(self.samples.label, weight, len(self.codes))
         frequent = np.array(self.samples.available) / drawn
@@ -97,6 +93,21 @@ class _ForestTraining:
         self.stands_for = weight * frequent[self.samples.label]
         factors = frequent**options.prior_weight
         self.factors = factors / factors.max() if options.prior_weight else None
+        self.counts: dict[str, int] = {}
+        plan = feature_plan(options)
+        used = [clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
+        bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
+        self.features = Features(plan, bins, threshold, options.seed)
+        self.own = self._features_of_samples()
+        context = Context(tuple(options.context))
+        self.reads: list[Context | None] = [None, *[context] * (options.passes - 1)]
+        self.blends = self._blends()
+        #: What the first pass reads of the samples.
+        self.first = self.own
+        if self.base is not None:  # which has not seen their labels, so no ground need be held out
+            self.reads[0] = context if options.passes == 1 else Context((OWN,))
+            self.first = _beside(self.own, self._around(0))
+        self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
         share = options.max_samples
         if share is None:
             share = min(1.0, PER_TREE * len(self.codes) / int(weight.sum()))
@@ -105,12 +116,7 @@ class _ForestTraining:
 
     def _features_of_samples(self) -> npt.NDArray[np.float32]:
         """(samples, features), filled cloud by cloud."""
-        o, samples, names, own = (
-            self.options,
-            self.samples,
-            self.features.plan.names,
-            self.features.plan.dimensions,
-        )
+        o, samples, names = self.options, self.samples, self.features.plan.names
         if (needed := 4 * len(samples) * len(names)) > free_memory():
             raise OptionError(
                 f"{len(samples):,} samples of {len(names)} features do not fit into the free memory",
@@ -118,22 +124,20 @@ class _ForestTraining:
                 cure="Lower 'count', or use fewer neighborhoods or features",
             )
         values = np.empty((len(samples), len(names)), np.float32, order="F")
-        with Progress(len(samples), "features of the samples", enabled=self.progress) as bar:
+        with self.progress(len(samples), "features of the samples") as bar:
             for number, cloud in enumerate(self.clouds):
                 at, rows = samples.of_cloud(number)
                 if not len(at):
                     continue
-                engine = self.features.engine(cloud.xyz, o.threads)
-                there = with_returns(own, cloud.xyz, cloud.dimensions, o.threads)
-                fed, counts = gather(own, there, len(cloud), rows, cloud.name)
-                if cloud.own is not None:
-                    counts[SHORT] = 0
-                for part, block in engine.blocks(
-                    queries=rows, dimensions=fed, threads=o.threads, memory_mb=o.memory_mb, progress=bar
-                ):
+                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb)
+                computed = CloudFeatures(self.features, request).blocks(
+                    rows, lambda block, _: block, 1.0, bar
+                )
+                for part, block in computed:
                     values[at[np.searchsorted(rows, part)]] = block
+                counts = {k: n for k, n in request.report.figures.items() if isinstance(n, int)}
                 if cloud.own is not None:
-                    counts[SHORT] = max(engine.report.beyond_halo.values(), default=0)
+                    counts[SHORT] = max(request.report.beyond_halo.values(), default=0)
                 for key, n in counts.items():
                     self.counts[key] = self.counts.get(key, 0) + n
         bad = ~np.isfinite(values).all(axis=0)
@@ -141,9 +145,23 @@ class _ForestTraining:
             raise DimensionError(f"the feature {names[int(bad.argmax())]} is not finite for some samples")
         return values
 
+    def _blends(self) -> Sequence[Blend | None]:
+        """What each pass on top of a base makes of the one before."""
+        o = self.options
+        out: list[Blend] = []
+        if self.base is None:
+            return [None] * o.passes
+        before, trusted = self.base.codes.tolist(), trust(int(np.bincount(self.samples.label).min()))
+        for _ in range(o.passes):
+            out.append(Blend(tuple(before), tuple(self.codes), trusted, o.target))
+            before = out[-1].codes
+        if o.passes > 1 and self.factors is not None:  # a few labels say nothing of how frequent a class is
+            out[-1] = replace(out[-1], factors=tuple(self.factors.tolist()))
+        return out
+
     def model(self) -> Model:
         """Score, grow, and put together."""
-        o = self.options
+        o, base = self.options, self.base
         timed = {"features": time.perf_counter() - self.started}
         validation, notes = self._validate()
         started = time.perf_counter()
@@ -164,7 +182,7 @@ class _ForestTraining:
                 "min_samples_leaf": o.min_samples_leaf,
                 **({"pass_folds": o.pass_folds} if o.passes > 1 else {}),
                 **notes,
-                **(held_by_base(self.below, self.codes) if self.below else {}),
+                **self._held_by_base(),
                 **{key: n for key, n in self.counts.items() if n},
             },
             "priors": priors,
@@ -176,9 +194,18 @@ class _ForestTraining:
         }
         if validation is not None and self.sureness.right:
             info["sureness"] = self.sureness.to_dict()
-        names = list(zip(self.codes, self.labeled.classes.names, strict=True))
-        made = Model(tuple(forests), names, info, timed)
-        return made if self.below is None else on_top(self.below, made)
+        names = dict(zip(self.codes, self.labeled.classes.names, strict=True))
+        if base is None:
+            return Model(tuple(forests), list(names.items()), info, timed)
+        codes = self._codes_after(o.passes - 1)
+        names |= dict(base.classes)
+        classes = [(code, names[code]) for code in codes]
+        return Model((*base.passes, *forests), classes, on_top(base, info, names, codes), timed)
+
+    def _codes_after(self, number: int) -> Sequence[int]:
+        """The classes of a pass."""
+        blend = self.blends[number]
+        return self.codes if blend is None else blend.codes
 
     def _grow(
         self, values: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], trees: int, bar: Progress
@@ -199,7 +226,7 @@ class _ForestTraining:
         OptionError where so few samples are left that fewer classes have any than are `needed`.
         """
         label, weight, count = self.samples.label, self.samples.weight, int(fold.max()) + 1
-        with Progress(count * self.fold_trees, what, "trees", enabled=self.progress) as bar:
+        with self.progress(count * self.fold_trees, what, "trees") as bar:
             for number in range(count):
                 train, rows = split(self.xy, fold, number, gap)
                 there = np.bincount(label[train], minlength=len(self.codes)) > 0
@@ -219,8 +246,11 @@ class _ForestTraining:
         o, samples, codes = self.options, self.samples, self.codes
         if o.folds == 0:
             return None, {}
-        folds, gap = o.folds or 5, _gap(self.features.plan)
-        group = samples.take(lambda number: _groups(self.clouds[number], o))
+        folds, gap = (
+            o.folds or 5,
+            max((one.reach or 0.0 for one in self.features.plan.neighborhoods), default=0.0),
+        )
+        group = samples.take(self._groups)
         names, index = np.unique(group, return_inverse=True)
         asked = {"groups": o.groups} if o.groups else {}
         for by in (["groups" if o.groups else "surveys"] if len(names) > 1 else []) + ["blocks"]:
@@ -228,15 +258,13 @@ class _ForestTraining:
             here = 0.0 if by == "surveys" else gap  # which do not see each other, whatever their coordinates
             try:
                 if by == "blocks":
-                    fold = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK).points(
-                        self.xy
-                    )
+                    blocks = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK)
+                    fold = blocks.points(self.xy)
                 else:
                     fold = (index % folds).astype(np.int16)
                 matrix = np.zeros((len(codes), len(codes)), np.int64)
-                for rows, forest in self._without_each(
-                    self.first, fold, "cross-validation", here, len(codes)
-                ):
+                each = self._without_each(self.first, fold, "cross-validation", here, len(codes))
+                for rows, forest in each:
                     p = forest.predict_proba(self.first[rows])
                     np.add.at(matrix, (samples.label[rows], p.argmax(axis=1)), samples.weight[rows])
                     self._count_sure(rows, p)
@@ -250,27 +278,32 @@ class _ForestTraining:
             return {"by": by, **asked, **more}, {}
         return None, {"unscored": self._unscored(reason, gap)}
 
+    def _groups(self, number: int) -> npt.NDArray[Any]:
+        """What a cloud's points are held out with: their `groups`, or all of them with the survey."""
+        cloud, name = self.clouds[number], self.options.groups
+        if not name:
+            return np.broadcast_to(np.array(cloud.flight), len(cloud))
+        return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[0][name]
+
     def _count_sure(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
         """Count in how far samples that were held out were right where they were sure, as the points lie."""
-        codes: Sequence[int] = self.codes
-        if self.below is None:
+        blend = self.blends[0]
+        if blend is None:
             p = weighed(p, self.factors)
         elif self.options.target is not None:
             return  # what the others truly are is not known
         else:
-            before = self.below.base.codes.tolist()
-            p = blended(self.below.own[rows], p, before, codes, self.below.trusted)
-            codes = sorted({*before, *codes})
+            p = replace(blend, factors=None)(self._said_by_base(rows), p)
+        given = np.asarray(self._codes_after(0))[p.argmax(axis=1)]
         true = np.asarray(self.codes)[self.samples.label[rows]]
-        counted(p, codes, true, self.stands_for[rows], self.sureness)
+        self.sureness.add(given, true, p.max(axis=1), self.stands_for[rows])
 
     def _unscored(self, reason: str, gap: float) -> str:
         """Why there is no score, and which class to label next, and where not: that of the fewest blocks of ground."""
         cell = np.floor(self.xy / BLOCK)
         mine = [self.samples.label == place for place in range(len(self.codes))]
         least = int(np.argmin([len(np.unique(cell[one], axis=0)) for one in mine]))
-        low, high = self.xy[mine[least]].min(axis=0), self.xy[mine[least]].max(axis=0)
-        x, y = (low + high) / 2
+        x, y = (self.xy[mine[least]].min(axis=0) + self.xy[mine[least]].max(axis=0)) / 2
         return (
             f"there is no score on ground held out: {reason}. Label next, at least {BLOCK + gap:.0f} m away: "
             f"{self.codes[least]} {self.labeled.classes.names[least]}, which lies around {x:.0f}, {y:.0f}"
@@ -282,8 +315,8 @@ class _ForestTraining:
         """One forest after the other, each reading what the one before says of ground it has not seen."""
         o, samples = self.options, self.samples
         made, importances = [], []
-        held_out: list[list[Forest]] = []
-        values = self.first
+        held_out: list[list[FeatureForest]] = []
+        values, folds = self.first, None
         if o.passes > 1:
             folds = Folds.of_ground(self.xy, samples.label, samples.weight, self.flights, o.pass_folds)
             fold = samples.take(lambda number: folds.points(self.clouds[number].xyz, self.flights[number]))
@@ -291,75 +324,70 @@ class _ForestTraining:
             if number:
                 # Ground beside a fold is not left out as for the score: the forests miss the fold's samples already,
                 # and the next pass should see probabilities as good as those it will see when the model is used.
-                what = f"pass {number} without each fold"
-                held_out.append([forest for _, forest in self._without_each(values, fold, what)])
-                values = _beside(self.own, self._context(folds, held_out))
-            with Progress(o.trees, f"growing pass {number + 1}", "trees", enabled=self.progress) as bar:
+                each = self._without_each(values, fold, f"pass {number} without each fold")
+                held_out.append([self._read_by(number - 1, forest) for _, forest in each])
+                values = _beside(self.own, self._around(number, held_out, folds))
+            with self.progress(o.trees, f"growing pass {number + 1}", "trees") as bar:
                 forest, shares = self._grow(values, samples.weight, o.trees, bar)
-            made.append(FeatureForest(self.features, forest, self._read_by(number)))
+            made.append(self._read_by(number, forest))
             importances.append(shares.tolist())
         return made, importances
 
-    def _read_by(self, number: int) -> Context | None:
-        """What a pass reads of the one before."""
-        if number:
-            return self.context
-        return None if self.below is None else self.below.context
+    def _read_by(self, number: int, forest: Forest) -> FeatureForest:
+        """A forest with what a pass reads."""
+        return FeatureForest(self.features, forest, self.reads[number], self.blends[number])
 
-    def _context(self, folds: Folds, held_out: Sequence[Sequence[Forest]]) -> npt.NDArray[np.float32]:
-        """The samples' context, (samples, columns), by passes that have not seen them."""
-        o, below, count = self.options, self.below, len(held_out)
-        reads = [self._read_by(number) for number in range(count)]
-        blends: Sequence[Blend | None] = [None] * count
-        classes = [len(self.codes)] * count
-        first: Sequence[Any] = ()
-        factors: Sequence[Any] = ()
-        if below is not None:
-            blends = below.blends(self.codes, len(self.features.plan.names), reads)
-            classes = [*below.classes, *(len(one.codes) for one in blends if one)]
-            first, factors = below.passes, below.factors
-        out = np.empty((len(self.samples), len(self.context.tokens) * classes[-1]), np.float32)
-        with Progress(len(out), f"context for pass {count + 1}", enabled=self.progress) as bar:
-            for number, cloud in enumerate(self.clouds):
-                at, rows = self.samples.of_cloud(number)
+    def _around(
+        self, number: int, held_out: Sequence[Sequence[FeatureForest]] = (), folds: Folds | None = None
+    ) -> npt.NDArray[np.float32]:
+        """(samples, columns): what a pass reads of those before, a base's and forests that have not seen the samples."""
+        o, context = self.options, self.reads[number]
+        assert context is not None
+        passes, classes, factors = ((), [], []) if self.base is None else self.base.asked
+        classes = [*classes, *(len(self._codes_after(k)) for k in range(number))]
+        out = np.empty((len(self.samples), len(context.tokens) * classes[-1]), np.float32)
+        with self.progress(
+            len(out), f"context for pass {number + 1}" if number else "what the base says"
+        ) as bar:
+            for place, cloud in enumerate(self.clouds):
+                at, rows = self.samples.of_cloud(place)
                 if not len(at):
                     continue
-                fold = folds.points(cloud.xyz, self.flights[number])
-                passes = [
-                    FoldForests(self.features, context, forests, fold, blend)
-                    for context, forests, blend in zip(reads, held_out, blends, strict=True)
-                ]
+                mine: list[Any] = []
+                if folds is not None:
+                    fold = folds.points(cloud.xyz, self.flights[place])
+                    mine = [FoldForests(forests, fold) for forests in held_out]
                 request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
-                out[at] = sample_context(request, [*first, *passes], self.context, classes, factors)
+                weights = [*factors, *[None] * number]
+                out[at] = sample_context([*passes, *mine], classes, weights, request, context)
         return out
+
+    # ---- on top of a base ----------------------------------------------------------------------------------
+
+    def _said_by_base(self, rows: Any = slice(None)) -> npt.NDArray[np.float64]:
+        """(m, classes) the base's probabilities of samples themselves."""
+        context = self.reads[0]
+        assert context is not None
+        return context.own(self.first[rows, self.own.shape[1] :], len(self.base.classes))
+
+    def _held_by_base(self) -> dict[str, Any]:
+        """Labeled classes new to the base: [different samples, of these what it calls a class that the labels lack].
+
+        Such points stay what the base calls them.
+        """
+        if self.base is None or self.options.target is not None:
+            return {}
+        said, out = self.base.codes[self._said_by_base().argmax(axis=1)], {}
+        for place, code in enumerate(self.codes):
+            mine = self.samples.label == place
+            held = int(np.count_nonzero(~np.isin(said[mine], self.codes)))
+            if code not in self.base.codes and held:
+                out[str(code)] = [int(np.count_nonzero(mine)), held]
+        return {"held_by_base": out} if out else {}
 
 
 def _beside(values: npt.NDArray[np.float32], more: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return np.asfortranarray(np.concatenate([values, more], axis=1))
-
-
-def _gap(plan: Any) -> float:
-    """Meters between samples trained on and ground held out."""
-    return max((one.reach or 0.0 for one in plan.neighborhoods), default=0.0)
-
-
-def _check_groups(clouds: Sequence[TrainingCloud], options: TrainingOptions) -> None:
-    """OptionError or DimensionError where clouds have not what is to be held out together."""
-    name = options.groups
-    if name and required((name,)) != (name,):
-        raise OptionError(
-            "'groups' must name a dimension other than coordinates and what is made of them", found=name
-        )
-    for cloud in clouds if name else ():
-        gather((name,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name)
-
-
-def _groups(cloud: TrainingCloud, options: TrainingOptions) -> npt.NDArray[Any]:
-    """What a cloud's points are held out with: their `groups`, or all of them with the survey."""
-    name = options.groups
-    if not name:
-        return np.broadcast_to(np.array(cloud.flight), len(cloud))
-    return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[0][name]
 
 
 def _versions() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Ground that is held out: whole surveys or blocks in turn, and what forests say of ground they have not seen.
+"""Ground that is held out: whole surveys or blocks in turn.
 
 Neighboring points share most of their features, so a forest nearly knows the neighbors of its samples: a score on them
 flatters, and a next pass trained on what it says there would trust what nobody knows elsewhere.
@@ -6,8 +6,7 @@ flatters, and a next pass trained on what it says there would trust what nobody 
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,18 +15,11 @@ import numpy.typing as npt
 
 from ..accuracy.measures import Accuracy
 from ..base.errors import OptionError
-from .algorithms import PredictRequest
-from .context import Context
-from .featureforest import Features
-from .forest import Forest
-from .passes import PassRun
 
 #: Side of a block in meters; where too few have samples it is halved down to the other.
 BLOCK, SMALLEST = 25.0, 0.02
 #: Fewer surveys than this are cut into blocks: else too little would be left to train the next pass on.
 SURVEYS = 3
-#: Rows handed to scikit-learn to deal out blocks, which counts them one by one.
-_DEALT = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,19 +68,14 @@ class Folds:
                 found=f"folds {folds}",
                 cure="Make folds smaller, or give more training data",
             )
-        from sklearn.model_selection import StratifiedGroupKFold
-
         content = np.zeros((len(blocks), int(label.max()) + 1))
         np.add.at(content, (block, label), weight)
-        rows = np.ceil(content * min(1.0, _DEALT / content.sum())).astype(np.int64)
-        of_block, of_class = (np.repeat(i.reshape(-1), rows.reshape(-1)) for i in np.indices(rows.shape))
-        fold = np.full(len(blocks), -1, np.int16)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a class with fewer rows than folds
-            for number, (_, held) in enumerate(
-                StratifiedGroupKFold(folds).split(of_block, of_class, of_block)
-            ):
-                fold[of_block[held]] = number
+        # Dealt out in turn, to and fro, those with most of the rarest class first.
+        rarest_last = np.argsort(-(content > 0).sum(axis=0), kind="stable")
+        order = np.lexsort(-content[:, rarest_last].T)
+        fold = np.empty(len(blocks), np.int16)
+        turn = np.arange(len(blocks)) % (2 * folds)
+        fold[order] = np.minimum(turn, 2 * folds - 1 - turn)
         return cls(folds, {}, side, blocks, fold)
 
     @classmethod
@@ -109,7 +96,7 @@ class Folds:
         while True:
             try:
                 return cls.of_blocks(xy, label, weight, folds, side)
-            except (OptionError, ValueError):  # the latter of scikit-learn, for classes of very few samples
+            except OptionError:
                 side /= 2.0
                 if side < SMALLEST:
                     raise OptionError(
@@ -156,57 +143,3 @@ def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, An
         "mean_f1": accuracy.mean_f1,
         "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class},
     }
-
-
-# ---- what a pass says of points it has not seen ------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class FoldForests:
-    """A forest per fold, each grown without it, as one pass over one cloud."""
-
-    features: Features
-    context: Context | None
-    forests: Sequence[Forest]
-    fold: npt.NDArray[np.int16]  #: (n,) of every point of the cloud: the forest that judges it
-    #: of a pass on top of others: what it makes of all that it reads and of what its forests say
-    blend: Callable[[npt.NDArray[np.float32], npt.NDArray[np.float64]], npt.NDArray[np.float64]] | None = None
-
-    def probabilities(
-        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
-    ) -> npt.NDArray[np.float64]:
-        """Of each point from the forest that has not seen its fold."""
-        out = np.empty((len(values), self.forests[0].n_classes))
-        fold = self.fold[rows]
-        for number in np.unique(fold).tolist():
-            out[fold == number] = self.forests[number].predict_proba(values[fold == number])
-        return out if self.blend is None else self.blend(values, out)
-
-
-@dataclass(frozen=True, eq=False)
-class _ContextOnly:
-    """A pass of which nothing but its context is wanted."""
-
-    context: Context
-    features: None = None
-
-
-def sample_context(
-    request: PredictRequest,
-    passes: Sequence[Any],
-    context: Context,
-    classes: Sequence[int],
-    factors: Sequence[npt.NDArray[np.float64] | None] = (),
-) -> npt.NDArray[np.float32]:
-    """(m, columns): the context of the m points asked for, ascending, as passes say that have not seen them.
-
-    `classes` and `factors` of each pass: see :class:`Passes`.
-    """
-    asked: Any = request.rows
-    out = np.empty((len(asked), len(context.tokens) * classes[-1]), np.float32)
-    padded = (*factors, *[None] * (len(passes) - len(factors) + 1))
-    members: list[Any] = [*passes, _ContextOnly(context)]
-    run = PassRun(members, [*classes, classes[-1]], request, padded)
-    for rows, columns in run.blocks(lambda columns, rows: columns):
-        out[np.searchsorted(asked, rows)] = columns
-    return out

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +20,10 @@ from ..features.voxels import check_side, represent
 from . import modelfile, summary
 from .algorithms import InputPlan, PredictRequest, algorithm
 from .clouds import density
-from .deciding import Outcome, Prediction, PredictionOptions, decide
+from .deciding import Prediction, PredictionOptions, decide, empty, judged
 from .dimensions import known, preparing, required, welcome
-from .passes import Passes, weighed
+from .passes import plan_of, predict
+from .refinement import weighed
 
 #: How many times sparser or denser a cloud may be than those trained on before that is said.
 TOLERANCE = 2.0
@@ -51,17 +52,15 @@ class Model:
 
     # ---- what it is ----------------------------------------------------------------------------------------
 
-    @cached_property
-    def algorithm(self) -> Any:
-        """What classifies clouds: the only pass, or all of them as one."""
-        if len(self.passes) == 1:
-            return self.passes[0]
-        return Passes(self.passes, tuple(map(len, self.codes_of)), (*self.factors_between, None))
-
     @property
+    def algorithm(self) -> Any:
+        """The last pass, whose answer is the model's."""
+        return self.passes[-1]
+
+    @cached_property
     def plan(self) -> FeaturePlan | InputPlan:
         """Features and dimensions it needs."""
-        return self.algorithm.plan
+        return plan_of(self.passes)
 
     @property
     def codes(self) -> npt.NDArray[np.uint8]:
@@ -81,10 +80,11 @@ class Model:
         return None if priors is None else np.array(priors["factors"])
 
     @property
-    def factors_between(self) -> tuple[npt.NDArray[np.float64] | None, ...]:
-        """The same of each pass but the last, before the next one reads them: of a base's last."""
-        given = (one.get("factors") for one in self.info["passes"][:-1])
-        return tuple(None if one is None else np.array(one) for one in given)
+    def asked(self) -> tuple[tuple[Any, ...], list[int], list[npt.NDArray[np.float64] | None]]:
+        """Passes, their numbers of classes and their factors, as :class:`PassRun` takes them, to ask what it says."""
+        given = [one.get("factors") for one in self.info["passes"][:-1]]
+        between = [None if one is None else np.array(one) for one in given]
+        return self.passes, [len(codes) for codes in self.codes_of], [*between, self.factors]
 
     @property
     def required_dimensions(self) -> tuple[str, ...]:
@@ -105,11 +105,6 @@ class Model:
     def halo_m(self) -> float:
         """Meters around a tile whose points a tile's results depend on."""
         return self.plan.halo_m + self.voxel
-
-    @property
-    def gives_variance(self) -> bool:
-        """Whether :meth:`predict` can return a variance."""
-        return self.algorithm.gives_variance
 
     def importances(self, by: str = "feature", number: int = -1) -> dict[str, float]:
         """Mean decrease in impurity, summing to 1, largest first.
@@ -194,7 +189,7 @@ class Model:
         xyz = np.asarray(xyz, dtype=np.float64)
         n = len(xyz)
         given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads)
-        if how.variance and not self.gives_variance:
+        if how.variance and not self.algorithm.gives_variance:
             raise OptionError(
                 "only a network gives a variance",
                 found=f"a model of {self.algorithm.name}",
@@ -206,7 +201,9 @@ class Model:
             there, ignored = np.flatnonzero(~gone), int(np.count_nonzero(gone))
             asked = asked & ~gone
         rows = None if asked.all() else np.flatnonzero(asked)
-        outcome = Outcome(n, len(self.codes), None if current is None else _codes_now(current, n), how)
+        codes, factors = self.codes, self.factors
+        now = None if current is None else _codes_now(current, n)
+        out = empty(n, len(codes), now, how)
         values = known(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
         del values, there
@@ -221,33 +218,32 @@ class Model:
             grid = build_grid(check_xyz(xyz), self._cell)
             order, xyz = grid.order, grid.coordinates
             grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
-            rows = None if rows is None else _places(order, rows)
+            if rows is not None:
+                rows = np.flatnonzero(np.isin(order, rows))
             taken = order if taken is None else taken[order]
         if taken is not None:
             needed = (*self.required_dimensions, *self.welcome_dimensions)
             given = {name: np.asarray(given[name])[taken] for name in needed if name in given}
-        codes, factors = self.codes, self.factors
         shown = progress if representatives is None else None
         request = PredictRequest(xyz, given, rows, how.threads, how.memory_mb, shown, grid)
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
-        predicted = self.algorithm.predict(request, lambda p: decide(weighed(p, factors), codes, how))
-        for block in predicted.blocks:
-            at, decided, variance = block.rows, block.result, block.variance
+        for block in predict(*self.asked, request, lambda p: decide(weighed(p, factors), codes, how)):
+            at, place = block.rows, cast(Any, slice(None))
             if order is not None:
                 at = order[at]
             if representatives is not None:
                 at, place = representatives.members(at)
-                decided = decided.taken(place)
-                variance = None if variance is None else variance[place]
                 if progress is not None:
                     progress.update(len(at))
-            outcome.write(at, decided, variance)
-        report = predicted.report
-        self._report_density(report, found, request.count)
+            decided = block.result if block.variance is None else {**block.result, "variance": block.variance}
+            for name, values in decided.items():
+                if name in out:
+                    out[name][at] = values[place]
+        self._report_density(request.report, found, request.count)
         if len(xyz) < n - ignored:
-            report.figures["representatives"] = len(xyz)
-        return outcome.prediction(asked, ignored, report)
+            request.report.figures["representatives"] = len(xyz)
+        return judged(out, asked, ignored, now, how, request.report)
 
     def _prepared(
         self,
@@ -358,13 +354,6 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
     if before != codes:
         raise ModelError("the last pass has other classes than the model", found=before[:10])
     return Model(tuple(passes), classes, info)
-
-
-def _places(order: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Where rows lie in an order, ascending."""
-    chosen = np.zeros(len(order), np.bool_)
-    chosen[rows] = True
-    return np.flatnonzero(chosen[order])
 
 
 def mask_of(name: str, mask: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Several passes as one classifier: each reads, beside its features, what the one before said around a point.
+"""Passes over one cloud: each reads, beside its features, what the one before said around a point.
 
 The cloud is worked on in bands from south to north. A pass works on a band as soon as the pass before has done that band
 and the next one, so the features of a few bands are held, and those of a band serve all passes that read the same ones.
@@ -7,78 +7,128 @@ and the next one, so the features of a few bands are held, and those of a band s
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.report import Report
 from ..base.runs import begins_run
 from ..base.threads import map_blocks
+from ..features import FeaturePlan
 from ..features.index import cell_numbers
-from .algorithms import Block, InputPlan, PredictRequest, PredictResult
-from .context import around, count_shares
-from .featureforest import CloudFeatures
+from .algorithms import Block, InputPlan, PredictRequest
+from .context import Context, around, count_shares
+from .featureforest import CloudFeatures, FeatureForest
+from .refinement import weighed
 
 #: Points of a band at most, but for a band of one strip.
-BAND = 150_000
+BAND = 75_000
+
+
+def plan_of(passes: Sequence[Any]) -> FeaturePlan | InputPlan:
+    """What all passes look at; the halo is the passes' own, one after the other."""
+    plans = [one.plan for one in passes]
+    if len(plans) == 1:
+        return plans[0]
+    halo_m = plans[0].halo_m
+    for one in passes[1:]:
+        halo_m = max(one.plan.halo_m, halo_m + one.context.reach)
+    return InputPlan(
+        tuple(dict.fromkeys(name for plan in plans for name in plan.names)),
+        tuple(dict.fromkeys(name for plan in plans for name in plan.dimensions)),
+        halo_m,
+        max(plan.most_neighbors for plan in plans),
+        max(plan.second_neighbors for plan in plans),
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Passes:
-    """Two or more passes."""
+class FoldForests:
+    """Forests that read the same, each grown without one fold, as one pass over one cloud."""
 
-    #: of a model file: the first any :class:`Algorithm`, then forests
-    members: tuple[Any, ...]
-    classes: tuple[int, ...]  #: of each pass
-    #: of each pass: what its classes' probabilities are multiplied by before they are handed on; None for nothing
-    factors: tuple[npt.NDArray[np.float64] | None, ...] = ()
-
-    gives_variance = False
+    forests: Sequence[FeatureForest]
+    fold: npt.NDArray[np.int16]  #: (n,) of every point of the cloud: the forest that judges it
 
     @property
-    def name(self) -> str:
-        """Of the last pass."""
-        return self.members[-1].name
+    def features(self) -> Any:
+        return self.forests[0].features
 
-    @cached_property
-    def plan(self) -> InputPlan:
-        """What all passes look at; the halo is the passes' own, one after the other."""
-        plans = [one.plan for one in self.members]
-        halo_m = plans[0].halo_m
-        for one in self.members[1:]:
-            halo_m = max(one.plan.halo_m, halo_m + one.context.reach)
-        return InputPlan(
-            tuple(dict.fromkeys(name for plan in plans for name in plan.names)),
-            tuple(dict.fromkeys(name for plan in plans for name in plan.dimensions)),
-            halo_m,
-            max(plan.most_neighbors for plan in plans),
-            max(plan.second_neighbors for plan in plans),
-        )
+    @property
+    def context(self) -> Context | None:
+        return self.forests[0].context
 
-    def predict(
-        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
-    ) -> PredictResult:
-        """Classify; see ``Algorithm.predict``."""
-        run = PassRun(self.members, self.classes, request, self.factors)
-        blocks = run.blocks(lambda read, rows: finish(self.members[-1].probabilities(read, rows)))
-        return PredictResult((Block(rows, result) for rows, result in blocks), run.report)
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """Of each point from the forest that has not seen its fold."""
+        each, fold = {}, self.fold[rows]
+        for number in np.unique(fold).tolist():
+            each[number] = self.forests[number].probabilities(values[fold == number])
+        out = np.empty((len(values), next(iter(each.values())).shape[1]))
+        for number, p in each.items():
+            out[fold == number] = p
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _ContextOnly:
+    """A pass of which nothing but its context is wanted."""
+
+    context: Context
+    features: None = None
+
+
+def predict(
+    passes: Sequence[Any],
+    classes: Sequence[int],
+    factors: Sequence[npt.NDArray[np.float64] | None],
+    request: PredictRequest,
+    finish: Callable[[npt.NDArray[np.float64]], Any],
+) -> Iterator[Block]:
+    """Classify by some passes: see :class:`PassRun`.
+
+    `finish` makes the results of the (b, classes) float64 probabilities of a block, which it may change, in a worker's
+    thread where there are any.
+    """
+    if len(passes) == 1 and passes[0].features is None:
+        yield from passes[0].predict(request, finish)
+        return
+    run = PassRun(passes, classes, request, factors)
+    for rows, result in run.blocks(lambda read, rows: finish(passes[-1].probabilities(read, rows))):
+        yield Block(rows, result)
+
+
+def sample_context(
+    passes: Sequence[Any],
+    classes: Sequence[int],
+    factors: Sequence[npt.NDArray[np.float64] | None],
+    request: PredictRequest,
+    context: Context,
+) -> npt.NDArray[np.float32]:
+    """(m, columns): the context that some passes give the m points asked for, ascending."""
+    asked: Any = request.rows
+    out = np.empty((len(asked), len(context.tokens) * classes[-1]), np.float32)
+    run = PassRun([*passes, _ContextOnly(context)], [*classes, 0], request, [*factors, None])
+    for rows, columns in run.blocks(lambda columns, rows: columns):
+        out[np.searchsorted(asked, rows)] = columns
+    return out
 
 
 class PassRun:
-    """Passes at work on one cloud; `report` has what was counted, complete when all blocks are read.
+    """Passes at work on one cloud.
 
     Parameters
     ----------
     members : sequence
         Each has `features` (None where it reads context alone), `context` (None for the first), and
         ``probabilities(read, rows)``, (b, classes) of points by their features and then their context, side by side; of
-        the last only the former two are looked at. A first one without features is asked as the algorithm it is.
-    classes, factors
-        See :class:`Passes`.
+        the last only the former two are looked at. A first one without features is asked as the kind it is.
+    classes : sequence of int
+        Of each pass.
     request : PredictRequest
+    factors : sequence of (classes,) float64 or None
+        Of each pass: what its classes' probabilities are multiplied by before they are handed on; None for nothing.
     """
 
     def __init__(
@@ -86,16 +136,15 @@ class PassRun:
         members: Sequence[Any],
         classes: Sequence[int],
         request: PredictRequest,
-        factors: Sequence[npt.NDArray[np.float64] | None] = (),
+        factors: Sequence[npt.NDArray[np.float64] | None],
     ) -> None:
-        self._members, self._request = members, request
-        self._factors = tuple(factors) or (None,) * len(members)
-        self.report = Report()
+        self._members, self._request, self._factors = members, request, factors
         wanted = [request.rows]  # of each pass
         for one in members[:0:-1]:
             wanted.insert(0, around(request.xyz, wanted[0], one.context))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
-        self._strips = Strips(request.xyz, wanted[0], max(one.context.strip for one in members[1:]))
+        width = max((one.context.strip for one in members[1:]), default=8.0)
+        self._strips = Strips(request.xyz, wanted[0], width)
         self._shares = [np.zeros((len(self._strips), n), np.uint16) for n in classes[:-1]]
         self._features: list[CloudFeatures | None] = []
         for one in members:
@@ -106,7 +155,6 @@ class PassRun:
             found = None if one.features is None else next(same, None)
             if found is None and one.features is not None:
                 found = CloudFeatures(one.features, request)
-                self.report.merge(found.report)
             self._features.append(found)
 
     def blocks(
@@ -136,20 +184,15 @@ class PassRun:
                         progress.update(len(rows))
                     yield rows, result
             held.pop(step - number + 1, None)
-        for features in dict.fromkeys(reversed(self._features)):
-            if features is not None:
-                self.report.merge(features.report)
 
     def _ask_algorithm(self) -> None:
         """Let a first pass of another kind, which has its own way through a cloud, say its probabilities."""
-        asked, factors = self._request, self._factors[0]
+        factors = self._factors[0]
         rows = None if self._wanted[0] is None else np.flatnonzero(self._wanted[0])
-        inner = PredictRequest(asked.xyz, asked.dimensions, rows, asked.threads, asked.memory_mb)
-        predicted = self._members[0].predict(inner, lambda p: count_shares(weighed(p, factors)))
-        every = np.arange(len(asked.xyz))
-        for block in predicted.blocks:
+        inner = replace(self._request, rows=rows, progress=None, grid=None)
+        every = np.arange(len(inner.xyz))
+        for block in self._members[0].predict(inner, lambda p: count_shares(weighed(p, factors))):
             self._shares[0][self._strips.places(every[block.rows])] = block.result
-        self.report.merge(predicted.report)
 
     def _handing_on(self, place: int) -> Callable[..., npt.NDArray[np.uint16]]:
         """What a pass makes of a block for the next one."""
@@ -197,14 +240,8 @@ class PassRun:
         context, shares = self._members[place].context, self._shares[place - 1]
         window = self._strips.window(band)
         xyz = self._request.xyz[self._strips.rows_at(window)]
-        tables = context.tables(xyz, shares[window], self._request.threads)
-
-        def columns(rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
-            out = np.empty((len(rows), len(context.tokens) * shares.shape[1]), np.float32)
-            tables.fill(self._strips.places(rows) - window.start, out)
-            return out
-
-        return columns
+        columns = context.columns_of(xyz, shares[window], self._request.threads)
+        return lambda rows: columns(self._strips.places(rows) - window.start)
 
 
 #: The first strip of a band, and the one after its last.
@@ -272,12 +309,3 @@ def _mask(rows: npt.NDArray[np.int64] | None, n: int) -> npt.NDArray[np.bool_] |
     mask = np.zeros(n, np.bool_)
     mask[rows] = True
     return mask
-
-
-def weighed(p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64]:
-    """Probabilities (b, classes), each class's multiplied by its factor; None leaves them as they are."""
-    if factors is None:
-        return p
-    p = p * factors
-    p /= p.sum(axis=1, keepdims=True)
-    return p

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..base.errors import ModelError, OptionError
 from ..base.plain import one_line
-from .algorithms import ON_TOP, Column
+from .algorithms import REFINED, Column
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"
@@ -55,7 +55,7 @@ def text(info: Mapping[str, Any]) -> str:
     info = _in_one_line(info)
     training, several = info["training"], len(info["passes"]) > 1
     # A base's own file describes its passes.
-    passes = [(n, one) for n, one in enumerate(info["passes"], 1) if one["algorithm"] in ON_TOP]
+    passes = [(n, one) for n, one in enumerate(info["passes"], 1) if one["algorithm"] == REFINED]
     passes = passes or list(enumerate(info["passes"], 1))
     lines = [score(info), ""]
     for number, one in passes:

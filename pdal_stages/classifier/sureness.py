@@ -6,7 +6,7 @@ From the counts comes, for each class, the reliability from which on its points 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -179,15 +179,3 @@ def said(known: Sureness, names: Mapping[int, str], accuracy: float) -> list[str
                 f"  {name}: {100 * one.kept:.1f} % keep it, from reliability {one.reliability:.2f} on"
             )
     return lines
-
-
-def counted(
-    probabilities: npt.NDArray[np.floating],
-    codes: Sequence[int],
-    true: npt.NDArray[Any],
-    weight: npt.NDArray[np.floating],
-    into: Sureness,
-) -> None:
-    """Count points by their probabilities (n, classes) and true codes (n,)."""
-    given = np.asarray(codes)[probabilities.argmax(axis=1)]
-    into.add(given, true, probabilities.max(axis=1), weight)

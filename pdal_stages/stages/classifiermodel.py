@@ -17,7 +17,7 @@ from ..base.files import check_writable
 from ..base.outputs import Output
 from ..base.report import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
-from ..classifier.algorithms import ALGORITHMS, Trainer, trainer
+from ..classifier.algorithms import ALGORITHMS, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
 from ..classifier.foresttraining import SHORT
@@ -192,7 +192,7 @@ classes.
         return TrainingOptions(**values, memory_mb=self.memory)
 
     @property
-    def _trainer(self) -> Trainer:
+    def _trainer(self) -> Any:
         return trainer(self.algorithm)
 
     @property

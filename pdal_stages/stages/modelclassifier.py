@@ -113,7 +113,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
     def check(self) -> None:
-        able = self.model.gives_variance  # reads the file in any case
+        able = self.model.algorithm.gives_variance  # reads the file in any case
         if self.variance and not able:
             raise OptionError(
                 "option 'variance' is for networks; this model is another",
