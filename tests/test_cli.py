@@ -68,7 +68,7 @@ def test_pipeline_with_overrides(job, tmp_path, capsys):
     [
         (["--stage.hieght.cell=10"], "Did you mean 'height'?"),
         (["--stage.height.cell=ten"], "option 'cell' must be a number"),
-        (["--stage.height.cell=-3"], "option 'cell' must be a number above 0"),
+        (["--stage.height.cell=-3"], "option 'cell' must be a number from 0.05"),
         (["--stage.height.resolution=50"], "must not be larger than 'cell'"),
         (["--filters.hag_minima.cel=10"], "Did you mean 'cell'?"),
         (["--filters.hag_nn.count=10"], "no stage of the pipeline has the type 'filters.hag_nn'"),

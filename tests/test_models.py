@@ -14,8 +14,8 @@ from pdal_stages.base.errors import DimensionError, OptionError, StageError
 from pdal_stages.classifier.modelfile import STANDARD, find, shipped
 from pdal_stages.cli import main
 from pdal_stages.pipeline import Pipeline
-from pdal_stages.stages.heights import made_of_coordinates, preparation_of
 from pdal_stages.stages.loading import load_model
+from pdal_stages.stages.preparation import made_of_coordinates, preparation_of
 from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import run_tiled
 

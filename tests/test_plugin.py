@@ -346,7 +346,7 @@ def test_an_empty_list_is_none(pipeline, town, tmp_path):
     [
         ({"cell": "wide"}, "filters.hag_minima: Invalid value 'wide' for argument 'cell'"),
         ({"sell": 3}, "filters.hag_minima: Unexpected argument 'sell'"),
-        ({"cell": -1}, "filters.hag_minima (tag 'h'): option 'cell' must be a number above 0"),
+        ({"cell": -1}, "filters.hag_minima (tag 'h'): option 'cell' must be a number from 0.05"),
         ({"where": "X >"}, "filters.hag_minima (tag 'h'): the 'where' expression"),
         ({"where": "X > 1", "where_merge": False}, "there is no option 'where_merge'"),
         ({"option_file": "nowhere.json"}, "there is no option 'option_file'"),

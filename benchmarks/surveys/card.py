@@ -19,8 +19,7 @@ from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
 from rules import table
 
 from pdal_stages.classifier import load_model
-from pdal_stages.stages.heights import PREPARATION
-from pdal_stages.stages.preparation import as_json
+from pdal_stages.stages.preparation import PREPARATION, as_json
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without
 from pdal_stages.base.hashing import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.features.voxels import represent
-from pdal_stages.stages.heights import PREPARATION
+from pdal_stages.stages.preparation import PREPARATION
 
 #: Points per square meter of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)

@@ -161,4 +161,4 @@ def gather(
 
 def preparing() -> Any:
     """The module that knows the stages which make dimensions; it stands above this room, and is imported when asked for."""
-    return pkgutil.resolve_name("pdal_stages.stages.heights")
+    return pkgutil.resolve_name("pdal_stages.stages.preparation")

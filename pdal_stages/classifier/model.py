@@ -307,7 +307,7 @@ def load_model(path: str | os.PathLike) -> Model:
     try:
         model = assemble(manifest, arrays)
         if asked := model.info.get("preparation"):
-            model.info["preparation"] = preparing().checked(asked)
+            model.info["preparation"] = preparing().check(asked)
         return model
     except ModelError as error:
         error.cure = error.cure or modelfile.CURE

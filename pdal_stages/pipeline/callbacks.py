@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import StageError
-from ..stages import carried
+from ..stages.preparation import NEEDS_GROUND
 from . import pdal as pdal_env
 from .interrupts import catches
 from .runtime import as_stage_error, hand_over, place, python_filter
@@ -65,7 +65,7 @@ class Callbacks(AbstractContextManager):
             return list(stages)
         out: list[dict[str, Any]] = []
         for stage in stages:
-            if stage.get("type") in carried.NEEDS_GROUND:
+            if stage.get("type") in NEEDS_GROUND:
                 named = place(stage["type"], stage.get("tag"))
                 check = self.filter(partial(_check_ground, named))
                 check["tag"] = check["module"]

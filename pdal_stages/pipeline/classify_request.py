@@ -10,7 +10,6 @@ from ..base.asprs import BRIDGE
 from ..base.errors import ModelError, OptionError, suggest
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation, registry
-from ..stages.heights import preparation_of
 from ..stages.loading import loaded_model
 from . import pdal as pdal_env
 from .filenames import LAS_WRITERS
@@ -124,7 +123,9 @@ class ClassifyRequest:
                 cure="Write a pipeline: the reader, these stages with their options of training, "
                 "filters.modelclassifier, and the writer",
             )
-        prepared = self.loaded.info.get("preparation") or preparation_of(self.loaded.required_dimensions)
+        prepared = self.loaded.info.get("preparation") or preparation.preparation_of(
+            self.loaded.required_dimensions
+        )
         if self._with_bridges:
             # The last one's heights and flags are those that stay.
             at = max(n for n, stage in enumerate(prepared) if stage["type"] == _DECKS)
@@ -136,7 +137,9 @@ class ClassifyRequest:
     def _with_bridges(self) -> bool:
         """Whether decks are looked for: not where the model knows bridges itself, or heights are made otherwise."""
         known = {code for code, _ in self.loaded.classes}
-        made = self.loaded.info.get("preparation") or preparation_of(self.loaded.required_dimensions)
+        made = self.loaded.info.get("preparation") or preparation.preparation_of(
+            self.loaded.required_dimensions
+        )
         there = any(stage["type"] == _DECKS for stage in made)
         return self.bridges and there and known >= {2, 6} and BRIDGE not in known and not self._by_class
 

@@ -151,7 +151,7 @@ def _views_reaching(stages: Sequence[dict[str, Any]]) -> list[int]:
 
 def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str]) -> None:
     """PDAL runs only what leads to the first end of a pipeline, and says nothing of the others."""
-    taken = set(itertools.chain(*(_wiring(stages) or [range(len(stages))])))
+    taken = set(itertools.chain(*(_wiring(stages) or [list(range(len(stages)))])))
     ends = [number for number in range(len(stages)) if number not in taken]
     if len(ends) > 1:
         named = [

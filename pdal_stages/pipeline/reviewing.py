@@ -26,8 +26,8 @@ from ..classifier.modelfile import STANDARD
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, write_layers
 from ..reports.reviewpage import review_page, styles
-from ..stages.heights import PREPARATION, made_of_coordinates
 from ..stages.loading import loaded_model
+from ..stages.preparation import PREPARATION, made_of_coordinates
 from .inputs_outputs import input_files
 from .parts import Part, parts_of, reads_in_parts, reference_and_wkt
 from .references import check_one_reference, without_reference

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 from ..classifier.summary import FILE_NUMBER
 from ..stages.classifiermodel import ClassifierModel
-from ..stages.heights import preparation_of
 from ..stages.points import Points
+from ..stages.preparation import preparation_of
 from . import pdal as pdal_env
 from .inputs_outputs import reader_of
 from .lowering import lower_stage

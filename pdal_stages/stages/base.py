@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.outputs import Output
 from ..base.units import named_unit
-from .carried import Rule
 from .options import Option, option, parse_options
 from .points import Points
 from .where import Expression
@@ -98,9 +97,9 @@ class Stage(ABC):
     where_chooses: ClassVar[bool] = False
     #: For a stage that needs all points at once: what to do instead of running it in tiles.
     instead_of_tiles: ClassVar[str] = ""
-    #: For a stage that a model may carry with it, to be run by whoever applies it: the options that the file may give, each
-    #: with what it may say (see ``carried``). None: a model file cannot name the stage.
-    in_models: ClassVar[Mapping[str, Rule] | None] = None
+    #: For a stage that a model file may carry, to be run by whoever applies it: the options that the file may give. Model
+    #: files come from strangers, so none that holds a path.
+    in_models: ClassVar[tuple[str, ...]] = ()
     #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read wider.
     open_ended: ClassVar[bool] = False
 

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from ..base.errors import OptionError
 from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
-from . import carried
 from .base import HEIGHTS_OUTSIDE, Stage
 from .options import ignore_option, option
 from .points import Points
@@ -22,18 +21,12 @@ class HagMinima(Stage):
     source = "[W18] section 3.2"
     open_ended = True  # an empty cell is filled from the nearest ones, however far away
     where_help = HEIGHTS_OUTSIDE
-    in_models = {
-        "cell": carried.number(1, 1000),
-        "resolution": carried.number(0.05, 1000),
-        "ignore": carried.selection,
-        "where": carried.condition,
-    }
+    in_models = ("cell", "resolution", "ignore", "where")
     cell: float = option(
         "number",
         20.0,
         "Side of the coarse cells whose lowest points form the terrain; more than half the width of the largest building",
-        minimum=0,
-        exclusive=True,
+        minimum=0.05,
         maximum=10_000,
         unit="m",
     )
@@ -41,8 +34,7 @@ class HagMinima(Stage):
         "number",
         0.5,
         "Side of the fine cells on which the terrain is evaluated",
-        minimum=0,
-        exclusive=True,
+        minimum=0.05,
         maximum=10_000,
         unit="m",
     )

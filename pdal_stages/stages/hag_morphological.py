@@ -16,7 +16,6 @@ from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
 from ..terrain.lowest import lowest_of_cells
 from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells
 from ..terrain.profile import opening_names
-from . import carried
 from .base import HEIGHTS_OUTSIDE, Blocks, Left, Stage
 from .options import ignore_option, option
 from .points import Points
@@ -31,21 +30,19 @@ class HagMorphological(Stage):
     summary = "Height above ground found by a progressive morphological filter"
     source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
     where_help = HEIGHTS_OUTSIDE
-    in_models = {
-        "cell": carried.number(0.2, 100),
-        "slope": carried.number(0, 100),
-        "window": carried.number(1, 1000),
-        "threshold": carried.number(0, 1000),
-        "scalar": carried.number(0, 1000),
-        "ignore": carried.selection,
-        "ground": carried.flag,
-        "terrain_slope": carried.flag,
-        "openings": carried.numbers(1, 1000),
-        "where": carried.condition,
-    }
-    cell: float = option(
-        "number", 1.0, "Side of the grid's cells", minimum=0, exclusive=True, maximum=1000, unit="m"
+    in_models = (
+        "cell",
+        "slope",
+        "window",
+        "threshold",
+        "scalar",
+        "ignore",
+        "ground",
+        "terrain_slope",
+        "openings",
+        "where",
     )
+    cell: float = option("number", 1.0, "Side of the grid's cells", minimum=0.05, maximum=1000, unit="m")
     slope: float = option(
         "number",
         0.15,

@@ -1,8 +1,8 @@
 """The stages before a classifier that made what it reads: kept in the model file, run by `classify`, compared elsewhere.
 
-A model file may come from anybody, and `classify` runs what it names. So a preparation holds only stages that declare
-themselves fit for it (:attr:`Stage.in_models`, and :data:`carried.OF_PDAL`), with options that have a rule; anything else is
-refused when the file is loaded, and not stored by training.
+A model file may come from anybody. So a preparation holds only stages and options that are listed (:attr:`Stage.in_models`,
+:data:`PDAL_OPTIONS`): numbers in bounds, classes, conditions, never a path. Else it is refused when the file is loaded,
+and not stored by training.
 """
 
 from __future__ import annotations
@@ -11,9 +11,15 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from ..base.errors import ModelError, StageError
-from . import carried, registry
+import numpy as np
+import numpy.typing as npt
 
+from ..base.errors import ModelError, StageError
+from . import registry
+from .options import Option, split_list
+
+#: The stage that makes the dimensions a model is trained on by default.
+PREPARATION = ({"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},)
 #: PDAL's stages that heights come from; of ours, :meth:`Stage.creates` says what they make.
 OF_PDAL = (
     "filters.smrf",
@@ -23,23 +29,27 @@ OF_PDAL = (
     "filters.hag_delaunay",
     "filters.hag_dem",
 )
-
+#: Those that measure from points of class 2, and what must stand before them: PDAL 2.2 crashes where there are none.
+NEEDS_GROUND, MAKES_GROUND = ("filters.hag_nn", "filters.hag_delaunay"), "filters.smrf"
+_COUNT = Option("integer", None, "", 1, 1000, name="count")
+_EXTRAPOLATION = Option("boolean", None, "", name="allow_extrapolation")
+#: PDAL's stages that a model may carry, and their options. They read no file, move no point and leave none out; each writes
+#: `Classification` or `HeightAboveGround` alone.
+PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
+    "filters.smrf": (
+        Option("number", None, "", 0.2, 100, name="cell"),
+        *(Option("number", None, "", 0, 1000, name=name) for name in ("cut", "scalar", "slope", "threshold")),
+        Option("number", None, "", 1, 1000, name="window"),
+        Option("selection", None, "", name="ignore"),
+    ),
+    "filters.hag_nn": (_COUNT, Option("number", None, "", 0, 1e6, name="max_distance"), _EXTRAPOLATION),
+    "filters.hag_delaunay": (_COUNT, _EXTRAPOLATION),
+}
 #: Options that say where in a pipeline a stage stands, how it is run, or in what units the points at hand are; not what
 #: it makes; and decks, which whoever applies a model looks for or not.
-_ASIDE = (
-    "decks",
-    "tag",
-    "inputs",
-    "user_data",
-    "log",
-    "threads",
-    "horizontal_unit",
-    "vertical_unit",
-)
-#: Most stages of a preparation.
-_MOST = 8
-#: What to do about a file that asks for more.
-_CURE = "Training writes no such file: ask where it comes from"
+_ASIDE = ("decks", "tag", "inputs", "user_data", "log", "threads", "horizontal_unit", "vertical_unit")
+#: Most stages of a preparation, and characters of one as JSON.
+_MOST, _LONGEST = 8, 1000
 
 
 def entry(stage: Mapping[str, Any]) -> dict[str, Any]:
@@ -73,44 +83,98 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     ModelError
         For a stage or an option that a model cannot carry, or a value out of its bounds; it names the stage.
     """
-    if len(preparation) > _MOST:
-        raise ModelError(f"a preparation has at most {_MOST} stages", found=len(preparation))
     try:
+        if len(preparation) > _MOST:
+            raise ModelError(f"a preparation has at most {_MOST} stages", found=len(preparation))
         made = [_checked(stage) for stage in preparation]
         for number, stage in enumerate(made):
             before = [one["type"] for one in made[:number]]
-            if stage["type"] in carried.NEEDS_GROUND and carried.MAKES_GROUND not in before:
-                raise ModelError(
-                    f"a model cannot carry {stage['type']} without {carried.MAKES_GROUND} before it"
-                )
+            if stage["type"] in NEEDS_GROUND and MAKES_GROUND not in before:
+                raise ModelError(f"a model cannot carry {stage['type']} without {MAKES_GROUND} before it")
         return made
     except ModelError as error:
-        error.cure = _CURE
+        error.cure = "Training writes no such file: ask where it comes from"
         raise
 
 
 def _checked(stage: Mapping[str, Any]) -> dict[str, Any]:
     kind = str(stage["type"])
     ours = registry.stages().get(kind)
-    rules = carried.OF_PDAL.get(kind) if ours is None else ours.in_models
-    if rules is None:
+    options = {one.name: one for one in PDAL_OPTIONS.get(kind, ())}
+    if ours is not None:
+        options = {one.name: one for one in ours.all_options() if one.name in ours.in_models}
+    if not options:
         raise ModelError(f"a model cannot carry the stage {kind[:80]!r}")
-    out: dict[str, Any] = {"type": kind}
-    for name, value in stage.items():
-        if name == "type":
-            continue
-        if name not in rules:
-            raise ModelError(f"a model cannot carry option {name[:80]!r} of {kind}")
-        try:
-            out[name] = rules[name](value)
-        except ValueError as error:
-            raise ModelError(
-                f"a model cannot carry this '{name}' of {kind}; it must be {error}",
-                found=json.dumps(value, default=str)[:80],
-            ) from None
-    if ours is not None:  # what the options say together
-        try:
-            ours({name: value for name, value in out.items() if name != "type"})
-        except StageError as error:
-            raise ModelError("a model cannot carry this stage", found=error) from None
-    return out
+    given = {name: value for name, value in stage.items() if name != "type"}
+    if unknown := [name for name in given if name not in options]:
+        raise ModelError(f"a model cannot carry option {unknown[0][:80]!r} of {kind}")
+    if len(json.dumps(given, default=str)) > _LONGEST:
+        raise ModelError(f"a model cannot carry options of more than {_LONGEST} characters", found=kind)
+    try:
+        made = {name: _value(options[name], value) for name, value in given.items()}
+        if ours is not None:
+            ours(made)
+    except StageError as error:
+        raise ModelError(f"a model cannot carry this {kind}", found=str(error)[:200]) from None
+    return {"type": kind, **made}
+
+
+def _value(option: Option, value: Any) -> Any:
+    """An option's value in the spelling of JSON."""
+    parsed = option.parse(value)
+    if option.kind == "selection":
+        items = split_list(value) if isinstance(value, str) else value if isinstance(value, list) else [value]
+        return [str(one).strip() for one in items]
+    if option.kind == "list":
+        return [_number(one) for one in parsed]
+    return _number(parsed) if option.kind in ("number", "integer") else parsed
+
+
+_any_number = Option("number", None, "", name="openings")
+
+
+def _number(value: Any) -> int | float:
+    found = _any_number.parse(value)
+    return int(found) if found == int(found) else found
+
+
+def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
+    """The stage that makes these dimensions, as far as they are heights."""
+    wanted = list(names)
+    openings = [int(name.rpartition("_")[2]) for name in wanted if name.startswith("HeightAboveOpening_")]
+    if not openings and "Ground" not in wanted:
+        return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in wanted else []
+    stage: dict[str, Any] = {"type": "filters.hag_morphological"}
+    if "Ground" in wanted:
+        stage["ground"] = True
+    return [{**stage, "openings": sorted(openings)}] if openings else [stage]
+
+
+def made_of_coordinates(
+    preparation: Sequence[Mapping[str, Any]],
+    xyz: npt.NDArray[np.float64],
+    usable: npt.NDArray[np.bool_] | None = None,
+    threads: int | None = None,
+) -> dict[str, npt.NDArray[Any]]:
+    """The dimensions that a preparation's only stage makes; none where it is not one of ours.
+
+    Parameters
+    ----------
+    preparation : sequence of mapping
+        As model files have it.
+    xyz : (n, 3) float64
+        Meters.
+    usable : (n,) bool, optional
+        Points that may form the ground; the others only receive heights.
+    threads : int, optional
+    """
+    if len(preparation) != 1 or "where" in preparation[0] or preparation[0]["type"] not in registry.stages():
+        return {}
+    options = {name: value for name, value in preparation[0].items() if name != "type"}
+    stage = registry.get(preparation[0]["type"])({**options, "ignore": "withheld", "threads": threads or 0})
+    there = {name: np.zeros(len(xyz), kind.removesuffix("_t")) for name, kind in stage.creates().items()}
+    there = {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in there.items()}
+    withheld = np.zeros(len(xyz), np.uint8) if usable is None else (~usable).view(np.uint8)
+    columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **there}
+    made = stage.run(stage.points(columns))
+    return {name: values.astype(there[name].dtype, copy=False) for name, values in made.items()}

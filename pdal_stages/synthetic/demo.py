@@ -12,7 +12,7 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.files import write_whole
 from ..classifier.modelfile import STANDARD
-from ..stages.heights import PREPARATION
+from ..stages.preparation import PREPARATION
 
 #: Classes of the town that the demo tells apart; small ones are left to the reader.
 CLASSES = {

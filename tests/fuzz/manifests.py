@@ -24,7 +24,7 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import modelfile
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.stages import carried, registry
+from pdal_stages.stages import preparation, registry
 from pdal_stages.stages.loading import load_model
 
 #: What Python reports that a model file must not cause. (NumPy compiles the literals in the heads of arrays, and does not run them.)
@@ -85,13 +85,18 @@ def _words() -> list[Any]:
     ]  # fmt: skip
 
 
-def _stage(rng: random.Random) -> dict[str, Any]:
-    ours = {
-        name: dict(kind.in_models) for name, kind in registry.stages().items() if kind.in_models is not None
+def carried() -> dict[str, tuple[str, ...]]:
+    """Stages that a model may carry, and which options of theirs."""
+    ours = {name: kind.in_models for name, kind in registry.stages().items() if kind.in_models}
+    return ours | {
+        name: tuple(one.name for one in options) for name, options in preparation.PDAL_OPTIONS.items()
     }
-    known = {**ours, **carried.OF_PDAL}
+
+
+def _stage(rng: random.Random) -> dict[str, Any]:
+    known = carried()
     kind = rng.choice([*known, *known, *_STAGES, *registry.stages()])
-    names = [*known.get(kind, {}), *rng.sample(_OPTIONS, 3)]
+    names = [*known.get(kind, ()), *rng.sample(_OPTIONS, 3)]
     options = {}
     for name in rng.sample(names, rng.randint(0, min(3, len(names)))):
         options[name] = _HONEST[name] if name in _HONEST and rng.random() < 0.6 else rng.choice(_words())
@@ -156,7 +161,7 @@ def manifest(data: bytes) -> str:
         assert not _seen, _seen[:5]
         assert sorted(os.listdir(folder())) == before, "a file appeared"
     without_ground = {s["type"] for s in pipeline.source.stages} & set(
-        carried.NEEDS_GROUND
+        preparation.NEEDS_GROUND
     )  # where PDAL 2.2 ends
     if rng.random() < 0.04 and not without_ground:
         pipeline.execute(arrays=False)
@@ -171,12 +176,11 @@ def _put_to_work(path: Path) -> Pipeline:
     assert str(made) and "\x1b" not in json.dumps(made.describe(), default=str)
     asked = made.info.get("preparation") or []
     for stage in asked:
-        rules = carried.OF_PDAL.get(stage["type"])
-        assert set(stage) - {"type"} <= set(registry.get(stage["type"]).in_models if rules is None else rules)
+        assert set(stage) - {"type"} <= set(carried()[stage["type"]])
         assert "/" not in json.dumps({k: v for k, v in stage.items() if k != "where"})
     pipeline = ClassifyRequest(str(path)).pipeline(str(cloud()), str(folder() / "out.las"))
     own = {s["type"] for s in pipeline.source.stages if s not in asked} - {"readers.las", "writers.las"}
-    assert own <= set(registry.stages()) | set(carried.OF_PDAL), own
+    assert own <= set(registry.stages()) | set(preparation.PDAL_OPTIONS), own
     assert Pipeline([str(cloud()), {"type": "filters.modelclassifier", "model": str(path)}]).lowered.ours
     return pipeline
 
