@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from ..base.errors import StageError
 from ..base.files import write_whole
 from .page import render
 from .raster import paint, shading, surface
-from .views import IGNORED, RIGHT, WRONG, nice_step, png, verdict
+from .views import IGNORED, RIGHT, WRONG, embedded, nice_step, verdict
 
 #: Files within so many meters share a map, and places that are drawn at most.
 TOGETHER, DRAWN = 1000.0, 12
@@ -174,9 +173,8 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any, unit: str) -> d
     length = nice_step(wide * s.pixel / 6)
 
     def picture(colors: npt.NDArray[np.uint8], heading: str, alt: str) -> dict[str, Any]:
-        data = base64.b64encode(png(paint(s, colors, light))).decode("ascii")
         scale = (100 * length / (wide * s.pixel), f"{length:g} {unit}")
-        return {"heading": heading, "alt": alt, "base64": data, "wide": wide, "tall": tall, "scale": scale}
+        return {"heading": heading, "alt": alt, "scale": scale, **embedded(paint(s, colors, light))}
 
     def classes(codes: npt.NDArray[Any], heading: str, word: str) -> dict[str, Any]:
         count = np.bincount(codes)

@@ -13,7 +13,7 @@ from ..objects.compare import compare_buildings, compare_trees
 from ..objects.outlines import reading, vector
 from .objectmap import draw_map
 from .page import render
-from .runpage import embedded
+from .views import embedded
 
 #: What columns of tree heights are called.
 HEIGHT_NAMES = ("height", "h", "height_m", "hoehe", "hauteur", "hoogte", "z_height")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import html
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -193,7 +193,11 @@ def write_layers(
     check_target(path, list(layers))
     driver, many = DRIVERS[Path(path).suffix.lower()]
     files = target_files(path, list(layers))
-    styles = styles if styles is not None else {name: qml(layer.kind, name) for name, layer in layers.items()}
+    styles = (
+        styles
+        if styles is not None
+        else {name: verdict_style(layer.kind, name) for name, layer in layers.items()}
+    )
     beside = [] if many else [file.with_suffix(".qml") for file in files]
     with whole_files(*files, *beside, what="objects") as parts:
         for number, (name, layer) in enumerate(layers.items()):
@@ -265,43 +269,47 @@ _SYMBOLS = {
 }
 
 
-def qml(kind: str, name: str) -> str:
+def verdict_style(kind: str, name: str) -> str:
     """A style for QGIS that tells what is sure from what is to be checked."""
     code, opacity = _CLASSES[name]
-    symbol, layer, fill = _SYMBOLS[kind]
-    categories = symbols = ""
-    for n, (value, color) in enumerate(
-        (("sure", ",".join(map(str, (*class_color(code), opacity)))), (CHECK, _TO_CHECK))
-    ):
-        categories += f'<category value="{value}" symbol="{n}" label="{value}" render="true"/>'
+    sure = ",".join(map(str, (*class_color(code), opacity)))
+    return qml(kind, [("sure", "verdict = 'sure'", sure), ("check", f"verdict = '{CHECK}'", _TO_CHECK)])
+
+
+def qml(kind: str, rules: Sequence[tuple[str, str, str]], **options: Any) -> str:
+    """A style for QGIS of rules (label, condition, color) for a type of geometry; `options` of all symbols."""
+    symbol, layer, color = _SYMBOLS[kind]
+    listed = symbols = ""
+    for n, (label, condition, ink) in enumerate(rules):
+        listed += f'<rule key="{{{n}}}" symbol="{n}" label="{label}" filter="{html.escape(condition)}"/>'
+        values = "".join(
+            f'<Option type="QString" name="{k}" value="{v}"/>' for k, v in {color: ink, **options}.items()
+        )
         symbols += (
-            f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0"><Option type="Map">'
-            f'<Option type="QString" name="{fill}" value="{color}"/></Option></layer></symbol>'
+            f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0">'
+            f'<Option type="Map">{values}</Option></layer></symbol>'
         )
     return (
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-        '<qgis version="3.22" styleCategories="Symbology"><renderer-v2 type="categorizedSymbol" attr="verdict">'
-        f"<categories>{categories}</categories><symbols>{symbols}</symbols></renderer-v2></qgis>\n"
+        '<qgis version="3.22" styleCategories="Symbology"><renderer-v2 type="RuleRenderer">'
+        f'<rules key="{{root}}">{listed}</rules><symbols>{symbols}</symbols></renderer-v2></qgis>\n'
     )
 
 
 def _write_styles(path: Path, styles: Mapping[str, str]) -> None:
     """The table of styles that QGIS looks for in a GeoPackage."""
-    import sqlite3
-
-    names = "f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName, styleQML, styleSLD"
-    with contextlib.closing(sqlite3.connect(path)) as base, base:
-        base.execute(
-            "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT, f_table_schema TEXT, "
-            "f_table_name TEXT, f_geometry_column TEXT, styleName TEXT, styleQML TEXT, styleSLD TEXT, useAsDefault BOOLEAN, "
-            "description TEXT, owner TEXT, ui TEXT, update_time DATETIME DEFAULT '2020-01-01T00:00:00.000Z')"
-        )
-        base.execute(
-            "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change, srs_id) "
-            "VALUES ('layer_styles', 'attributes', 'layer_styles', '', '2020-01-01T00:00:00.000Z', 0)"
-        )
-        base.executemany(
-            f"INSERT INTO layer_styles ({names}, useAsDefault, description, owner) "
-            "VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
-            [(name, name, style) for name, style in styles.items()],
-        )
+    empty, one = [""] * len(styles), np.ones(len(styles), bool)
+    columns = {
+        "f_table_catalog": empty, "f_table_schema": empty, "f_table_name": list(styles),
+        "f_geometry_column": ["geom"] * len(styles), "styleName": list(styles), "styleQML": list(styles.values()),
+        "styleSLD": empty, "useAsDefault": one, "description": empty, "owner": empty, "ui": empty,
+    }  # fmt: skip
+    vector("pyogrio").raw.write(
+        path,
+        None,
+        [np.array(values, bool if values is one else object) for values in columns.values()],
+        list(columns),
+        layer="layer_styles",
+        driver="GPKG",
+        FID="id",
+    )

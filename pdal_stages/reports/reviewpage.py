@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.plain import one_line
+from .objectlayers import qml
 from .page import duration, render
 
 #: Rows in the page's tables, and in text.
@@ -76,31 +77,16 @@ def styles(errors: NDArray[np.float64]) -> dict[str, str]:
     steps = np.quantile(positive, [0.5, 0.8, 0.95]) if len(positive) else np.array([1.0, 2.0, 3.0])
     low, middle, high = (f"{value:.0f}" for value in steps)
     rules = {
-        f"below {low} points expected wrong": f"done = 0 and expected &lt; {low}",
-        f"{low} to {middle}": f"done = 0 and expected >= {low} and expected &lt; {middle}",
-        f"{middle} to {high}": f"done = 0 and expected >= {middle} and expected &lt; {high}",
+        f"below {low} points expected wrong": f"done = 0 and expected < {low}",
+        f"{low} to {middle}": f"done = 0 and expected >= {low} and expected < {middle}",
+        f"{middle} to {high}": f"done = 0 and expected >= {middle} and expected < {high}",
         f"{high} and more": f"done = 0 and expected >= {high}",
         "looked at": "done = 1",
     }
-    listed = "".join(
-        f'<rule key="{{{n}}}" symbol="{n}" label="{label}" filter="{rule}"/>'
-        for n, (label, rule) in enumerate(rules.items())
-    )
-    symbols = "".join(_symbol(n, ink, "80,40,20,255", 0.3) for n, ink in enumerate((*_INKS, _LOOKED_AT)))
-    patches = f'type="RuleRenderer"><rules key="{{root}}">{listed}</rules><symbols>{symbols}</symbols>'
-    outline = _symbol(0, "0,0,0,0", "60,60,60,255", 0.5)
-    renderers = {"patches": patches, "tiles": f'type="singleSymbol"><symbols>{outline}</symbols>'}
+    patches = [(*rule, ink) for rule, ink in zip(rules.items(), (*_INKS, _LOOKED_AT), strict=True)]
     return {
-        layer: "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-        f'<qgis version="3.22" styleCategories="Symbology"><renderer-v2 {renderer}</renderer-v2></qgis>\n'
-        for layer, renderer in renderers.items()
+        "patches": qml("MultiPolygon", patches, outline_color="80,40,20,255", outline_width=0.3),
+        "tiles": qml(
+            "MultiPolygon", [("tile", "", "0,0,0,0")], outline_color="60,60,60,255", outline_width=0.5
+        ),
     }
-
-
-def _symbol(number: int, color: str, edge: str, width: float) -> str:
-    options = {"color": color, "outline_color": edge, "outline_width": width}
-    listed = "".join(f'<Option type="QString" name="{k}" value="{v}"/>' for k, v in options.items())
-    return (
-        f'<symbol type="fill" name="{number}" alpha="1"><layer class="SimpleFill" enabled="1" pass="0">'
-        f'<Option type="Map">{listed}</Option></layer></symbol>'
-    )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,10 @@ from numpy.typing import NDArray
 from ..base.asprs import class_name
 from ..base.files import write_whole
 from .page import duration, render
+from .views import embedded
 
-#: Most tiles drawn, and most rows of the table of times.
-DRAWN, ROWS = 20_000, 200
+#: Most rows of the table of times.
+ROWS = 200
 #: Settings shown, by their names in the report.
 _SETTINGS = {
     "pipeline": "pipeline",
@@ -55,20 +55,12 @@ def run_page(run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None) -
         run=run,
         figures=_figures(run),
         what=_what(run),
-        plan=_plan(run["tiles"], run["tile"]),
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
-        slowest=[(t, _corner(t["tile"], run["tile"])) for t in done[:ROWS]],
+        slowest=[(t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:ROWS]],
         done=len(done),
         objects={k: one for k, one in (run.get("objects") or {}).items() if k != "files" and one["objects"]},
         object_map=None if objects is None else embedded(objects),
     )
-
-
-def embedded(picture: NDArray[np.uint8]) -> dict[str, Any]:
-    from .views import png
-
-    data = base64.b64encode(png(picture)).decode("ascii")
-    return {"base64": data, "tall": picture.shape[0], "wide": picture.shape[1]}
 
 
 def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
@@ -101,36 +93,3 @@ def _what(run: Mapping[str, Any]) -> dict[str, Any]:
     if "cpu_seconds" in run:
         shown[_SETTINGS["cpu_seconds"]] = duration(run["cpu_seconds"])
     return {key: f"{value:,}" if isinstance(value, int) else value for key, value in shown.items()}
-
-
-def _corner(tile: Sequence[int], side: float, right: int = 0, up: int = 0) -> str:
-    """The coordinates of a tile's lower left corner, or of another one."""
-    return f"{(tile[0] + right) * side:.10g}, {(tile[1] + up) * side:.10g}"
-
-
-def _plan(tiles: Sequence[Mapping[str, Any]], side: float) -> dict[str, Any] | None:
-    """Every tile as a square, the darker the longer it took; none where there are too many for a page."""
-    if not 0 < len(tiles) <= DRAWN:
-        return None
-    columns, rows = zip(*(t["tile"] for t in tiles), strict=True)
-    left, low, right, top = min(columns), min(rows), max(columns), max(rows)
-    slowest = max((t["seconds"] for t in tiles if t["state"] == "done"), default=0.0)
-
-    def square(t: Mapping[str, Any]) -> dict[str, Any]:
-        shade = 0.25 + 0.75 * (t["seconds"] / slowest if slowest else 0.0) if t["state"] == "done" else None
-        x, y = t["tile"][0] - left, top - t["tile"][1]
-        return {"reason": "", **t, "x": x, "y": y, "corner": _corner(t["tile"], side), "shade": shade}
-
-    wide, high = right - left + 1, top - low + 1
-    return {
-        "wide": wide,
-        "high": high,
-        "pixels": min(820, max(240, wide * 60)),
-        "tiles": [square(t) for t in tiles],
-        "failed": sum(t["state"] == "failed" for t in tiles),
-        "slowest": slowest,
-        "upper_left": _corner((left, top), side, up=1),
-        "upper_right": _corner((right, top), side, right=1, up=1),
-        "lower_left": _corner((left, low), side),
-        "lower_right": _corner((right, low), side, right=1),
-    }

@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import math
 import os
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from scipy import ndimage
 
-from ..base.asprs import class_color, class_name
+from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
 from .raster import BACKGROUND, Surface, paint, shading, surface
 
-INK = (34, 38, 44)
 RIGHT, WRONG, IGNORED = (196, 196, 192), (204, 24, 32), (232, 232, 228)
 #: The color of each class code, (256, 3) uint8.
 CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
 #: Color ramps, as a few anchors: heights like a tinted map; values dark to bright with even lightness.
 _RAMPS = {
     "height": (
-        (38, 84, 106),
-        (62, 128, 112),
-        (132, 170, 104),
-        (208, 200, 130),
-        (206, 152, 98),
-        (172, 102, 84),
-        (233, 204, 186),
+        (38, 84, 106), (62, 128, 112), (132, 170, 104), (208, 200, 130), (206, 152, 98), (172, 102, 84), (233, 204, 186)
     ),
     "value": ((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132), (122, 209, 81), (253, 231, 37)),
-}
+}  # fmt: skip
 _GAP = 12
 
 
@@ -52,6 +46,11 @@ def png(rgb: npt.NDArray[np.uint8]) -> bytes:
     file = io.BytesIO()
     image.quantize(256, dither=Image.Dither.NONE).save(file, "PNG")
     return file.getvalue()
+
+
+def embedded(rgb: npt.NDArray[np.uint8]) -> dict[str, Any]:
+    """An image for a template: its file as text, its size."""
+    return {"base64": base64.b64encode(png(rgb)).decode("ascii"), "tall": rgb.shape[0], "wide": rgb.shape[1]}
 
 
 def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8]) -> Path:
@@ -169,7 +168,7 @@ def triptych(
     *,
     width: int = 1500,
 ) -> np.ndarray:
-    """Heights, classes and errors side by side, with captions, a scale and a legend.
+    """Heights, classes and errors (wrong points red) side by side.
 
     Parameters
     ----------
@@ -178,7 +177,7 @@ def triptych(
     truth : (n,) integer, optional
         Reference classes; without them there is no panel of errors.
     width : int
-        Pixels across all panels.
+        Pixels across all panels, about.
 
     Returns
     -------
@@ -186,50 +185,13 @@ def triptych(
     """
     x, y, z, predicted, *true = columns(x=x, y=y, z=z, predicted=predicted, truth=truth)
     panels = 2 + len(true)
-    each = (int(width) - _GAP * (panels + 1)) // panels
-    s = surface(x, y, z, each)
-    shown = {
-        "Heights (shaded)": ramp(s.z, name="height"),
-        "Predicted classes": CLASS_COLORS[s.spread(predicted, 0)],
-    }
-    entries = [(f"{c} {class_name(c)}", class_color(c)) for c in np.unique(predicted).tolist()]
+    s = surface(x, y, z, (int(width) - _GAP * (panels - 1)) // panels)
+    shown = [ramp(s.z, name="height"), CLASS_COLORS[s.spread(predicted, 0)]]
     for known in true:
         wrong = predicted != known
-        title = f"Errors: {100 * wrong.mean():.1f} % of {len(x):,} points"
-        shown[title] = verdict(s, x, y, z, wrong, np.zeros_like(wrong))
-        entries += [("right", RIGHT), ("wrong", WRONG)]
-
-    font, light, top = ImageFont.load_default(16), shading(s), 36  # Pillow's own: alike on every machine
-    below = top + s.which.shape[0]
-    legend, high = _legend(entries, int(width), font)
-    sheet = Image.new("RGB", (int(width), below + 36 + high), BACKGROUND)
-    pen = ImageDraw.Draw(sheet)
-    for n, (text, colors) in enumerate(shown.items()):
-        left = _GAP + n * (each + _GAP)
-        pen.text((left + 2, top - 14), text, INK, font, anchor="lm")
-        sheet.paste(Image.fromarray(paint(s, colors, light)), (left, top))
-    length = nice_step(0.2 * each * s.pixel)
-    long = max(2, round(length / s.pixel))
-    pen.rectangle((_GAP + 2, below + 15, _GAP + 1 + long, below + 19), fill=INK)
-    pen.text((_GAP + long + 10, below + 17), f"{length:g} m", INK, font, anchor="lm")
-    for left, down, text, color in legend:
-        pen.rectangle(
-            (left, below + 36 + down, left + 17, below + 53 + down), fill=color, outline=(90, 90, 90)
-        )
-        pen.text((left + 26, below + 45 + down), text, INK, font, anchor="lm")
-    return np.array(sheet)
-
-
-def _legend(entries: Sequence[tuple[str, tuple[int, int, int]]], width: int, font) -> tuple[list, int]:
-    """Where the color patches with their texts stand in lines of some width (left, down, text, color); their height."""
-    spots, left, down = [], 16, 6
-    for text, color in entries:
-        need = 48 + round(font.getlength(text))
-        if left + need > width and left > 16:
-            left, down = 16, down + 28
-        spots.append((left, down, text, color))
-        left += need
-    return spots, down + 30
+        shown.append(verdict(s, x, y, z, wrong, np.zeros_like(wrong)))
+    light, gap = shading(s), np.full((len(s.z), _GAP, 3), BACKGROUND, np.uint8)
+    return np.concatenate([part for colors in shown for part in (gap, paint(s, colors, light))][1:], axis=1)
 
 
 def nice_step(rough: float) -> float:
