@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from bisect import bisect
 from dataclasses import dataclass
-from json.decoder import JSONArray  # type: ignore[attr-defined]
-from json.scanner import py_make_scanner  # type: ignore[attr-defined]
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +77,7 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
     if not clean.strip():
         raise PipelineError("the pipeline is empty", where=name or None)
     try:
-        value = _Decoder().decode(clean)
+        value = json.loads(clean, parse_constant=_no_constant)
     except json.JSONDecodeError as error:
         raise PipelineError(
             f"the pipeline is not valid JSON: {error.msg}",
@@ -92,41 +89,35 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
         found = str(error)[:200]
         raise PipelineError("the pipeline is not valid JSON", where=name or None, found=found) from None
     stages = value.get("pipeline") if isinstance(value, dict) else value
-    if not isinstance(stages, _Stages):
+    if not isinstance(stages, list):
         what, found = "must be a list or an object", type(value).__name__
         if isinstance(value, dict):
             what = "has no list named 'pipeline'"
             found = f"an object with {', '.join(map(repr, value)) or 'nothing in it'}"[:200]
         cure = 'Write {"pipeline": [...]}, or the list alone'
         raise PipelineError(f"the pipeline {what}", where=name or None, found=found, cure=cure)
-    ends = [match.start() for match in re.finditer("\n", clean)]
-    return _checked(PipelineSource(stages, [bisect(ends, at) + 1 for at in stages.starts], name))
+    start = len(clean) - len(clean.lstrip())
+    if isinstance(value, dict):
+        inside = _places(clean, start)
+        keys = [_decoder.raw_decode(clean, at)[0] for at in inside[::2]]
+        start = dict(zip(keys, inside[1::2], strict=True))["pipeline"]
+    lines = [clean.count("\n", 0, at) + 1 for at in _places(clean, start)]
+    return _checked(PipelineSource(stages, lines, name))
 
 
-class _Stages(list):
-    """A list, and where in the text its items begin."""
+def _places(text: str, at: int) -> list[int]:
+    """Where the items of a list begin, or the keys and values of an object, whose bracket is there; it is valid JSON."""
+    places: list[int] = []
+    while True:
+        while text[(at := at + 1)] in " \t\r\n,:":
+            pass
+        if text[at] in "]}":
+            return places
+        places.append(at)
+        at = _decoder.raw_decode(text, at)[1] - 1
 
-    starts: list[int]
 
-
-class _Decoder(json.JSONDecoder):
-    def __init__(self) -> None:
-        super().__init__(parse_constant=_no_constant)
-        self.parse_array: Any = self._array
-        self.scan_once = py_make_scanner(self)
-
-    @staticmethod
-    def _array(begin: tuple[str, int], scan: Any) -> tuple[_Stages, int]:
-        starts: list[int] = []
-
-        def noted(text: str, at: int) -> Any:
-            starts.append(at)
-            return scan(text, at)
-
-        values, end = JSONArray(begin, noted)
-        found = _Stages(values)
-        found.starts = starts
-        return found, end
+_decoder = json.JSONDecoder()
 
 
 def _no_constant(word: str) -> None:
