@@ -89,12 +89,14 @@ def judge(model: Model, test: TrainingCloud, merged: dict | None, threads: int, 
     labels = np.asarray(test.labels)
     known = np.isin(labels, codes)
     accuracy = Accuracy.from_labels(labels, found.classification, classes=tuple(codes))
+    one = tuple(code for code in codes if code not in (3, 4))
+    joined = Accuracy.from_labels(labels, found.classification, classes=one, merge=merged)
     wrong = (found.classification != labels)[known]
     out = {
         "what": what,
         **figures(accuracy),
         "f1": {str(one.code): round(100 * (one.f1 or 0.0), 2) for one in accuracy.per_class},
-        "merged": figures(accuracy.merge(merged)) if merged else None,
+        "merged": figures(joined) if merged else None,
         "confusion": accuracy.matrix.tolist() if hasattr(accuracy, "matrix") else None,
         "test_points": len(labels),
         "classify_seconds": took,

@@ -109,6 +109,8 @@ def score(data: Path, scene: str, options: TrainingOptions, progress: bool) -> d
         reference[truth == options.target] = options.target
         classes, merged = (options.background, options.target), None  # type: ignore[assignment]
     result = Accuracy.from_labels(reference, prediction.classification, classes=classes)
+    one = [code for code in classes if code not in (3, 4)]
+    joined = Accuracy.from_labels(reference, prediction.classification, classes=one, merge=merged)
     wall = timer.parts["classify"][0]
     out = {
         "scene": scene,
@@ -120,7 +122,7 @@ def score(data: Path, scene: str, options: TrainingOptions, progress: bool) -> d
         "target": options.target,
         **figures(result),
         "f1": {str(one.code): round(100 * (one.f1 or 0), 2) for one in result.per_class},
-        "merged": figures(result.merge(merged)) if merged else None,
+        "merged": figures(joined) if merged else None,
         "cross_validated": (model.info["accuracy"]["cross_validation"] or {}).get("chosen"),
         "train_points": len(xyz),
         "samples": sum(entry["samples"] for entry in model.info["classes"]),

@@ -88,17 +88,18 @@ class Merge:
 
     @classmethod
     def parse(cls, mapping: Mapping[Any, Any] | None) -> Merge:
-        """Read ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``; keys and codes may be text.
+        """Read ``{5: [3, 4]}``; keys and codes may be text.
 
-        StageError for something that is not a class code, or a class sent to two others.
+        StageError for what is not a list of class codes, or a class sent to two others.
         """
         to = np.arange(MAX_CODE + 1)
         members: dict[int, set[int]] = {}
         for key, value in (mapping or {}).items():
-            if isinstance(value, (str, int, np.integer)):
-                (target,), sources = code_list([value], "merge"), code_list([key], "merge")
-            else:
-                (target,), sources = code_list([key], "merge"), code_list(value, "merge")
+            if not isinstance(value, list | tuple | set | np.ndarray):
+                raise StageError(
+                    "'merge' names lists of classes", found=repr(value), cure="As in {5: [3, 4]}"
+                )
+            (target,), sources = code_list([key], "merge"), code_list(value, "merge")
             for source in sources:
                 if to[source] not in (source, target):
                     raise StageError(

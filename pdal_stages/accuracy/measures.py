@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -33,22 +32,6 @@ from .text import CONFUSIONS, table
 
 FORMAT = "pdal-stages accuracy"
 VERSION = 1
-#: Standard deviations within which 95 % of a normal distribution lie.
-_Z = 1.959964
-
-
-def wilson(hits: int, n: int) -> tuple[float, float] | None:
-    """Wilson's 95 % score interval of a share; None where n is 0.
-
-    It takes the points as independent. Neighboring points of a scan are not, so the true
-    uncertainty is larger: read it as a lower bound.
-    """
-    if n == 0:
-        return None
-    p, z = hits / n, _Z
-    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 @dataclass(frozen=True)
@@ -64,8 +47,6 @@ class ClassFigures:
     precision: float | None
     f1: float | None
     iou: float | None
-    recall_interval: tuple[float, float] | None
-    precision_interval: tuple[float, float] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +101,7 @@ class Accuracy:
         reliability, margin : (n,) arrays, optional
             Winning probability, and winning minus second, both from 0 to 1.
         merge : mapping, optional
-            Classes to take as one, on both sides: ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
+            Classes to take as one, on both sides: ``{5: [3, 4]}``.
         allow_empty : bool
             Whether no point to compare is allowed (a tile without reference points, to be added to others).
 
@@ -197,14 +178,13 @@ class Accuracy:
         """
         rows, more = code_list(classes, "classes"), code_list(extra, "extra")
         counts = np.asarray(matrix)
-        if counts.shape != (len(rows), len(rows) + len(more)) or not rows:
+        fits = counts.shape == (len(rows), len(rows) + len(more)) and len(rows) > 0
+        if not fits or len(set(rows + more)) != len(rows) + len(more):
             raise StageError(
                 "the confusion matrix does not fit its classes",
-                found=f"shape {counts.shape} for {len(rows)} classes and {len(more)} extra columns",
+                found=f"shape {counts.shape} for classes {rows} and extra columns {more}",
                 cure="Give one row per class, and one column per class and extra class",
             )
-        if len(set(rows + more)) != len(rows) + len(more):
-            raise StageError("duplicate class in the confusion matrix", found=rows + more)
         whole = np.array(counts, dtype=np.int64)
         if (whole != counts).any() or (whole < 0).any():
             raise StageError("a confusion matrix holds counts: whole numbers of 0 or more")
@@ -213,41 +193,6 @@ class Accuracy:
         left = {int(c): int(n) for c, n in (left_out or {}).items()}
         codes = tuple(sorted(rows)) + tuple(sorted(more))
         return cls(codes[: len(rows)], codes[len(rows) :], whole, class_names((*codes, *left), names), left)
-
-    def merge(self, mapping: Mapping[Any, Any], names: Mapping[int, str] | None = None) -> Accuracy:
-        """The accuracy with some classes taken as one: ``{5: [3, 4]}`` or ``{3: 5, 4: 5}``.
-
-        Confusions inside a merged class become right, so the gradings of reliability and margin, which
-        do not know them, are dropped; use `merge` of :meth:`from_labels` to keep them.
-        """
-        merged = Merge.parse(mapping)
-        of_rows, of_columns = merged.target_of[list(self.classes)], merged.target_of[list(self.columns)]
-        rows = tuple(np.unique(of_rows).tolist())
-        columns, matrix = regroup(rows, (self.matrix, of_rows, of_columns))
-        self._refuse_clash(
-            [int(merged.target_of[c]) for c in self.left_out],
-            rows,
-            "merging joins a compared class with one that was left out",
-            "Compare the labels again with this merge",
-        )
-        known = {c: n for c, n in self.names.items() if int(merged.target_of[c]) == c}
-        return Accuracy(
-            rows,
-            columns[len(rows) :],
-            matrix,
-            class_names((*columns, *self.left_out), {**known, **merged.names, **(names or {})}),
-            self.left_out,
-            merged={**{c: int(merged.target_of[t]) for c, t in self.merged.items()}, **merged.changed},
-        )
-
-    def _refuse_clash(self, left: Iterable[int], rows: Iterable[int], what: str, cure: str) -> None:
-        """Refuse classes that are compared in one part and left out in another.
-
-        A code that others were merged into may be both: its own points left out, theirs compared.
-        """
-        clash = sorted(set(left) & set(rows) - set(self.merged.values()))
-        if clash:
-            raise StageError(what, found=f"class {clash[0]}", cure=cure)
 
     def __add__(self, other: Accuracy) -> Accuracy:
         if not isinstance(other, Accuracy):
@@ -259,12 +204,13 @@ class Accuracy:
             c: self.left_out.get(c, 0) + other.left_out.get(c, 0)
             for c in sorted(set(self.left_out) | set(other.left_out))
         }
-        self._refuse_clash(
-            left,
-            rows,
-            "two accuracies do not add: one compares a class that the other leaves out",
-            "Compare both with the same 'classes' and 'ignore'",
-        )
+        # A code that others were merged into may be both: its own points left out, theirs compared.
+        if clash := sorted(set(left) & set(rows) - set(self.merged.values())):
+            raise StageError(
+                "two accuracies do not add: one compares a class that the other leaves out",
+                found=f"class {clash[0]}",
+                cure="Compare both with the same 'classes' and 'ignore'",
+            )
         if self.merged != other.merged and self.points and other.points:
             raise StageError(
                 "two accuracies do not add: they merge different classes",
@@ -344,12 +290,6 @@ class Accuracy:
         return self.correct / self.points
 
     @property
-    def overall_accuracy_interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval of the overall accuracy; see :func:`wilson` for what it leaves out."""
-        self._checked()
-        return wilson(self.correct, self.points)  # type: ignore[return-value]
-
-    @property
     def kappa(self) -> float | None:
         """Cohen's kappa: agreement beyond chance; None where chance agrees on everything."""
         self._checked()
@@ -388,8 +328,6 @@ class Accuracy:
                     precision=hit / given if given else (0.0 if support else None),
                     f1=2 * hit / (support + given) if support + given else None,
                     iou=hit / (support + given - hit) if support + given else None,
-                    recall_interval=wilson(hit, support),
-                    precision_interval=wilson(hit, given),
                 )
             )
         return tuple(figures)
@@ -436,16 +374,12 @@ class Accuracy:
             "merged": {str(c): t for c, t in sorted(self.merged.items())},
             "predicted_outside_reference": {"points": self.extra_points, "classes": described(self.extra)},
             "overall_accuracy": self.overall_accuracy,
-            "overall_accuracy_interval": list(self.overall_accuracy_interval),
             "kappa": self.kappa,
             "mean_class_recall": self.mean_class_recall,
             "mean_class_precision": self.mean_class_precision,
             "mean_f1": self.mean_f1,
             "mean_iou": self.mean_iou,
-            "classes": [
-                {key: list(value) if isinstance(value, tuple) else value for key, value in vars(f).items()}
-                for f in self.per_class
-            ],
+            "classes": [dict(vars(f)) for f in self.per_class],
             "confusion": {
                 "rows": described(self.classes),
                 "columns": described(self.columns),
