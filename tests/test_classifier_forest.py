@@ -8,7 +8,7 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.classifier.forest import MAX_DEPTH, Forest, TreeOptions, float32_at_most, grow_forest
+from pdal_stages.classifier.forest import MAX_DEPTH, Forest, float32_at_most, grow_forest
 
 
 def data(n=600, features=17, classes=4, seed=0):
@@ -205,8 +205,8 @@ def test_growing_does_not_depend_on_threads_and_counts_weights():
     x, y = data(300)
     weight = np.ones(300, np.int64)
     weight[:50], weight[290:] = 3, 0
-    setting = TreeOptions(min_samples_leaf=2, max_samples=0.5)
-    one, other = (grow_forest(x, y, weight, 7, setting, 4, threads) for threads in (1, 3))
+    setting = {"seed": 4, "min_samples_leaf": 2, "max_samples": 0.5}
+    one, other = (grow_forest(x, y, weight, 7, threads=threads, **setting) for threads in (1, 3))
     for name, array in one[0].arrays().items():
         assert np.array_equal(array, other[0].arrays()[name])
     assert np.array_equal(one[1], other[1]) and one[1].sum() == pytest.approx(1)
@@ -217,5 +217,4 @@ def test_growing_does_not_depend_on_threads_and_counts_weights():
 @pytest.mark.parametrize("asked", ["auto", "sqrt", "log2", 5, 700, 0.1])
 def test_any_number_of_features_may_be_tried(asked):
     x, y = data(60)
-    grow_forest(x, y, np.ones(60, np.int64), 1, TreeOptions(max_features=asked), 0)
-    assert TreeOptions().tried(64) == 8 and TreeOptions().tried(569) == 56
+    grow_forest(x, y, np.ones(60, np.int64), 1, max_features=asked, seed=0)

@@ -224,7 +224,6 @@ def test_options():
     for bad in (
         {"passes": 4},
         {"passes": 0},
-        {"pass_folds": 1},
         {"passes": 2, "context": []},
         {"context": "box3"},
     ):

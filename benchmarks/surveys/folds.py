@@ -22,7 +22,7 @@ from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.clouds import label_classes
 from pdal_stages.classifier.context import Context, count_shares
 from pdal_stages.classifier.featureforest import CloudFeatures, Features
-from pdal_stages.classifier.forest import TreeOptions, grow_forest
+from pdal_stages.classifier.forest import grow_forest
 from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.stages.loading import load_model
@@ -67,10 +67,11 @@ class LeaveOneOut:
         self._pair = cache(self._grown_without)
 
     def _grow(self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int) -> Forest:
-        setting = TreeOptions(OPTIONS.min_samples_leaf, OPTIONS.max_samples, OPTIONS.max_features)
+        names = ("seed", "min_samples_leaf", "max_samples", "max_features")
+        setting = {name: getattr(OPTIONS, name) for name in names}
         weight = self.samples.weight * kept
         values = np.asfortranarray(values)
-        return grow_forest(values, self.samples.label, weight, trees, setting, OPTIONS.seed)[0]
+        return grow_forest(values, self.samples.label, weight, trees, **setting)[0]
 
     def _grown_without(self, one: int, other: int) -> Forest:
         kept = (self.survey != one) & (self.survey != other)

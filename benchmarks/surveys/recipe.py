@@ -38,7 +38,6 @@ OPTIONS = TrainingOptions(
     min_samples_leaf=10,
     prior_weight=0.0,
     passes=3,
-    pass_folds=len(SURVEYS),
     context=("own", "box1", "box4", "columnvotes2", "columnvotes4"),
     folds=0,
     voxel=0.25,

@@ -22,14 +22,13 @@ CHECKED = "Checked"
 #: Derived here: ReturnNumber / NumberOfReturns, 1 for a last or only return.
 RETURN_RATIO = "ReturnRatio"
 
+_READ = "It comes from the reader; this source has none. Use a model trained without it"
 _MAKERS = {
     "HeightAboveGround": (
         "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological before this stage, or "
         "what the model was trained with"
     ),
-    "Intensity": "It comes from the reader; this source has none. Use a model trained without it",
-    "ReturnNumber": "It comes from the reader; this source has none. Use a model trained without it",
-    "NumberOfReturns": "It comes from the reader; this source has none. Use a model trained without it",
+    **dict.fromkeys(("Intensity", *returns.SOURCES), _READ),
 }
 
 
@@ -54,16 +53,11 @@ def known(
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
 ) -> list[npt.NDArray[Any]]:
-    """Values (n,) of the dimensions that these features must have, and of those they use where a cloud has them.
-
-    Parameters and errors as for :func:`gather`; what is not at `rows` is not looked at.
-    """
-    there = (name for name in welcome(names) if name in dimensions)
-    found = []
-    for name in (*required(names), *there):
-        if gather((name,), dimensions, n, rows, where)[0]:  # one after the other: it may be a copy
-            found.append(np.asarray(dimensions[name]))
-    return found
+    """Values (n,) of the dimensions that these features need, checked as by :func:`gather`, and of those that they use."""
+    found = [*required(names), *(name for name in welcome(names) if name in dimensions)]
+    for name in found:
+        gather((name,), dimensions, n, rows, where)  # one after the other: it may be a copy
+    return [np.asarray(dimensions[name]) for name in found]
 
 
 def with_returns(
@@ -89,11 +83,9 @@ def gather(
     Parameters
     ----------
     names : iterable of str
-        Dimension features, ``ReturnRatio`` among them or not.
     dimensions : mapping
         Name to (n,) values of the whole cloud; see :func:`with_returns`.
     n : int
-        Points in the cloud.
     rows : array of int, optional
         Points wanted; all by default.
     where : str, optional

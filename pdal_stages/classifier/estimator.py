@@ -12,7 +12,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from ..base.errors import OptionError
-from .model import Model
+from .deciding import Prediction
 from .training import train
 from .trainoptions import DEFAULT_PASSES, TrainingOptions
 
@@ -84,16 +84,7 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
     def fit(
         self, X: npt.ArrayLike, y: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
     ) -> PointClassifier:
-        """Train on a labeled cloud.
-
-        Parameters
-        ----------
-        X : (n, 3) array
-        y : (n,) int
-            Class codes, 0 to 255.
-        dimensions : mapping, optional
-            Name to (n,) values; without, heights are made of the coordinates.
-        """
+        """Train on a cloud (n, 3) with class codes (n,); `dimensions` (name to (n,) values) are heights by default."""
         options = self.options
         if options is None:
             given = {k: v for k, v in self.get_params(deep=False).items() if k != "options"}
@@ -105,27 +96,28 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
             raise OptionError(
                 f"there must be one label for each of the {len(xyz):,} points", found=f"shape {labels.shape}"
             )
-        model = train(xyz, labels, options, dimensions=dimensions, progress=False)
-        self.model_: Model = model
-        self.classes_ = model.codes
+        self.model_ = train(xyz, labels, options, dimensions=dimensions, progress=False)
+        self.classes_ = self.model_.codes
         self.n_features_in_ = 3
         return self
+
+    def _predicted(self, X: npt.ArrayLike, dimensions: Any, **more: Any) -> Prediction:
+        check_is_fitted(self)
+        return self.model_.predict(_cloud(X), dimensions, threads=self.threads, **more)
 
     def predict(
         self, X: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
     ) -> npt.NDArray[np.uint8]:
         """ASPRS codes of a cloud's points, (n,)."""
-        check_is_fitted(self)
-        return self.model_.predict(_cloud(X), dimensions, threads=self.threads).classification
+        return self._predicted(X, dimensions).classification
 
     def predict_proba(
         self, X: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
     ) -> npt.NDArray[np.float32]:
         """Probabilities of ``classes_``, (n, k)."""
-        check_is_fitted(self)
-        found = self.model_.predict(_cloud(X), dimensions, threads=self.threads, probabilities=True)
-        assert found.probabilities is not None
-        return found.probabilities
+        found = self._predicted(X, dimensions, probabilities=True).probabilities
+        assert found is not None
+        return found
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the model file."""

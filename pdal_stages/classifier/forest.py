@@ -210,30 +210,16 @@ def walk(values, sizes, nodes, shares, out):
                         out[row + lane, c] += shares[leaf, c]
 
 
-@dataclass(frozen=True)
-class TreeOptions:
-    """How each tree is grown; see ``TrainingOptions``."""
-
-    min_samples_leaf: int = 1
-    max_samples: float = 1.0
-    max_features: str | int | float = "auto"
-
-    def tried(self, features: int) -> str | int | float:
-        """Features tried at a split, as scikit-learn takes it; ``auto``: a tenth of them, but at least their root."""
-        if self.max_features == "auto":
-            return max(1, math.isqrt(features), features // 10)
-        if isinstance(self.max_features, int | np.integer):
-            return min(int(self.max_features), features)
-        return self.max_features
-
-
 def grow_forest(
     values: npt.NDArray[np.float32],
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
     trees: int,
-    options: TreeOptions,
+    *,
     seed: int,
+    min_samples_leaf: int = 1,
+    max_samples: float = 1.0,
+    max_features: str | int | float = "auto",
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[Forest, npt.NDArray[np.float64]]:
@@ -247,12 +233,17 @@ def grow_forest(
         Class positions; every class occurs, if only with weight 0.
     weight : (n,) int
         Times a row counts; rows of weight 0 take no part.
+    min_samples_leaf, max_samples, max_features
+        See ``TrainingOptions``.
     """
     from sklearn.tree import DecisionTreeClassifier
 
-    ends = np.cumsum(weight)
-    draws = max(1, round(options.max_samples * int(ends[-1])))
-    tried = options.tried(values.shape[1])
+    ends, features = np.cumsum(weight), values.shape[1]
+    draws = max(1, round(max_samples * int(ends[-1])))
+    if max_features == "auto":
+        max_features = max(1, math.isqrt(features), features // 10)
+    elif isinstance(max_features, int | np.integer):
+        max_features = min(int(max_features), features)
 
     def one(number: int) -> tuple[Any, npt.NDArray[np.float64]]:
         random = np.random.default_rng([seed, number])
@@ -260,18 +251,18 @@ def grow_forest(
         bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
         state = int(random.integers(0, 2**31 - 1))
         tree = DecisionTreeClassifier(
-            max_features=tried, min_samples_leaf=options.min_samples_leaf, random_state=state
+            max_features=max_features, min_samples_leaf=min_samples_leaf, random_state=state
         )
         tree.fit(values, label, sample_weight=bag, check_input=False)
         return tree.tree_, tree.feature_importances_
 
-    grown, total = [], np.zeros(values.shape[1])
+    grown, total = [], np.zeros(features)
     for tree, importances in map_blocks(one, range(trees), threads):
         grown.append(tree)
         total += importances
         if progress is not None:
             progress.update(1)
-    return Forest.from_sklearn(grown, values.shape[1]), total / (total.sum() or 1.0)
+    return Forest.from_sklearn(grown, features), total / (total.sum() or 1.0)
 
 
 def _laid_out(

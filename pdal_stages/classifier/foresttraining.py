@@ -25,7 +25,7 @@ from .clouds import TrainingCloud, densities, label_classes, listed
 from .context import OWN, Context
 from .dimensions import WHERE_THERE, gather, required
 from .featureforest import CloudFeatures, FeatureForest, Features
-from .forest import Forest, TreeOptions, grow_forest
+from .forest import Forest, grow_forest
 from .holdout import BLOCK, Folds, figures, split
 from .model import Model
 from .passes import FoldForests, sample_context
@@ -36,6 +36,8 @@ from .trainoptions import PER_TREE, TrainingOptions, feature_plan
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25
+#: Parts of the training ground held out in turn to train the passes after the first.
+PASS_FOLDS = 5
 #: In the counts: samples of tiles whose nearest neighbors lie beyond the halo of their features.
 SHORT = "short_of_neighbors"
 
@@ -111,7 +113,13 @@ class _ForestTraining:
         share = options.max_samples
         if share is None:
             share = min(1.0, PER_TREE * len(self.codes) / int(weight.sum()))
-        self.setting = TreeOptions(options.min_samples_leaf, share, options.max_features)
+        self.setting: dict[str, Any] = {
+            "seed": options.seed,
+            "min_samples_leaf": options.min_samples_leaf,
+            "max_samples": share,
+            "max_features": options.max_features,
+            "threads": options.threads,
+        }
         self.fold_trees = max(1, math.ceil(options.trees * FOLD_TREES))
 
     def _features_of_samples(self) -> npt.NDArray[np.float32]:
@@ -177,10 +185,9 @@ class _ForestTraining:
                 "count": o.count,
                 "seed": o.seed,
                 "samples": len(self.samples),
-                "max_samples": self.setting.max_samples,
+                "max_samples": self.setting["max_samples"],
                 "max_features": o.max_features,
                 "min_samples_leaf": o.min_samples_leaf,
-                **({"pass_folds": o.pass_folds} if o.passes > 1 else {}),
                 **notes,
                 **self._held_by_base(),
                 **{key: n for key, n in self.counts.items() if n},
@@ -210,8 +217,7 @@ class _ForestTraining:
     def _grow(
         self, values: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], trees: int, bar: Progress
     ) -> tuple[Forest, npt.NDArray[np.float64]]:
-        o = self.options
-        return grow_forest(values, self.samples.label, weight, trees, self.setting, o.seed, o.threads, bar)
+        return grow_forest(values, self.samples.label, weight, trees, progress=bar, **self.setting)
 
     def _without_each(
         self,
@@ -318,7 +324,7 @@ class _ForestTraining:
         held_out: list[list[FeatureForest]] = []
         values, folds = self.first, None
         if o.passes > 1:
-            folds = Folds.of_ground(self.xy, samples.label, samples.weight, self.flights, o.pass_folds)
+            folds = Folds.of_ground(self.xy, samples.label, samples.weight, self.flights, PASS_FOLDS)
             fold = samples.take(lambda number: folds.points(self.clouds[number].xyz, self.flights[number]))
         for number in range(o.passes):
             if number:

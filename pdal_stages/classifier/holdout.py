@@ -87,10 +87,10 @@ class Folds:
         surveys: Sequence[str],
         folds: int,
     ) -> Folds:
-        """Whole surveys where there are enough, else blocks as small as need be."""
+        """Whole surveys where there are enough, up to twice as many folds, else blocks as small as need be."""
         names = sorted(set(surveys))
         if len(names) >= SURVEYS:
-            folds = min(folds, len(names))
+            folds = min(2 * folds, len(names))
             return cls(folds, {name: number % folds for number, name in enumerate(names)})
         side = BLOCK
         while True:

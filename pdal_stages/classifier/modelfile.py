@@ -110,8 +110,7 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
     ----------
     path : path
     rules_of : function
-        From a pass's ``algorithm`` to its arrays' rules (name to :class:`ArrayRule`, a name that ends
-        in ``*`` stands for many); raises for an algorithm it does not know.
+        From a pass's ``algorithm`` to its arrays' rules; raises for an algorithm it does not know.
 
     Raises
     ------
@@ -120,12 +119,11 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
     """
     path = Path(path)
     try:
-        if not path.exists():
-            raise ModelError("there is no such model file", cure="Check the path")
         if not path.is_file():
-            raise ModelError("the model is not a file", cure="Check the path")
+            what = "the model is not a file" if path.exists() else "there is no such model file"
+            raise ModelError(what, cure="Check the path")
         with zipfile.ZipFile(path) as archive:
-            return _read(archive, path.stat().st_size, rules_of, path in shipped().values())
+            return _read(archive, path.stat().st_size, rules_of)
     except zipfile.BadZipFile as error:
         raise ModelError(
             "this is not a model file, or it is cut short or damaged",
@@ -141,7 +139,7 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
         raise ModelError("the model file cannot be read", where=str(path), found=text, cure=CURE) from error
 
 
-def _read(archive: zipfile.ZipFile, size: int, rules_of, own: bool) -> tuple[dict[str, Any], Arrays]:
+def _read(archive: zipfile.ZipFile, size: int, rules_of) -> tuple[dict[str, Any], Arrays]:
     members = {info.filename: info for info in archive.infolist()}
     if len(members) != len(archive.infolist()):
         raise ModelError("the model file has a member twice")
@@ -155,7 +153,7 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of, own: bool) -> tuple[dic
         raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}")
     if members[MANIFEST].file_size > MANIFEST_LIMIT:
         raise ModelError("the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes")
-    manifest = parse(_unpack(archive, members[MANIFEST]), own)
+    manifest = parse(_unpack(archive, members[MANIFEST]))
     rules = [rules_of(one["algorithm"]) for one in manifest["passes"]]
     table = manifest["arrays"]
     expected = {MANIFEST, *(entry["file"] for entry in table.values())}
@@ -215,24 +213,21 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
         if np.lib.format.read_magic(stream) != (1, 0):
             raise ValueError("another version than 1.0")
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        if fortran or dtype.str not in rule.dtypes or len(shape) != rule.ndim:
+            raise ValueError(
+                f"{dtype.str} {shape}, not {' or '.join(rule.dtypes)} with {rule.ndim} axes in C order"
+            )
+        rest = len(data) - stream.tell()
+        if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != rest:
+            raise ValueError(f"{rest:,} bytes of values for shape {shape}")
     except (ValueError, RecursionError, MemoryError) as error:
-        raise ModelError(f"the header of the array '{name}' cannot be read", found=str(error)[:80]) from None
-    if fortran or dtype.str not in rule.dtypes or len(shape) != rule.ndim:
-        raise ModelError(
-            f"the array '{name}' must be {' or '.join(rule.dtypes)} with {rule.ndim} axes, in C order",
-            found=f"{dtype.str} {shape}",
-        )
-    start = stream.tell()
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise ModelError(
-            f"the array '{name}' has another size than its header says",
-            found=f"shape {shape}, {len(data) - start:,} bytes",
-        )
-    return np.frombuffer(data, dtype, offset=start).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
+        raise ModelError(f"the array '{name}' is not what a model has", found=str(error)[:120]) from None
+    values = np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
+    return values.astype(dtype.newbyteorder("="), copy=False)
 
 
-def parse(data: bytes, own: bool = False) -> dict[str, Any]:
-    """The manifest in `data`, valid by its schema; `own` ones, which came with the package, are known to be."""
+def parse(data: bytes) -> dict[str, Any]:
+    """The manifest in `data`, valid by its schema."""
     try:
         manifest = strictjson.loads(data.decode("utf-8"))
     except RecursionError:
@@ -242,14 +237,13 @@ def parse(data: bytes, own: bool = False) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
     version = manifest.get("version")
-    if type(version) is not int or version != VERSION:
+    if type(version) is not int or version != VERSION:  # True is 1
         raise ModelError(
             f"the model file has a version this release does not know (it knows {VERSION})",
             found=f"version {str(version)[:20]}",
             cure="Update pdal-stages",
         )
-    if not own:  # the validator takes 0.07 s to import
-        validate(manifest)
+    validate(manifest)
     return manifest
 
 

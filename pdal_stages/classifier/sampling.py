@@ -1,9 +1,8 @@
 """Training samples: as many of each class, spread over space, whatever the order of the points.
 
-Each class's points are put in the order of a space-filling curve (Morton's, over 0.5 m cells), the
-curve is cut into `count` equal pieces and one point is taken from each, at a position drawn from the seed.
-So samples follow the class wherever it is, none of them clumped, and a class's dense parts weigh as they do
-in the cloud. Ties within a cell are ordered by a hash of the coordinates, never by the order of the points.
+Each class's points are put in the order of a space-filling curve (Morton's, over 0.5 m cells) and taken from it at equal
+steps, from a place drawn by the seed on. So samples follow the class wherever it is, none of them clumped, and a class's
+dense parts weigh as they do in the cloud. Ties within a cell are ordered by a hash of the coordinates.
 """
 
 from __future__ import annotations
@@ -24,9 +23,6 @@ from ..base.progress import Progress
 CELL = 0.5
 #: Points of a class that are put in order at a time; of more, those with the smallest hashes.
 MOST = 5_000_000
-
-#: ((n, 3) float64 coordinates in meters, (n,) class positions) of each cloud; may be made when asked for.
-Clouds = Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +67,7 @@ class Samples:
 
 
 def draw_samples(
-    clouds: Clouds,
+    clouds: Any,
     n_classes: int,
     count: int,
     seed: int,
@@ -120,18 +116,23 @@ def draw_samples(
         quota = share_out(there[:, position], count)
         for group in np.flatnonzero(quota):
             random = [seed, position] if alone else [seed, position, crc32(str(names[group]).encode())]
-            members = np.flatnonzero(of_cloud == group)
-            cloud, row, weight = _draw(
-                clouds,
-                members,
-                position,
-                int(there[group, position]),
-                int(quota[group]),
-                seed,
-                random,
-                progress,
-            )
-            parts.append((cloud, row, np.full(len(row), position, np.int16), weight))
+            limit = np.uint64(min(1.0, MOST / there[group, position]) * (2.0**64 - 2048.0))
+            keys, rows, where = [], [], []
+            for number in np.flatnonzero(of_cloud == group).tolist():
+                xyz, label = clouds[number]
+                mine = np.flatnonzero(label == position)
+                key = curve_keys(xyz[mine], seed)
+                keep = key["hash"] <= limit
+                keys.append(key[keep])
+                rows.append(mine[keep])
+                where.append(np.full(len(rows[-1]), number))
+                if progress is not None:
+                    progress.update(len(label))
+            found, row, cloud = np.concatenate(keys), np.concatenate(rows), np.concatenate(where)
+            order = np.lexsort((found["hash"], found["cell"]))
+            place, weight = spread(len(order), int(quota[group]), np.random.default_rng(random))
+            chosen = order[place]
+            parts.append((cloud[chosen], row[chosen], np.full(len(chosen), position, np.int16), weight))
     cloud, row, label, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Samples(cloud, row, label, weight, tuple(available.tolist()))
 
@@ -142,64 +143,23 @@ def share_out(available: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.in
     if count >= total:  # all of them, the rest as copies
         exact = available * (count / total)
     else:
-        exact = np.zeros(len(available))
-        open_ = available > 0
-        while open_.any():
-            level = (count - exact[~open_].sum()) / np.count_nonzero(open_)
-            full = open_ & (available <= level)
-            if not full.any():
-                exact[open_] = level
-                break
-            exact[full] = available[full]
-            open_ &= ~full
+        exact, open_ = np.zeros(len(available)), len(available)
+        for place in np.argsort(available).tolist():  # the smallest give what they have
+            exact[place] = min(available[place], (count - exact.sum()) / open_)
+            open_ -= 1
     quota = np.floor(exact + 1e-9).astype(np.int64)
     for place in np.argsort(quota - exact, kind="stable")[: count - int(quota.sum())]:
         quota[place] += 1
     return quota
 
 
-def _draw(
-    clouds: Clouds,
-    members: Any,
-    position: int,
-    n: int,
-    count: int,
-    seed: int,
-    random: list[int],
-    progress: Progress | None,
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """(cloud, row, weight) of `count` samples from the n points of a class in some clouds."""
-    limit = np.uint64(2**64 - 1) if n <= MOST else np.uint64(MOST / n * 2.0**64)
-    keys, rows, where = [], [], []
-    for number in members.tolist():
-        xyz, label = clouds[number]
-        mine = np.flatnonzero(label == position)
-        key = curve_keys(xyz[mine], seed)
-        keep = key["hash"] <= limit
-        keys.append(key[keep])
-        rows.append(mine[keep])
-        where.append(np.full(len(rows[-1]), number, np.int64))
-        if progress is not None:
-            progress.update(len(label))
-    key, row, cloud = np.concatenate(keys), np.concatenate(rows), np.concatenate(where)
-    order = np.lexsort((key["hash"], key["cell"]))
-    place, weight = spread(len(order), count, np.random.default_rng(random))
-    chosen = order[place]
-    return cloud[chosen], row[chosen], weight
-
-
 def spread(
     n: int, count: int, random: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """`count` of `n` places in a row, one at random in each of `count` equal pieces, and their weights."""
+    """`count` of `n` places in a row, equally far apart from a random one on, and their weights."""
     share, rest = divmod(count, n)
-    picks = np.zeros(0, np.int64)
-    if rest:
-        picks = np.floor((np.arange(rest) + random.random(rest)) * (n / rest)).astype(np.int64)
-        picks = np.minimum(picks, n - 1)
-        # Where pieces are shorter than two places neighbors can meet in one; push them apart.
-        picks = np.maximum.accumulate(picks - np.arange(rest)) + np.arange(rest)
-        picks = np.minimum(picks, n - rest + np.arange(rest))
+    picks = np.floor((np.arange(rest) + random.random()) * (n / max(rest, 1))).astype(np.int64)
+    picks = np.minimum(picks, n - 1)
     if share == 0:
         return picks, np.ones(rest, np.int64)
     weight = np.full(n, share, np.int64)

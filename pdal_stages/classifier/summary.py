@@ -11,8 +11,6 @@ from .algorithms import REFINED, Column
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"
-#: Training clouds that are listed.
-_CLOUDS = 20
 GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 
 
@@ -53,10 +51,10 @@ def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -
 def text(info: Mapping[str, Any]) -> str:
     """What :func:`describe` gives as a page of text."""
     info = _in_one_line(info)
-    training, several = info["training"], len(info["passes"]) > 1
+    several = len(info["passes"]) > 1
+    every = list(enumerate(info["passes"], 1))
     # A base's own file describes its passes.
-    passes = [(n, one) for n, one in enumerate(info["passes"], 1) if one["algorithm"] == REFINED]
-    passes = passes or list(enumerate(info["passes"], 1))
+    passes = [(number, one) for number, one in every if one["algorithm"] == REFINED] or every
     lines = [score(info), ""]
     for number, one in passes:
         name = f"pass {number}, {one['algorithm']}" if several else one["algorithm"]
@@ -66,31 +64,27 @@ def text(info: Mapping[str, Any]) -> str:
             f"features       {len(one['feature_names'])}: {' '.join(one['features']['neighborhoods'])}",
             f"context        {' '.join(one['context']) or '-'}",
         ]
-    lines += [
-        f"needs          {', '.join(info['required_dimensions']) or 'coordinates only'}",
-        f"halo           {info['halo_m']:g} m",
+    rows: list[tuple[str, Any, str]] = [
+        ("needs", True, ", ".join(info["required_dimensions"]) or "coordinates only"),
+        ("halo", True, f"{info['halo_m']:g} m"),
+        ("prior weight", info.get("priors"), "{0[weight]:g}"),
+        (
+            "strategy",
+            info["strategy"] == "binary",
+            f"binary, target {info['target']}, background {info['background']}",
+        ),
+        ("densities", info.get("densities"), f"{range_text(info.get('densities') or {})} points/m2"),
+        ("voxel", info.get("voxel"), "{0:g} m, which one point stands for"),
+        ("on top of", info.get("base"), "{0[name]}, the passes before (SHA-256 {0[sha256]})"),
+        *(("trained on", c, "{0[name]}, {0[points]:,} points") for c in info["training"]["clouds"]),
+        ("labels", info.get("teacher"), "what {0[name]} is sure of ({0[sure]:g} and more); no person's"),
     ]
-    if info.get("priors"):
-        lines.append(f"prior weight   {info['priors']['weight']:g}")
-    if info["strategy"] == "binary":
-        lines.append(f"strategy       binary, target {info['target']}, background {info['background']}")
-    if densities := info.get("densities"):
-        lines.append(f"densities      {range_text(densities)} points/m2")
-    if info.get("voxel"):
-        lines.append(f"voxel          {info['voxel']:g} m, which one point stands for")
-    if base := info.get("base"):
-        lines.append(f"on top of      {base['name']}, the passes before (SHA-256 {base['sha256']})")
-    lines += [f"trained on     {cloud['name']}, {cloud['points']:,} points" for cloud in training["clouds"]]
-    if teacher := info.get("teacher"):
-        lines.append(
-            f"labels         what {teacher['name']} is sure of ({teacher['sure']:g} and more); no person's"
-        )
+    lines += [f"{name:<15}{said.format(value)}" for name, value, said in rows if value]
     lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 held out':>13}"]
     f1 = held_out(info).get("f1") or {}
     for entry in info["classes"]:
-        name = (
-            entry["name"] if "\\" in entry["name"] else entry["name"][:29]
-        )  # codes of control characters stay
+        name = entry["name"]
+        name = name if "\\" in name else name[:29]  # codes of control characters stay
         lines.append(
             f"{entry['code']:>3} {name:<30}{entry['available']:>12,}{entry['samples']:>10,}"
             f"{entry['duplicates']:>12,}{_percent(f1.get(str(entry['code']))):>13}"
@@ -105,8 +99,7 @@ def text(info: Mapping[str, Any]) -> str:
 
 def range_text(densities: Mapping[str, float]) -> str:
     """``0.3 to 46``, or one number where both are alike."""
-    low, high = f"{densities['low']:.3g}", f"{densities['high']:.3g}"
-    return low if low == high else f"{low} to {high}"
+    return " to ".join(dict.fromkeys(f"{densities[one]:.3g}" for one in ("low", "high") if densities))
 
 
 def _in_one_line(value: Any) -> Any:

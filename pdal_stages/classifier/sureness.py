@@ -1,7 +1,5 @@
-"""How often a model was right where it said how sure it was, on ground that it had not seen; and what follows from it.
-
-From the counts comes, for each class, the reliability from which on its points are right as often as is wanted.
-"""
+"""How often a model was right where it said how sure it was, on ground that it had not seen: from which reliability on
+the points of a class are right as often as is wanted."""
 
 from __future__ import annotations
 
@@ -85,38 +83,31 @@ class Sureness:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a manifest or a file."""
-
-        def short(values: npt.NDArray[np.float64]) -> list[float]:
-            return [float(f"{value:.4g}") for value in values]
-
+        tables = {"right": self.right, "wrong": self.wrong}
         classes = {
-            str(code): {"right": short(self.right[code]), "wrong": short(self.wrong[code])}
+            str(code): {
+                name: [float(f"{value:.4g}") for value in table[code]] for name, table in tables.items()
+            }
             for code in sorted(self.right)
         }
         return {"about": self.about, "classes": classes}
 
     @classmethod
     def from_dict(cls, said: Mapping[str, Any]) -> Sureness:
-        """What :meth:`to_dict` gave.
-
-        Raises
-        ------
-        ModelError
-            If it is something else.
-        """
+        """What :meth:`to_dict` gave; ModelError for something else."""
+        made = cls()
         try:
-            tables: list[dict[int, npt.NDArray[np.float64]]] = [{}, {}]
+            made.about = one_line(str(said["about"]))
             for code, counted in said["classes"].items():
-                for table, name in zip(tables, ("right", "wrong"), strict=True):
-                    values = np.array(counted[name], np.float64)
+                for table, name in ((made.right, "right"), (made.wrong, "wrong")):
+                    table[int(code)] = values = np.array(counted[name], np.float64)
                     if values.shape != (BINS,) or not (values >= 0).all() or not np.isfinite(values).all():
                         raise ValueError(name)
-                    table[int(code)] = values
-            return cls(tables[0], tables[1], one_line(str(said["about"])))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(
                 "the counts of right and wrong points by reliability are damaged", found=str(error)
             ) from None
+        return made
 
 
 def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
@@ -142,19 +133,17 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
     )
 
 
-def of_the_base(own: Mapping[str, Any], base: Mapping[str, Any], path: str) -> dict[str, Any]:
+def of_the_base(own: Mapping[str, Any], base: Mapping[str, Any], path: str) -> Mapping[str, Any]:
     """What a model on top of a base says of itself where its labels are a person's corrections.
 
-    These lie where the base was worst, so how often it was right there says nothing of the rest: of the base's classes
-    counts what is known of the base, where that is, and only of new ones its `own` counts.
+    These lie where the base was worst, so its `own` counts are taken for new classes alone, where the base's are known.
     """
     try:
         known = sureness_of(base, path)
     except OptionError:
-        return dict(own)
+        return own
     about = f"its base ({known.about}), as its own labels lie where that was looked at"
-    classes = {**own.get("classes", {}), **known.to_dict()["classes"]}
-    return {"about": about, "classes": classes}
+    return {"about": about, "classes": {**own.get("classes", {}), **known.to_dict()["classes"]}}
 
 
 def said(known: Sureness, names: Mapping[int, str], accuracy: float) -> list[str]:

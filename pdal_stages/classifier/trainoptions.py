@@ -49,23 +49,21 @@ class TrainingOptions:
         ("s5", "k10", "k20", "k50"),
         "list",
         "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
-        "The default has one sphere and three numbers of neighbors: on surveys a model has not seen these four beat the "
-        "papers' nine, at a fraction of the time.",
     )
     feature_set: Any = setting(
         ("covariance", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest"),
         "list",
         "Groups (covariance, geometric, shapes, surfaces, all) or single features. 'all' is the papers' set",
-        "The default leaves out density, which belongs to the sensor, and shape distributions, and adds the height above "
-        "the lowest point of each neighborhood [HWS16], which tells low vegetation from sloping ground.",
+        "The default adds the height above the lowest point of each neighborhood [HWS16], which tells low vegetation from "
+        "sloping ground.",
     )
     dimensions: Sequence[str] = setting(
         ("HeightAboveGround",),
         "list",
         "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, ReturnRatio, or returns "
         "for all return features",
-        "Intensity depends on sensor, flying height and calibration, and return numbers on the sensor, so a model that uses "
-        "them seldom fits another flight. ``ReturnRatio`` is ReturnNumber / NumberOfReturns.",
+        "Intensity and return numbers depend on the flight, so a model that uses them seldom fits another. ``ReturnRatio`` "
+        "is ReturnNumber / NumberOfReturns.",
     )
     classes: Any = setting(
         None,
@@ -88,8 +86,6 @@ class TrainingOptions:
         40_000,
         "integer",
         "Samples per class; smaller classes are filled up with duplicates",
-        "Of more than 10,000 each tree draws some (see `max_samples`): the forest sees more of the ground, at little more "
-        "time.",
         low=1,
         high=10**8,
     )
@@ -107,7 +103,6 @@ class TrainingOptions:
         "number",
         f"Share of the samples that each tree draws; default: as many as there are, but no more than {PER_TREE:,} of each "
         "class on average",
-        "So more samples show the forest more of the ground at little cost: each tree draws others.",
         low=0,
         high=1,
         above=True,
@@ -121,9 +116,7 @@ class TrainingOptions:
         0.2,
         "number",
         "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
-        "At 0 rare ones are called too often, at 1 hardly at all. Between: each class's probability is multiplied by its "
-        "frequency to this power. The default lies between what suits new ground (held-out tiles gain up to 0.3 and more) "
-        "and held-out blocks amid the training points (0 to 0.1).",
+        "Each class's probability is multiplied by its frequency to this power.",
         low=0,
         high=1,
     )
@@ -148,8 +141,7 @@ class TrainingOptions:
     folds: int | None = setting(
         None,
         "integer",
-        "Folds of cross-validation over groups or spatial blocks; 0 for none; default: 5, with a quarter of the trees",
-        "The default is by survey where there are several, so that every model has an honest score.",
+        "Folds of cross-validation by group, survey or block of ground; 0 for none; default: 5, with a quarter of the trees",
         low=0,
         high=1000,
     )
@@ -175,16 +167,7 @@ class TrainingOptions:
         "list",
         "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5); default: "
         f"{','.join(DEFAULT_CONTEXT)}, of one pass on top of a base {','.join(CONTEXT_OF_BASE)}, of several own besides",
-        "See :class:`pdal_stages.classifier.context.Context`. The default leaves the point's own probabilities out: the "
-        "next pass sees the same features and does better by what is said around it.",
-    )
-    pass_folds: int = setting(
-        5,
-        "integer",
-        "Parts of the training ground held out in turn to train the passes after the first",
-        "Whole surveys where there are three or more, else every so many-th strip of 10 m.",
-        low=2,
-        high=100,
+        "See :class:`pdal_stages.classifier.context.Context`.",
     )
     base: Any = setting(
         None,

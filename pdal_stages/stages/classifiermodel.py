@@ -119,7 +119,6 @@ class ClassifierModel(Stage):
     )
     passes: int | None = trained("passes")
     context: list | None = trained("context")
-    pass_folds: int = trained("pass_folds")
     files: list = option("list", (), "Files that the model names; default: those of the readers")
     memory: int = trained(
         "memory_mb", kind="integer", default=512, name="memory", minimum=16, exclusive=False, maximum=None
