@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages import cli
 from pdal_stages.base.errors import StageError
-from pdal_stages.pipeline.correcting import CorrectionRequest, near_any, partners, write_corrections
+from pdal_stages.pipeline.correcting import near_any, partners, write_corrections
 from pdal_stages.synthetic import write_town
 
 
@@ -93,18 +93,14 @@ def test_changes_are_found_in_any_order(town, tmp_path, how, capsys):
 
 def test_all_around_a_change_was_seen(town, tmp_path):
     corner, _ = changed_copy(town, tmp_path / "after.laz")
-    write_corrections(
-        CorrectionRequest(str(town), str(tmp_path / "o.laz"), str(tmp_path / "after.laz"), around=2.0)
-    )
+    write_corrections(str(town), str(tmp_path / "o.laz"), str(tmp_path / "after.laz"), around=2.0)
     las = laspy.read(tmp_path / "o.laz")
     assert np.array_equal(np.asarray(las["Checked"]) > 0, near_any(np.asarray(las.xyz), corner, 2.0))
     # A second time adds to the first.
     again = laspy.read(tmp_path / "o.laz")
     again.classification[:5] = 21
     again.write(tmp_path / "again.laz")
-    done = write_corrections(
-        CorrectionRequest(str(tmp_path / "o.laz"), str(tmp_path / "p.laz"), str(tmp_path / "again.laz"))
-    )
+    done = write_corrections(str(tmp_path / "o.laz"), str(tmp_path / "p.laz"), str(tmp_path / "again.laz"))
     second = laspy.read(tmp_path / "p.laz")
     assert done.changed == 5 and (second["Checked"][:5] == 1).all()
     assert (np.asarray(second["Checked"]) >= np.asarray(las["Checked"])).all()
@@ -121,7 +117,7 @@ def test_a_copc_file_becomes_a_plain_one(tmp_path):
     after.classification = np.where(np.arange(len(las)) < 50, 9, las.classification)
     after.write(tmp_path / "after.laz")
     out = tmp_path / "checked.laz"
-    found = write_corrections(CorrectionRequest(str(before), str(out), str(tmp_path / "after.laz")))
+    found = write_corrections(str(before), str(out), str(tmp_path / "after.laz"))
     made = laspy.read(out)
     assert found.changed == (np.asarray(las.classification)[:50] != 9).sum() > 0
     assert np.array_equal(made.xyz, las.xyz) and np.array_equal(made.classification, after.classification)
@@ -140,7 +136,7 @@ def test_areas_that_were_looked_at(town, tmp_path):
     fields = {"done": np.array([1, 0], np.int32)}
     pyogrio.raw.write(area, shapes, list(fields.values()), list(fields), driver="GPKG", layer="patches",
                       geometry_type="Polygon", crs=None)  # fmt: skip
-    done = write_corrections(CorrectionRequest(str(town), str(tmp_path / "o.laz"), areas=(str(area),)))
+    done = write_corrections(str(town), str(tmp_path / "o.laz"), areas=(str(area),))
     inside = (xyz[:, 0] <= x + 10) & (xyz[:, 1] <= y + 10)
     assert np.array_equal(np.asarray(laspy.read(tmp_path / "o.laz")["Checked"]) > 0, inside)
     assert done.changed == 0 and done.checked == inside.sum()
@@ -148,7 +144,7 @@ def test_areas_that_were_looked_at(town, tmp_path):
     pyogrio.raw.write(none, shapes, [np.zeros(2, np.int32)], ["done"], driver="GPKG", layer="patches",
                       geometry_type="Polygon", crs=None)  # fmt: skip
     with pytest.raises(StageError, match="no patch is marked as looked at"):
-        write_corrections(CorrectionRequest(str(town), str(tmp_path / "x.laz"), areas=(str(none),)))
+        write_corrections(str(town), str(tmp_path / "x.laz"), areas=(str(none),))
     assert not (tmp_path / "x.laz").exists()
 
 

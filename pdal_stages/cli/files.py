@@ -231,9 +231,8 @@ def _review(options: argparse.Namespace) -> None:
 
 
 def _corrections(options: argparse.Namespace) -> None:
-    from ..pipeline.correcting import CorrectionRequest, write_corrections
+    from ..pipeline.correcting import write_corrections
 
-    areas = tuple(options.area)
-    request = CorrectionRequest(options.before, options.out, options.after or "", areas, options.around)
-    print("\n".join(write_corrections(request).lines()))
-    print(f"written to {request.output}; next: pdal-stages train --base MODEL {request.output} --model NEW")
+    done = write_corrections(options.before, options.out, options.after or "", options.area, options.around)
+    print("\n".join(done.lines))
+    print(f"written to {options.out}; next: pdal-stages train --base MODEL {options.out} --model NEW")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,22 +27,6 @@ _MOST_LOST = 0.1
 _PATCHES, _DONE = "patches", "done"
 
 
-@dataclass(frozen=True)
-class CorrectionRequest:
-    """What was corrected, and where the marked points go."""
-
-    before: str  #: the file as it was classified
-    output: str
-    after: str = ""  #: the same points as a person left them; empty for none
-    areas: tuple[
-        str, ...
-    ] = ()  #: files of polygons inside of which all was looked at, and what was not changed is right
-    around: float = 1.0  #: meters around a changed point within which all was looked at
-
-    def __post_init__(self) -> None:
-        checks.number("'--around'", self.around, 0, 100, unit="m")
-
-
 @dataclass
 class Corrections:
     """What was found."""
@@ -49,68 +34,78 @@ class Corrections:
     points: int
     changed: int  #: points with another class now
     checked: int  #: points that a person has checked, then or now
-    moves: dict[tuple[int, int], int]  #: (class before, class after) -> points
-    notes: list[str] = field(default_factory=list)  #: what the user should know
-
-    def lines(self) -> list[str]:
-        """As text."""
-        share = 100.0 * self.checked / max(self.points, 1)
-        out = [f"{self.points:,} points, {self.changed:,} changed, {self.checked:,} checked ({share:.2f} %)"]
-        out += [
-            f"  {a} became {b}{n:>14,}" for (a, b), n in sorted(self.moves.items(), key=lambda one: -one[1])
-        ]
-        return out + self.notes
+    lines: list[str]  #: all that is to be told
 
 
-def write_corrections(request: CorrectionRequest) -> Corrections:
+def write_corrections(
+    before: str, output: str, after: str = "", areas: Sequence[str] = (), around: float = 1.0
+) -> Corrections:
     """Mark what was checked, and write the points of `before` with the classes of `after`.
 
     All else stays as it is in `before`, whatever the program of the person dropped.
+
+    Parameters
+    ----------
+    before, output : str
+        The file as it was classified, and where the marked points go.
+    after : str
+        The same points as a person left them; empty for none.
+    areas : sequence of str
+        Files of polygons inside of which all was looked at, and what was not changed is right.
+    around : float
+        Meters around a changed point within which all was looked at.
 
     Raises
     ------
     StageError
         If a file cannot be read, or the two do not hold the same points.
     """
-    if not request.after and not request.areas:
+    checks.number("'--around'", around, 0, 100, unit="m")
+    if not after and not areas:
         raise OptionError(
             "there is nothing to mark: neither corrected points nor an area that was looked at",
             cure="Give the corrected file as the second, or --area patches.gpkg",
         )
-    for name in filter(None, (request.before, request.after)):
+    for name in filter(None, (before, after)):
         if not reads_in_parts(name):
             raise StageError("corrections are read from LAS and LAZ files", found=name)
-    if request.output.lower().endswith(".copc.laz"):
-        raise OptionError("corrections are written as LAS or LAZ", found=request.output, cure="Name it .laz")
-    outputs = [Output(request.output, "output")]
-    check_outputs(outputs, [one for one in (request.before, request.after, *request.areas) if one])
-    reference, wkt = reference_and_wkt(request.before)
+    if output.lower().endswith(".copc.laz"):
+        raise OptionError("corrections are written as LAS or LAZ", found=output, cure="Name it .laz")
+    check_outputs([Output(output, "output")], [*filter(None, (before, after)), *areas])
+    reference, wkt = reference_and_wkt(before)
     units = reference.units
-    las = _read(request.before)
+    las = _read(before)
     xyz = np.column_stack([las.x, las.y, las.z])
     codes = np.asarray(las.classification).astype(np.uint8)
     notes: list[str] = []
-    new = codes.copy()
-    if request.after:
-        _from_points(request, las, xyz, new, notes)
+    new = _codes_of(before, after, las, xyz, codes, notes) if after else codes
     changed = new != codes
-    meters = xyz * [units.horizontal, units.horizontal, units.vertical]
-    checked = near_any(meters, changed, request.around)
-    for area in request.areas:
+    checked = near_any(xyz * [units.horizontal, units.horizontal, units.vertical], changed, around)
+    for area in areas:
         checked |= _inside(area, xyz, wkt, notes)
     if CHECKED in las.point_format.extra_dimension_names:
         checked |= np.asarray(las[CHECKED]) > 0
     elif CHECKED in las.point_format.dimension_names:
-        raise StageError(f"'{CHECKED}' is a dimension of another kind", where=request.before)
+        raise StageError(f"'{CHECKED}' is a dimension of another kind", where=before)
     if not checked.any():
         raise StageError(
             "nothing was changed, and no point lies in an area that was looked at",
-            found=", ".join(filter(None, (request.after, *request.areas))),
+            found=", ".join(filter(None, (after, *areas))),
         )
-    _write(request, las, new, checked)
-    pairs, number = np.unique(np.stack([codes[changed], new[changed]], axis=1), axis=0, return_counts=True)
-    moves = {(int(a), int(b)): int(n) for (a, b), n in zip(pairs, number, strict=True)}
-    return Corrections(len(codes), int(changed.sum()), int(checked.sum()), moves, notes)
+    if las.header.point_format.id < 6 and new.max() > LEGACY_LIMIT:
+        raise StageError(
+            f"classes above {LEGACY_LIMIT} do not fit the file, which is of LAS 1.0-1.3",
+            where=before,
+            found=f"class {int(new.max())}",
+            cure="Convert it to LAS 1.4 first (minor_version 4, dataformat_id 6)",
+        )
+    _write(output, las, new, checked)
+    counts = len(codes), int(changed.sum()), int(checked.sum())
+    share = 100.0 * counts[2] / counts[0]
+    lines = [f"{counts[0]:,} points, {counts[1]:,} changed, {counts[2]:,} checked ({share:.2f} %)"]
+    moves = Counter(zip(codes[changed].tolist(), new[changed].tolist(), strict=True))
+    lines += [f"  {one} became {other}{n:>14,}" for (one, other), n in moves.most_common()]
+    return Corrections(*counts, [*lines, *notes])
 
 
 def _read(path: str) -> Any:
@@ -130,11 +125,11 @@ def _read(path: str) -> Any:
     return out
 
 
-def _from_points(
-    request: CorrectionRequest, las: Any, xyz: NDArray[np.float64], new: NDArray[np.uint8], notes: list[str]
-) -> None:
-    """Take over the classes of the same points in another file."""
-    other = _read(request.after)
+def _codes_of(
+    before: str, after: str, las: Any, xyz: NDArray[np.float64], codes: NDArray[np.uint8], notes: list[str]
+) -> NDArray[np.uint8]:
+    """The classes that the same points have in another file; their own where they are not there."""
+    other = _read(after)
     theirs = np.column_stack([other.x, other.y, other.z])
     step = float(max(*las.header.scales, *other.header.scales))
     both = {*las.point_format.dimension_names} & {*other.point_format.dimension_names}
@@ -145,16 +140,15 @@ def _from_points(
     if lost > _MOST_LOST * len(xyz) or extra > _MOST_LOST * len(xyz):
         raise StageError(
             "the two files do not hold the same points",
-            found=f"{lost:,} of {len(xyz):,} points of {request.before} are not in {request.after}, and "
+            found=f"{lost:,} of {len(xyz):,} points of {before} are not in {after}, and "
             f"{extra:,} of its {len(theirs):,} not in the former",
             cure="Save all points from the program they were corrected in, in the same reference system",
         )
     if lost:
-        notes.append(f"{lost:,} points are missing in {request.after}: they keep their class, unchecked")
+        notes.append(f"{lost:,} points are missing in {after}: they keep their class, unchecked")
     if extra:
-        notes.append(f"{extra:,} points of {request.after} are in no place of {request.before}: left out")
-    there = found >= 0
-    new[there] = np.asarray(other.classification).astype(np.uint8)[found[there]]
+        notes.append(f"{extra:,} points of {after} are in no place of {before}: left out")
+    return np.where(found >= 0, np.asarray(other.classification).astype(np.uint8)[found], codes)
 
 
 def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> NDArray[np.bool_]:
@@ -194,23 +188,14 @@ def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> 
     return inside
 
 
-def _write(
-    request: CorrectionRequest, las: Any, codes: NDArray[np.uint8], checked: NDArray[np.bool_]
-) -> None:
+def _write(output: str, las: Any, codes: NDArray[np.uint8], checked: NDArray[np.bool_]) -> None:
     import laspy
 
-    if las.header.point_format.id < 6 and codes.max() > LEGACY_LIMIT:
-        raise StageError(
-            f"classes above {LEGACY_LIMIT} do not fit the file, which is of LAS 1.0-1.3",
-            where=request.before,
-            found=f"class {int(codes.max())}",
-            cure="Convert it to LAS 1.4 first (minor_version 4, dataformat_id 6)",
-        )
     if CHECKED not in las.point_format.extra_dimension_names:
         las.add_extra_dim(laspy.ExtraBytesParams(CHECKED, "uint8", "1: a person has checked it"))
     las.classification = codes
     las[CHECKED] = checked.astype(np.uint8)
-    with whole_files(request.output) as (part,):
+    with whole_files(output) as (part,):
         las.write(str(part))
 
 
