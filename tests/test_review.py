@@ -143,7 +143,7 @@ def test_what_is_missing_is_made_and_said(folder, tmp_path, capsys):
     [
         (["--share", "0"], "'--share'"),
         (["--cell", "0.1"], "'--cell'"),
-        (["--workers", "0"], "'--workers'"),
+        (["--workers", "0"], "--workers"),
     ],
 )
 def test_what_cannot_be_is_refused(folder, tmp_path, words, what, capsys):

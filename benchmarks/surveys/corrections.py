@@ -25,7 +25,7 @@ from clouds import SURVEYS, slug, true_classes
 from pdal_stages import cli
 from pdal_stages.objects.overlay import points_inside
 from pdal_stages.pipeline.parts import reference_and_wkt
-from pdal_stages.pipeline.reviewing import ReviewRequest, review_files, review_layers
+from pdal_stages.pipeline.reviewing import review_files, review_layers
 from pdal_stages.reports.objectlayers import Layer, write_layers
 
 ROUNDS, PATCHES = 3, 5
@@ -68,7 +68,7 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
     done: list[Any] = []
     told, checked_file = [], before
     for number in range(1, ROUNDS + 1):
-        found = review_files(ReviewRequest((str(before),), "unused.gpkg"))
+        found = review_files([str(before)])
         shapes = review_layers(found)["patches"].shapes
         seen = shapely.union_all(done)
         fresh = [k for k, shape in enumerate(shapes) if shape.difference(seen).area > 0.5 * shape.area]

@@ -211,23 +211,15 @@ def _objects(options: argparse.Namespace) -> int:
 
 def _review(options: argparse.Namespace) -> None:
     from ..pipeline.inputs_outputs import overlooked
-    from ..pipeline.reviewing import ReviewRequest, write_review
+    from ..pipeline.reviewing import write_review
     from ..reports.reviewpage import lines
 
     html = str(Path(options.output).with_suffix(".html")) if options.html is None else options.html
-    request = ReviewRequest(
-        tuple(options.inputs),
-        options.output,
-        html,
-        options.json or "",
-        options.share,
-        options.cell,
-        options.model,
-        options.workers,
-    )
+    how = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
     print_messages(*overlooked(options.inputs))
-    print("\n".join(lines(write_review(request).to_dict())))
-    print(f"written to {', '.join(name for name in (request.output, request.html, request.json) if name)}")
+    found = write_review(options.inputs, options.output, html, options.json or "", **how)
+    print("\n".join(lines(found.to_dict())))
+    print(f"written to {', '.join(name for name in (options.output, html, options.json) if name)}")
 
 
 def _corrections(options: argparse.Namespace) -> None:

@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -37,31 +36,6 @@ from .workers import each_file
 LAYERS = ("patches", "tiles")
 
 
-@dataclass(frozen=True)
-class ReviewRequest:
-    """What is reviewed, and what is written; OptionError if a number is out of bounds."""
-
-    inputs: tuple[str, ...]  #: classified files, folders, patterns
-    output: str  #: vector file
-    html: str = ""  #: a page; empty for none
-    json: str = ""  #: figures; empty for none
-    share: float = 0.95  #: patches are written until they hold this share of the expected errors
-    cell: float = 0.0  #: side of a cell, meters; 0: chosen by the density
-    model: str = STANDARD  #: what gives reliabilities where the files have none
-    workers: int = 1  #: files read at the same time
-
-    def __post_init__(self) -> None:
-        if self.cell:
-            checks.number("'--cell'", self.cell, 0.5, 100, unit="m")
-        checks.number("'--share'", self.share, 0, 1, above=True)
-        checks.whole("'--workers'", self.workers, 1, 1024)
-
-    @cached_property
-    def files(self) -> list[str]:
-        """All inputs."""
-        return input_files(self.inputs)
-
-
 @dataclass
 class Review:
     """What was found; of the patches those `listed`, which come first, are written."""
@@ -82,10 +56,11 @@ class Review:
             {
                 "tile": Path(name).name,
                 "points": int(points[k]),
-                "expected": float(errors[k]),
-                "share": float(errors[k] / max(points[k], 1)),
+                "expected": round(float(errors[k]), 3),
+                "percent": round(100.0 * float(errors[k] / max(points[k], 1)), 2),
                 "patches": int(np.count_nonzero(listed == k)),
-                "minutes": float(minutes[k]),
+                "minutes": round(float(minutes[k]), 1),
+                "file": k,
             }
             for k, name in enumerate(self.files)
         ]
@@ -103,6 +78,7 @@ class Review:
                 "points": int(p.points[k]),
                 "area": float(p.area[k]),
                 "seconds": round(60.0 * float(p.minutes[k]), 1),
+                "per_minute": round(float(p.errors[k] / p.minutes[k]), 1),
                 "reason": p.reason[k],
                 "box": [round(float(v), 3) for v in p.box[k]],
             }
@@ -123,33 +99,56 @@ class Review:
         }
 
 
-def review_files(request: ReviewRequest) -> Review:
-    """Read the files and find the patches; StageError if one cannot be read, or there is nothing to judge."""
-    references = {path: reference_and_wkt(path) for path in request.files}
+def review_files(
+    inputs: Sequence[str], share: float = 0.95, cell: float = 0.0, model: str = STANDARD, workers: int = 1
+) -> Review:
+    """Read classified files and find the patches.
+
+    Parameters
+    ----------
+    inputs : sequence of str
+        Files, folders, patterns.
+    share : float
+        Patches are listed until they hold this share of the expected errors.
+    cell : float
+        Side of a cell, meters; 0: chosen by the density.
+    model : str
+        What gives reliabilities where the files have none.
+    workers : int
+        Files read at the same time.
+
+    Raises
+    ------
+    StageError
+        If a file cannot be read, there is nothing to judge, or a number is out of bounds.
+    """
+    if cell:
+        checks.number("'--cell'", cell, 0.5, 100, unit="m")
+    checks.number("'--share'", share, 0, 1, above=True)
+    files = input_files(inputs)
+    references = {path: reference_and_wkt(path) for path in files}
     without = check_one_reference({path: one for path, (one, _) in references.items()})
     print_messages(*without_reference(without))
-    side = request.cell or side_for(*_extent(request.files, references))
+    side = cell or side_for(*_extent(files, references))
     found: list[ReviewCells] = []
-    work = [
-        (path, references[path][1], request.model, side, number) for number, path in enumerate(request.files)
-    ]
+    work = [(path, references[path][1], model, side, number) for number, path in enumerate(files)]
     with Progress(len(work), "reading", "files") as line:
-        for _, answer in each_file(cells_of, work, request.workers):
+        for _, answer in each_file(cells_of, work, workers):
             if answer.reason:
                 raise StageError(answer.reason)
             found += answer.result
             line.update(1)
-    cells = ReviewCells.join(found) if found else None
-    if cells is None or not len(cells):
+    if not any(map(len, found)):
         raise StageError(
             "no point is ground, vegetation or a building",
-            found=", ".join(request.files[:3]),
+            found=", ".join(files[:3]),
             cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
         )
+    cells = ReviewCells.join(found)
     patches = find_patches(cells)
     held = np.cumsum(patches.errors)
-    listed = int(np.searchsorted(held, request.share * held[-1])) + 1 if held[-1] > 0 else 0
-    return Review(cells, patches, min(listed, len(patches)), request.files)
+    listed = int(np.searchsorted(held, share * held[-1])) + 1 if held[-1] > 0 else 0
+    return Review(cells, patches, min(listed, len(patches)), files)
 
 
 def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
@@ -199,21 +198,22 @@ def reliability_of(points: Part, model: str) -> NDArray[np.float32]:
     return np.where(mine >= 0, own, 1.0).astype(np.float32)
 
 
-def write_review(request: ReviewRequest) -> Review:
-    """Review files, and write what is asked for."""
-    check_target(request.output, LAYERS)
-    outputs = [Output(request.output, "review")]
-    outputs += [Output(request.html, "html", kinds.HTML)] if request.html else []
-    outputs += [Output(request.json, "json", kinds.JSON)] if request.json else []
-    check_outputs(outputs, [*request.files, *request.inputs])
-    found = review_files(request)
-    reference, wkt = reference_and_wkt(request.files[0])
+def write_review(
+    inputs: Sequence[str], output: str, html: str = "", json_file: str = "", **how: Any
+) -> Review:
+    """Review files, and write a vector file, a page and figures; `how`: see :func:`review_files`."""
+    check_target(output, LAYERS)
+    pages = {"html": (html, kinds.HTML), "json": (json_file, kinds.JSON)}
+    outputs = [Output(path, what, kind) for what, (path, kind) in pages.items() if path]
+    check_outputs([Output(output, "review"), *outputs], [*input_files(inputs), *inputs])
+    found = review_files(inputs, **how)
+    reference, wkt = reference_and_wkt(found.files[0])
     layers = review_layers(found, reference.units.horizontal)
-    write_layers(request.output, layers, wkt, styles(found.patches.errors))
-    if request.json:
-        write_whole(request.json, (json.dumps(found.to_dict(), indent=1) + "\n").encode())
-    if request.html:
-        write_whole(request.html, review_page(found.to_dict(), _minutes(found)).encode())
+    write_layers(output, layers, wkt, styles(found.patches.errors))
+    if json_file:
+        write_whole(json_file, (json.dumps(found.to_dict(), indent=1) + "\n").encode())
+    if html:
+        write_whole(html, review_page(found.to_dict(), _minutes(found)).encode())
     return found
 
 
@@ -230,41 +230,23 @@ def _minutes(found: Review) -> list[tuple[float, float]]:
 def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
     """Layers ``patches``, best first, and ``tiles``; coordinates in units of `across` meters."""
     shapely = vector("shapely")
-    patches, n, corners = found.patches, found.listed, found.cells.corners / across
-    boxes = shapely.box(*corners.T)
-    order = np.argsort(patches.of_cell, kind="stable")
-    ends = np.searchsorted(patches.of_cell[order], np.arange(n + 1))
-    shapes = [shapely.union_all(boxes[order[a:b]]) for a, b in pairwise(ends)]
-    columns = {
-        name: np.array([row[name] for row in found.rows], kind)
-        for name, kind in (
-            ("rank", int),
-            ("expected", float),
-            ("points", int),
-            ("area", float),
-            ("seconds", float),
-        )
-    }
-    columns["per_minute"] = np.round(patches.errors[:n] / patches.minutes[:n], 1)
-    columns |= {name: np.array([row[name] for row in found.rows], object) for name in ("reason", "tile")}
-    columns["done"] = np.zeros(n, np.int32)
-    number = {Path(name).name: k for k, name in reversed(list(enumerate(found.files)))}
-    outlines, kept = [], []
-    for row in found.tiles:
-        at = found.cells.place[:, 0] == number[row["tile"]]
-        if at.any():
-            outlines.append(shapely.box(*corners[at, :2].min(axis=0), *corners[at, 2:].max(axis=0)))
-            kept.append(row)
-    tiles = {
-        "tile": np.array([row["tile"] for row in kept], object),
-        "points": np.array([row["points"] for row in kept], np.int64),
-        "expected": np.round([row["expected"] for row in kept], 1),
-        "percent": np.round([100.0 * row["share"] for row in kept], 2),
-        "patches": np.array([row["patches"] for row in kept], np.int64),
-        "minutes": np.round([row["minutes"] for row in kept], 1),
-    }
-    layers = {"patches": (shapes, columns), "tiles": (outlines, tiles)}
+    boxes, of = shapely.box(*(found.cells.corners / across).T), found.cells.place[:, 0]
+    tiles = [row for row in found.tiles if row["points"]]
+    order = np.argsort(found.patches.of_cell, kind="stable")
+    ends = np.searchsorted(found.patches.of_cell[order], np.arange(1, found.listed + 1))
+    shapes = [shapely.union_all(boxes[mine]) for mine in np.split(order, ends)[:-1]]
+    outlines = [shapely.box(*shapely.total_bounds(boxes[of == row["file"]])) for row in tiles]
+    patches = [{**row, "done": 0} for row in found.rows]
     return {
-        name: Layer([shapely.MultiPolygon(shapely.get_parts(s)) for s in of], "MultiPolygon", fields)
-        for name, (of, fields) in layers.items()
+        name: Layer(
+            [shapely.MultiPolygon(shapely.get_parts(s)) for s in drawn], "MultiPolygon", _fields(rows)
+        )
+        for name, drawn, rows in (("patches", shapes, patches), ("tiles", outlines, tiles))
     }
+
+
+def _fields(rows: Sequence[dict[str, Any]]) -> dict[str, NDArray]:
+    """Columns of a layer."""
+    names = [name for name in (rows[0] if rows else {}) if name not in ("box", "file")]
+    kinds_of = {name: object if isinstance(rows[0][name], str) else None for name in names}
+    return {name: np.array([row[name] for row in rows], kinds_of[name]) for name in names}

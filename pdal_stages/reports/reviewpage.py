@@ -56,7 +56,7 @@ def lines(found: Mapping[str, Any]) -> list[str]:
     ]
     for row in found["tiles"][:_WORST]:
         out.append(
-            f"{one_line(row['tile'])[-40:]:<40}{row['points']:>14,}{row['expected']:>16,.0f}{100 * row['share']:>8.2f}"
+            f"{one_line(row['tile'])[-40:]:<40}{row['points']:>14,}{row['expected']:>16,.0f}{row['percent']:>8.2f}"
             f"{row['patches']:>9,}{row['minutes']:>9.1f}"
         )
     if len(found["tiles"]) > _WORST:
