@@ -350,25 +350,6 @@ def test_a_class_of_two_kinds():
         kind_of_code({Kind.BUILDING: (6,), Kind.TREE: (6,)})
 
 
-def test_what_is_larger_than_a_window_says_that_it_was_cut(monkeypatch):
-    """Memory has an end: a row of houses that goes on beyond what is looked at in one piece is cut, but not silently."""
-    from pdal_stages.objects import view
-    from pdal_stages.objects.find import BLOCK
-    from pdal_stages.objects.measure import CHECK, REASONS
-
-    row, codes = house(0, 0, 900, 12, 6.0, 0.7)
-    walls = np.column_stack([row[:, :2], np.full(len(row), 0.5)])
-    ground, flat = house(-20, -20, 920, 32, 0.0, 1.0, 2)
-    xyz, codes = np.concatenate([row, walls, ground]), np.concatenate([codes, codes, flat])
-    cells = Cells.of(*xyz.T, codes, 1.0)
-    whole = find_objects(cells, block=64, progress=False).tables[Kind.BUILDING]
-    assert len(whole) == 1 and whole.columns["reason"][0] == "" and view.MOST_CELLS > BLOCK**2
-    monkeypatch.setattr(view, "MOST_CELLS", 1000)
-    cut = find_objects(cells, block=64, progress=False).tables[Kind.BUILDING]
-    assert cut.columns["reason"][0] == "cut off" and cut.columns["verdict"][0] == CHECK
-    assert "cut off" in REASONS
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.6, 0.9]))
 def test_boundaries_of_cells_against_their_union(seed, share):

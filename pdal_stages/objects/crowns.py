@@ -48,57 +48,6 @@ def _higher(z, a, b):
     return z[a] > z[b] or (z[a] == z[b] and a < b)
 
 
-@njit
-def summits(s: NDArray, lowest: float) -> NDArray:
-    """Of each cell the number of the cell beside it (or itself) that is highest; -1 below `lowest`."""
-    rows, columns = s.shape
-    z = s.ravel()
-    up = np.full(rows * columns, -1, np.int64)
-    for r in range(rows):
-        for c in range(columns):
-            n = r * columns + c
-            if z[n] < lowest:
-                continue
-            best = n
-            for i in range(max(r - 1, 0), min(r + 2, rows)):
-                for j in range(max(c - 1, 0), min(c + 2, columns)):
-                    if _higher(z, i * columns + j, best):
-                        best = i * columns + j
-            up[n] = best
-    return up
-
-
-@njit
-def heirs(s: NDArray, up: NDArray, base: float, slope: float, most: float, depth: float) -> NDArray:
-    """Of each maximum (a cell that is its own `up`) the higher one that it goes to, itself where it is a top.
-
-    A window has a radius of `base` cells and `slope` per meter of height, `most` at most. Of the higher maxima inside,
-    the one over the highest saddle (on the line between) takes it, where the saddle lies no more than `depth` times its
-    height below.
-    """
-    rows, columns = s.shape
-    z = s.ravel()
-    out = np.full(rows * columns, -1, np.int64)
-    for n in range(rows * columns):
-        if up[n] != n:
-            continue
-        r, c = n // columns, n % columns
-        radius = min(base + slope * z[n], most)
-        k = int(radius)
-        best, best_saddle, best_away = n, -1.0, 0
-        for i in range(max(r - k, 0), min(r + k + 1, rows)):
-            for j in range(max(c - k, 0), min(c + k + 1, columns)):
-                m = i * columns + j
-                away = (i - r) * (i - r) + (j - c) * (j - c)
-                if up[m] != m or m == n or away > radius * radius or not _higher(z, m, n):
-                    continue
-                saddle = _saddle(s, r, c, i, j)
-                if saddle > best_saddle or (saddle == best_saddle and away < best_away):
-                    best, best_saddle, best_away = m, saddle, away
-        out[n] = best if best_saddle >= z[n] * (1.0 - depth) else n
-    return out
-
-
 @device
 def _saddle(s, r, c, i, j):
     """The lowest height on the line between two cells; the same either way."""
@@ -113,30 +62,54 @@ def _saddle(s, r, c, i, j):
 
 
 @njit
-def crown_cells(
-    s: NDArray, up: NDArray, heir: NDArray, least: float, top_least: float, reach: float
-) -> NDArray:
-    """Of each cell the number of its tree's top cell, -1 where there is none.
+def crown_cells(s: NDArray, least: float, base: float, slope: float, depth: float, reach: float) -> NDArray:
+    """Of each cell of a smoothed canopy the number of its tree's top cell, -1 where there is none.
 
-    A cell belongs to a crown where it is at least `least` times as high as the top and within `reach` cells of it.
+    A cell goes to the highest cell beside it, up to a maximum. Of the higher maxima in a maximum's window, the one over
+    the highest saddle (on the line between) takes it, where the saddle lies no more than `depth` times its height below.
+    A window has a radius of `base` cells and `slope` per meter of height, half of `reach` at most. A cell belongs to a
+    crown where it is at least 0.3 times as high as the top and within `reach` cells of it; tops are nearly as high as
+    the `least` tree, meters.
     """
     rows, columns = s.shape
     z = s.ravel()
+    up = np.full(rows * columns, -1, np.int64)  # where a cell goes; a top goes to itself
+    for n in range(rows * columns):
+        r, c = n // columns, n % columns
+        if z[n] >= min(1.5, least / 2):
+            up[n] = n
+            for i in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, columns)):
+                    if _higher(z, i * columns + j, up[n]):
+                        up[n] = i * columns + j
+    maximum = up == np.arange(rows * columns)
+    for n in np.flatnonzero(maximum):
+        r, c = n // columns, n % columns
+        radius = min(base + slope * z[n], reach / 2)
+        k = int(radius)
+        best, best_saddle, best_away = n, -1.0, 0
+        for i in range(max(r - k, 0), min(r + k + 1, rows)):
+            for j in range(max(c - k, 0), min(c + k + 1, columns)):
+                m = i * columns + j
+                away = (i - r) * (i - r) + (j - c) * (j - c)
+                if not maximum[m] or m == n or away > radius * radius or not _higher(z, m, n):
+                    continue
+                saddle = _saddle(s, r, c, i, j)
+                if saddle > best_saddle or (saddle == best_saddle and away < best_away):
+                    best, best_saddle, best_away = m, saddle, away
+        if best_saddle >= z[n] * (1.0 - depth):
+            up[n] = best
     out = np.full(rows * columns, -1, np.int64)
     for n in range(rows * columns):
-        if up[n] < 0:
-            continue
-        r, c = n // columns, n % columns
-        at = n
+        r, c, at = n // columns, n % columns, up[n]
         while at >= 0:
-            following = up[at] if up[at] != at else heir[at]
             dr, dc = at // columns - r, at % columns - c
             if dr * dr + dc * dc > reach * reach:
                 at = -1
-            elif following == at:
+            elif up[at] == at:
                 break
             else:
-                at = following
-        if at >= 0 and z[at] >= top_least and z[n] >= least * z[at]:
+                at = up[at]
+        if at >= 0 and z[at] >= 0.8 * least and z[n] >= 0.3 * z[at]:
             out[n] = at
     return out.reshape(s.shape)

@@ -9,6 +9,7 @@ So blocks, and tiles that hold as much, find exactly what one look at everything
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from ..base.progress import Progress
 from . import crowns, measure, roofs
 from .cells import Cells, Kind, cell_keys, object_id, unpack
-from .found import Found, Objects, ObjectSettings
+from .found import Objects, ObjectSettings, Table
 from .measure import Body
 from .view import AROUND, MARGIN, CellView, Window, extent_of
 
@@ -47,28 +48,52 @@ def find_objects(
     chosen = settings or ObjectSettings(cell=cells.size)
     if chosen.cell != cells.size:
         raise ValueError(f"cells of {cells.size} m, settings for {chosen.cell} m")
-    found = {kind: Found() for kind in FOUND}
+    found: dict[Kind, list[_One]] = {kind: [] for kind in FOUND}
     of_block: dict[tuple[int, int], list[Kind]] = {}
     for kind in FOUND:
         _, row, column = unpack(cells.of_kind(kind).key)
-        places = (row // block << 32) + column // block
-        places = places[np.r_[True, places[1:] != places[:-1]]] if len(places) else places  # most repeat
-        for at in np.unique(places).tolist():
-            column_at = (at + (1 << 31)) % (1 << 32) - (1 << 31)
-            of_block.setdefault((at - column_at >> 32, column_at), []).append(kind)
+        for north, east in np.unique(np.stack([row // block, column // block]), axis=1).T.tolist():
+            of_block.setdefault((north, east), []).append(kind)
     extent = extent_of(cells) if len(cells) else Window(0, 0, 0, 0)
     with Progress(len(of_block), "objects", "blocks", enabled=progress) as line:
         for (north, east), kinds in of_block.items():
             core = Window(north * block, east * block, block, block)
             near = CellView(cells, core.widened(round((MARGIN + AHEAD) / cells.size)), extent, chosen)
             for kind in kinds:
-                _FINDERS[kind](near, core, kind, found[kind])
+                found[kind] += _FINDERS[kind](near, core, kind)
             line.update()
     none = [np.empty(0, np.int64)]
-    key = np.concatenate(none + [k for one in found.values() for k in one.keys])
-    owner = np.concatenate(none + [k for one in found.values() for k in one.owners])
+    key = np.concatenate(none + [one.keys for ones in found.values() for one in ones])
+    owner = np.repeat(
+        np.array([one.identity for ones in found.values() for one in ones], np.int64),
+        [len(one.keys) for ones in found.values() for one in ones],
+    )
     order = np.argsort(key, kind="stable")
-    return Objects(chosen, {kind: one.table() for kind, one in found.items()}, key[order], owner[order])
+    return Objects(chosen, {kind: _table(ones) for kind, ones in found.items()}, key[order], owner[order])
+
+
+class _One(NamedTuple):
+    """An object: its id, what was measured, its cells, and the keys of those that hold its points."""
+
+    identity: int
+    record: dict[str, Any]
+    body: Body
+    keys: NDArray[np.int64]
+
+
+def _table(ones: list[_One]) -> Table:
+    ones = sorted(ones, key=lambda one: one.identity)
+    columns = {
+        name: np.array([one.record[name] for one in ones])
+        for name in (ones[0].record if ones else ())
+        if name != "path"
+    }
+    return Table(
+        np.array([one.identity for one in ones], np.int64),
+        columns,
+        [np.column_stack([one.body.row, one.body.column, one.body.z]) for one in ones],
+        [one.record["path"] for one in ones if "path" in one.record],
+    )
 
 
 def _bodies(number: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
@@ -80,9 +105,9 @@ def _bodies(number: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64],
         yield n, cells // number.shape[1], cells % number.shape[1]
 
 
-def _surfaces(near: CellView, core: Window, kind: Kind, found: Found) -> None:
+def _surfaces(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
     """Buildings and decks."""
-    view, mask, sure = near.whole(core, lambda view: view.surface(kind)[0])
+    view, mask = near.whole(core, lambda view: view.surface(kind)[0])
     chosen, z = view.chosen, view.surface(kind)[1]
     area = chosen.cell**2
     step, part = (chosen.step, chosen.roof_part) if kind == Kind.BUILDING else (1.0, 10.0)
@@ -94,10 +119,10 @@ def _surfaces(near: CellView, core: Window, kind: Kind, found: Found) -> None:
     beside = scipy.ndimage.minimum_filter(beside, 3, mode="constant", cval=none)
     theirs = np.where((number < 0) & (beside < none), beside, number)
     measured = measure.building if kind == Kind.BUILDING else measure.deck
-    _keep(view, number, theirs, z, core, sure, kind, found, measured)
+    return _objects(view, number, theirs, z, core, kind, measured)
 
 
-def _spans(near: CellView, core: Window, kind: Kind, found: Found) -> None:
+def _spans(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
     chosen = near.chosen
 
     def dilated(mask: NDArray[np.bool_], meters: float) -> NDArray[np.bool_]:
@@ -108,14 +133,14 @@ def _spans(near: CellView, core: Window, kind: Kind, found: Found) -> None:
         tower, wire = (view.held(one)[1] >= 0 for one in (Kind.TOWER, kind))
         return dilated(wire, chosen.span_gap / 2) & ~dilated(tower, 1.5)
 
-    view, mask, sure = near.whole(core, masked, beside=False)
+    view, mask = near.whole(core, masked, beside=False)
     high = view.high(kind)
     joined, _ = scipy.ndimage.label(mask)
     number = _without_small(np.where(np.isnan(high), -1, joined - 1), 4)
-    _keep(view, number, number, high, core, sure, kind, found, measure.span)
+    return _objects(view, number, number, high, core, kind, measure.span)
 
 
-def _trees(near: CellView, core: Window, kind: Kind, found: Found) -> None:
+def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
     chosen, window = near.chosen, near.window
     size, high = chosen.cell, near.high(kind)
     mask, roof = near.surface(Kind.BUILDING)
@@ -123,12 +148,14 @@ def _trees(near: CellView, core: Window, kind: Kind, found: Found) -> None:
         # Chimneys, gutters and walls that were taken for leaves are no trees.
         high[mask & (high <= roof + 0.5)] = np.nan
     height = crowns.canopy(high, near.ground)
-    s = crowns.smoothed(height, chosen.smoothing / size)
-    up = crowns.summits(s, min(1.5, chosen.tree_height / 2))
-    heir = crowns.heirs(
-        s, up, chosen.window / size, chosen.window_slope / size, crowns.REACH / 2 / size, chosen.saddle
+    top = crowns.crown_cells(
+        crowns.smoothed(height, chosen.smoothing / size),
+        chosen.tree_height,
+        chosen.window / size,
+        chosen.window_slope / size,
+        chosen.saddle,
+        crowns.REACH / size,
     )
-    top = crowns.crown_cells(s, up, heir, 0.3, 0.8 * chosen.tree_height, crowns.REACH / size)
     number = np.where(np.isnan(high), -1, top)
     z = np.where(np.isnan(high), near.ground + height, high)
     for n, r, c in _bodies(number):
@@ -137,41 +164,34 @@ def _trees(near: CellView, core: Window, kind: Kind, found: Found) -> None:
             continue
         body = near.body(kind, r, c, z)
         record = measure.tree(body, tr, tc, size)
-        if record["height"] >= chosen.tree_height:  # type: ignore[operator]
-            identity = int(object_id(kind, tr, tc))
-            found.add(identity, record, body)
-            found.own(cell_keys(kind, body.row, body.column), identity)
+        if record["height"] >= chosen.tree_height:
+            yield _One(int(object_id(kind, tr, tc)), record, body, cell_keys(kind, body.row, body.column))
 
 
 _FINDERS = {Kind.BUILDING: _surfaces, Kind.TREE: _trees, Kind.SPAN: _spans, Kind.DECK: _surfaces}
 
 
-def _keep(
+def _objects(
     view: CellView,
     number: NDArray[np.int64],
     theirs: NDArray[np.int64],
     z: NDArray,
     core: Window,
-    sure: Window,
     kind: Kind,
-    found: Found,
-    measured: Callable[[Body, float], dict[str, object]],
-) -> None:
-    """Keep the objects whose first cell lies in the block; `theirs` says whose points cells hold."""
-    window, identities = view.window, {}
+    measured: Callable[[Body, float], dict[str, Any]],
+) -> Iterator[_One]:
+    """The objects whose first cell lies in the block; `theirs` says whose points cells hold."""
+    window, none = view.window, np.empty(0, np.int64)
+    keys = {
+        n: cell_keys(kind, r + window.row, c + window.column)
+        for n, r, c in _bodies(np.where(np.isnan(view.high(kind)), -1, theirs))
+    }
     for n, r, c in _bodies(number):
         row, column = int(r[0]) + window.row, int(c[0]) + window.column
         if core.holds(row, column):
-            identities[n] = identity = int(object_id(kind, row, column))
             body = view.body(kind, r, c, z)
             record = measured(body, view.chosen.cell)
-            ends = ((body.row.min(), body.column.min()), (body.row.max(), body.column.max()))
-            if not all(sure.holds(*map(int, end)) for end in ends):
-                record |= measure.judged({str(record["reason"]): bool(record["reason"]), measure.CUT: True})
-            found.add(identity, record, body)
-    for n, r, c in _bodies(np.where(np.isnan(view.high(kind)), -1, theirs)):
-        if n in identities:
-            found.own(cell_keys(kind, r + window.row, c + window.column), identities[n])
+            yield _One(int(object_id(kind, row, column)), record, body, keys.get(n, none))
 
 
 def _without_small(number: NDArray[np.int64], smallest: float) -> NDArray[np.int64]:

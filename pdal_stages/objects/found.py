@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..base import checks
 from .cells import Kind, point_keys
-from .measure import Body
 
 
 def _setting(default: float, what: str, low: float, high: float, unit: str = "m"):
@@ -134,31 +133,3 @@ class Objects:
                 "reasons": dict(sorted(Counter(chain.from_iterable(reasons)).items())),
             }
         return out
-
-
-class Found:
-    """What blocks found so far."""
-
-    def __init__(self) -> None:
-        self._objects: list[tuple[int, dict[str, object], NDArray]] = []
-        self.keys: list[NDArray] = []
-        self.owners: list[NDArray] = []
-
-    def table(self) -> Table:
-        objects = sorted(self._objects, key=lambda one: one[0])
-        columns = {
-            name: np.array([record[name] for _, record, _ in objects])
-            for name in (objects[0][1] if objects else ())
-            if name != "path"
-        }
-        paths = [np.asarray(record["path"]) for _, record, _ in objects if "path" in record]
-        ids = np.array([identity for identity, *_ in objects], np.int64)
-        return Table(ids, columns, [cells for *_, cells in objects], paths)
-
-    def add(self, identity: int, record: dict[str, object], body: Body) -> None:
-        self._objects.append((identity, record, np.column_stack([body.row, body.column, body.z])))
-
-    def own(self, key: NDArray[np.int64], identity: int) -> None:
-        """The points of these cells are the object's."""
-        self.keys.append(key)
-        self.owners.append(np.full(len(key), identity))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -14,8 +13,6 @@ from .cells import MM
 from .roofs import roof_planes
 
 SURE, CHECK = "sure", "check"
-#: The reason of an object that is larger than what is looked at in one piece.
-CUT = "cut off"
 #: A building holds a square of this side, meters; wires that were taken for one do not.
 WIDE = 2.0
 #: Less than such a mean reliability of its points is unsure.
@@ -32,7 +29,7 @@ POLE, SLIM, DEEP, CROWN = 15.0, 0.35, 0.8, 0.36
 #: Why an object is to be checked.
 REASONS = (
     "no ground near", "small", "narrow", "vehicle", "container", "low", "rough roof", "unsure points", "no facade",
-    "few points", "thin crown", "wide crown", "pole", "short", "not straight", CUT,
+    "few points", "thin crown", "wide crown", "pole", "short", "not straight",
 )  # fmt: skip
 
 
@@ -63,21 +60,17 @@ class Body(NamedTuple):
         """The middle one of the ground's heights, NaN where there is none."""
         return float(np.nanmedian(self.ground)) if not np.isnan(self.ground).all() else math.nan
 
-    def record(self, measures: dict[str, object], reasons: dict[str, bool]) -> dict[str, object]:
+    def record(self, measures: dict[str, Any], reasons: dict[str, bool]) -> dict[str, Any]:
         """Measures, points and their mean reliability (NaN where they have none), and the verdict that follows."""
         told = int(self.told.sum())
         reliability = float(self.sure.sum()) / told / MM if told else math.nan
         reasons["unsure points"] = reliability < RELIABLE
-        return {**measures, "points": int(self.points.sum()), "reliab": reliability, **judged(reasons)}
+        text = ", ".join(reason for reason, holds in reasons.items() if holds)
+        verdict = {"verdict": CHECK if text else SURE, "reason": text}
+        return {**measures, "points": int(self.points.sum()), "reliab": reliability, **verdict}
 
 
-def judged(reasons: Mapping[str, bool]) -> dict[str, object]:
-    """The verdict that follows from reasons to check, those that hold."""
-    text = ", ".join(reason for reason, holds in reasons.items() if holds)
-    return {"verdict": CHECK if text else SURE, "reason": text}
-
-
-def building(body: Body, size: float) -> dict[str, object]:
+def building(body: Body, size: float) -> dict[str, Any]:
     """Heights, roof and verdict of a building."""
     image, ground = body.image(body.z), body.ground_height
     inside, area = ~np.isnan(image), len(body.row) * size * size
@@ -124,7 +117,7 @@ def _box_like(body: Body, height: float, slope: float, size: float) -> str:
     return ""
 
 
-def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, object]:
+def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, Any]:
     """Place, height and crown of a tree, and the verdict."""
     area = len(body.row) * size * size
     above = body.z - body.ground
@@ -149,7 +142,7 @@ def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, ob
     )
 
 
-def span(body: Body, size: float) -> dict[str, object]:
+def span(body: Body, size: float) -> dict[str, Any]:
     """Length and clearance of the wires between two masts, the path (k, 3) along them, and the verdict."""
     path = path_of(body, size)
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))]
@@ -190,7 +183,7 @@ def path_of(body: Body, size: float) -> NDArray[np.float64]:
     return np.column_stack([x.min() + u * c - v * s, y.min() + u * s + v * c, z])
 
 
-def deck(body: Body, size: float) -> dict[str, object]:
+def deck(body: Body, size: float) -> dict[str, Any]:
     """Area, height and clearance of a bridge deck, and the verdict."""
     area, ground, height = len(body.row) * size * size, body.ground_height, float(np.median(body.z))
     return body.record(

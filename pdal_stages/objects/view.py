@@ -26,8 +26,6 @@ GROWTH = 3.0
 DARK = 6.0
 #: A cell and its eight neighbors.
 AROUND = np.ones((3, 3), bool)
-#: Cells of a window beyond which no more is looked at around a block: objects that reach farther are cut, and say so.
-MOST_CELLS = 64_000_000
 
 
 class Window(NamedTuple):
@@ -145,29 +143,23 @@ class CellView:
 
     def whole(
         self, core: Window, masked: Callable[[CellView], NDArray[np.bool_]], beside: bool = True
-    ) -> tuple[CellView, NDArray[np.bool_], Window]:
+    ) -> tuple[CellView, NDArray[np.bool_]]:
         """The view with as much around a block as it takes for all that reaches into the block to be whole; its mask.
 
-        The last is the window within which they are: only objects larger than a window may be go beyond it. `beside`:
-        cells beside an object are looked at, too, so objects a cell apart reach as far as both.
+        `beside`: cells beside an object are looked at, too, so objects a cell apart reach as far as both.
         """
         margin, view = round(MARGIN / self.chosen.cell), self
-        around = self.seen.rows - core.rows >> 1
         while True:
             mask = masked(view)
-            part, _ = scipy.ndimage.label(scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask)
-            sure = view.seen.widened(-margin)
-            reached = np.zeros(int(part.max(initial=0)) + 1, bool)
+            part, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask)
+            reached = np.zeros(count + 1, bool)
             reached[part[view.window.part(core)]] = True
             reached[0] = False
-            part[view.window.part(sure)] = 0
-            if not reached[part].any() or mask.size > MOST_CELLS:
-                return view, mask, sure
-            more = max(margin, around // 2)
-            view, around = (
-                CellView(self.cells, view.seen.widened(more), self.extent, self.chosen),
-                around + more,
-            )
+            part[view.window.part(view.seen.widened(-margin))] = 0
+            if not reached[part].any():
+                return view, mask
+            more = max(margin, (view.seen.rows - core.rows) // 4)
+            view = CellView(self.cells, view.seen.widened(more), self.extent, self.chosen)
 
 
 def _wide(values: NDArray) -> NDArray:
