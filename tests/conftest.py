@@ -257,3 +257,50 @@ def write_las():
         return Path(path)
 
     return write
+
+
+# ---- what the ready pipelines read and apply ---------------------------------------------------------------
+
+#: Smaller than the files say; the stages are the same.
+QUICK = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stage.model.trees=10"]
+
+
+@pytest.fixture(scope="session")
+def ready_town(tmp_path_factory) -> Path:
+    """A small town, whole."""
+    from pdal_stages.synthetic import TownOptions, write_town
+
+    path = tmp_path_factory.mktemp("town") / "town.laz"
+    write_town(TownOptions(size=60, density=5, seed=3), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def ready_halves(ready_town, tmp_path_factory) -> Path:
+    """A folder with the town in two files."""
+    import laspy
+
+    folder, las = tmp_path_factory.mktemp("halves"), laspy.read(ready_town)
+    west = np.asarray(las.x) <= 500_030
+    for name, mine in (("west", west), ("east", ~west)):
+        half = laspy.LasData(las.header)
+        half.points = las.points[mine]
+        half.write(folder / f"{name}.laz")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def ready_models(ready_town, tmp_path_factory) -> Path:
+    """A folder with the models that ready pipelines apply, trained by those that train."""
+    from pdal_stages.pipeline.overrides import parse_overrides
+    from pdal_stages.pipeline.run import Pipeline
+
+    folder = tmp_path_factory.mktemp("models")
+    for name, file in (("train", "classes"), ("train-binary", "buildings"), ("train-on-smrf-ground", "smrf")):
+        words = [
+            f"--stage.input.filename={ready_town}",
+            f"--stage.model.filename={folder / file}.model",
+            *QUICK,
+        ]
+        Pipeline(ROOT / "pipelines" / f"{name}.json", parse_overrides(words)[0]).execute()
+    return folder

@@ -31,7 +31,7 @@ failures = 0
 #: Each fails once per turn, for several reasons, and counts the failures whose message is ours.
 OBJECTS = """
 kept = pdal.Reader(**bad) | ps.Filter.hag_minima(tag="kept")
-for turn in range(50):
+for turn in range(12):
     for pipeline, says in (
         (pdal.Reader(**bad) | ps.Filter.hag_minima(), "not finite"),
         (kept, "(tag 'kept')"),
@@ -44,10 +44,10 @@ for turn in range(50):
         assert sys.stdout is sys.__stdout__
     gc.collect()
     (pdal.Reader(**good) | ps.Filter.hag_minima()).execute()
-assert failures == 150, failures
+assert failures == 36, failures
 """
 RUNNER = """
-for turn in range(50):
+for turn in range(12):
     for stages, says in (
         ([bad, {"type": "filters.hag_minima"}], "not finite"),
         ([good, {"type": "filters.accuracy"}], "'Reference' is missing"),
@@ -60,10 +60,10 @@ for turn in range(50):
         assert sys.stdout is sys.__stdout__
     gc.collect()
     ps.run_pipeline([good, {"type": "filters.hag_minima"}])
-assert failures == 150, failures
+assert failures == 36, failures
 """
 TEXTS = """
-for turn in range(50):
+for turn in range(12):
     stages = ps.Pipeline([good, {"type": "filters.hag_minima"}]).lowered.stages
     stages[1]["pdalargs"]["options"]["cell"] = "wide " + str(turn)
     try:
@@ -71,14 +71,14 @@ for turn in range(50):
     except RuntimeError as error:
         failures += "must be a number" in str(error)
     gc.collect()
-assert failures == 50, failures
+assert failures == 12, failures
 """
 
 
 @pytest.mark.parametrize(
     "body", [OBJECTS, RUNNER, TEXTS], ids=["python-pdal objects", "the runner", "expanded JSON"]
 )
-def test_fifty_failing_pipelines(tmp_path, body):
+def test_failing_pipelines(tmp_path, body):
     script = CLOUD + body + "gc.collect()\nprint('survived')\n"
     done = subprocess.run(
         [sys.executable, "-X", "faulthandler", "-c", script],
@@ -113,9 +113,9 @@ def test_stock_pdal_says_it_and_fails(tmp_path, pdal_program):
 
 INTERRUPTED = """
 import os, signal, subprocess
-big = {"type": "readers.faux", "count": 2_000_000, "mode": "ramp", "bounds": "([0,30],[0,30],[0,3])"}
+big = {"type": "readers.faux", "count": 1_000_000, "mode": "ramp", "bounds": "([0,30],[0,30],[0,3])"}
 ps.run_pipeline([good, {"type": "filters.hag_minima"}])  # Numba is imported, which Ctrl-C would break off
-for wait in (0, 0.1, 0.3, 0.6, 1):
+for wait in (0, 0.3, 1):
     kill = subprocess.Popen(["sh", "-c", f"sleep {wait}; kill -INT {os.getpid()}"])
     try:
         ps.run_pipeline([big, {"type": "filters.hag_minima"}])
@@ -124,7 +124,7 @@ for wait in (0, 0.1, 0.3, 0.6, 1):
     except KeyboardInterrupt:
         failures += 1
     kill.wait()
-assert failures == 5, failures
+assert failures == 3, failures
 ps.run_pipeline([good, {"type": "filters.hag_minima"}])
 """
 

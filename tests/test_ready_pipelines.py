@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 
+from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.overrides import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.synthetic import TownOptions, write_town
 from pdal_stages.tiling import run_tiled
 
 pytestmark = pytest.mark.pdal
 FOLDER = Path(__file__).resolve().parent.parent / "pipelines"
 FILES = sorted(FOLDER.glob("*.json"))
-#: Smaller than the files say, so that the tests stay quick; the stages are the same.
-QUICK = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stage.model.trees=10"]
 
 
-@pytest.fixture(scope="module")
-def town(tmp_path_factory):
-    path = tmp_path_factory.mktemp("town") / "town.laz"
-    write_town(TownOptions(size=60, density=5, seed=3), path)
-    return path
+@pytest.fixture
+def town(ready_town):
+    return ready_town
+
+
+@pytest.fixture
+def models(ready_models):
+    return ready_models
 
 
 def run(name, *words):
@@ -34,15 +36,6 @@ def run(name, *words):
     pipeline = Pipeline(FOLDER / f"{name}.json", overrides)
     pipeline.execute()
     return pipeline
-
-
-@pytest.fixture(scope="module")
-def models(town, tmp_path_factory):
-    """The models that other pipelines apply, trained by the training pipelines."""
-    folder = tmp_path_factory.mktemp("models")
-    for name, file in (("train", "classes"), ("train-binary", "buildings"), ("train-on-smrf-ground", "smrf")):
-        run(name, f"--stage.input.filename={town}", f"--stage.model.filename={folder / file}.model", *QUICK)
-    return folder
 
 
 def test_none_is_forgotten():
@@ -75,6 +68,37 @@ def test_classify(town, models, tmp_path, name):
         assert {"Margin", "Probability_2"} <= set(after.point_format.dimension_names)
 
 
+@pytest.mark.parametrize("name", ["noise", "normalize", "features", "features-for-viewers", "copc-to-tiles"])
+def test_those_that_need_no_model_of_their_own(town, ready_models, tmp_path, name):
+    source = Path(__file__).parent / "data" / "town.copc.laz" if name.startswith("copc") else town
+    words = [f"--stage.input.filename={source}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
+    if '"classifier"' in (FOLDER / f"{name}.json").read_text():
+        words.append(f"--stage.classifier.model={ready_models / 'classes.model'}")
+    run(name, *words)
+    parts = [laspy.read(path) for path in tmp_path.glob("o_*.laz")]
+    assert sum(map(len, parts)) == len(laspy.read(source))
+
+
+def test_tile_index_to_tiles(ready_halves, ready_models, tmp_path):
+    index = tmp_path / "survey.gpkg"
+    command = [
+        pdal_env.program(),
+        "tindex",
+        "create",
+        str(index),
+        "--stdin",
+        "-f",
+        "GPKG",
+        "--lyr_name",
+        "pdal",
+    ]
+    files = "\n".join(map(str, ready_halves.glob("*.laz")))
+    subprocess.run(command, input=files, text=True, check=True, capture_output=True)
+    words = [f"--stage.input.filename={index}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
+    run("tile-index-to-tiles", *words, f"--stage.classifier.model={ready_models / 'classes.model'}")
+    assert list(tmp_path.glob("o_*.laz"))
+
+
 def test_evaluate(town, models, tmp_path):
     pipeline = run(
         "evaluate",
@@ -91,18 +115,10 @@ def test_evaluate(town, models, tmp_path):
     assert "<html" in (tmp_path / "a.html").read_text()
 
 
-def test_tiles_to_tiles(town, models, tmp_path):
-    for half, limits in (("west", "X[:500030]"), ("east", "X(500030:]")):
-        Pipeline(
-            [
-                str(town),
-                {"type": "filters.range", "limits": limits},
-                {"type": "writers.las", "filename": str(tmp_path / f"{half}.laz")},
-            ]
-        ).execute()
+def test_tiles_to_tiles(town, ready_halves, models, tmp_path):
     run(
         "tiles-to-tiles",
-        f"--stage.input.filename={tmp_path}/*.laz",
+        f"--stage.input.filename={ready_halves}/*.laz",
         f"--stage.classifier.model={models / 'classes.model'}",
         f"--stage.output.filename={tmp_path}/classified_#.laz",
         "--stage.tiles.length=40",
@@ -130,18 +146,14 @@ def test_raw_to_footprints(town, tmp_path):
     assert pyogrio.read_info(tmp_path / "o.gpkg", layer="buildings")["features"] > 0
 
 
-def test_terrain_and_surface_of_a_survey_show_no_tiles(town, tmp_path):
-    las = laspy.read(town)
-    west = np.asarray(las.x) < np.asarray(las.x).min() + 30
-    for name, mine in (("west", west), ("east", ~west)):
-        part = laspy.LasData(las.header)
-        part.points = las.points[mine]
-        part.write(tmp_path / f"{name}.laz")
+def test_terrain_and_surface_of_a_survey_show_no_tiles(town, ready_halves, tmp_path):
     (tmp_path / "classified").mkdir()
     writer = {"type": "writers.las", "filename": "", "forward": "all", "extra_dims": "all"}
     heights = {"type": "filters.hag_morphological", "window": 20}
     writer["filename"] = str(tmp_path / "classified" / "#.laz")
-    assert not run_tiled([str(tmp_path / "*.laz"), heights, writer], 25, workers=0, progress=False).failures
+    assert not run_tiled(
+        [str(ready_halves / "*.laz"), heights, writer], 25, workers=0, progress=False
+    ).failures
     writer["filename"] = str(tmp_path / "whole.laz")
     Pipeline([str(town), heights, writer]).execute()
     rasters = {}

@@ -70,10 +70,10 @@ def _options(options: argparse.Namespace) -> None:
 
 
 def _commands(parser: Parser, options: argparse.Namespace) -> None:
-    from ..plugin.forms import forms
+    from .dialogs import dialogs
 
     if options.showjson:
-        print(forms(parser.commands), end="")
+        print(dialogs(parser.commands), end="")
         return
     for name, command in parser.commands.items():
         print(f"{name:12s} {command.description}")

@@ -3,36 +3,44 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import ctypes
+import importlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from ..base.errors import DependencyError, StageError
-from ..base.version import __version__
+from ..pipeline import pdal as pdal_env
 from ..stages import registry
-from . import declarations, places
+from . import declarations
 
-#: Beside the libraries: what was put there, by which version, for which PDAL.
-RECORD = "pdal_stages_plugin.json"
 SOURCE = Path(__file__).with_name("stage.cpp")
+#: Suffix of a shared library, by which PDAL knows its plugins.
+SUFFIX = ".dylib" if sys.platform == "darwin" else ".so"
+_PYTHON_FILTER = f"libpdal_plugin_filter_python{SUFFIX}"
+#: A function of PDAL's library, in every version: its address tells which file the library is.
+_OF_PDAL = "_ZN4pdal12StageFactoryC1Eb"
+_OTHER_DOORS = "every other door works: pdal-stages pipeline, pdal-stages expand"
 
 
-def library_name(type_name: str) -> str:
-    """The file that PDAL looks for: ``filters.hag_minima`` is in ``libpdal_plugin_filter_hag_minima.so``."""
-    family, _, name = type_name.partition(".")
-    return f"libpdal_plugin_{family.removesuffix('s')}_{name}{places.SUFFIX}"
+def libraries() -> list[str]:
+    """The files that PDAL looks for: ``filters.hag_minima`` is in ``libpdal_plugin_filter_hag_minima.so``."""
+    parts = (name.partition(".") for name in registry.stages())
+    return [f"libpdal_plugin_{family.removesuffix('s')}_{name}{SUFFIX}" for family, _, name in parts]
 
 
 def usual_folder() -> Path:
     """Where PDAL looks and the plugin is already; otherwise the folder of ``filters.python``."""
     named = [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
-    return next((path for path in named if record(path) is not None), None) or places.plugin_folder()
+    there = (path for path in named if any((path / name).is_file() for name in libraries()))
+    return next(there, None) or plugin_folder()
 
 
 def install(folder: Path | None = None) -> list[Path]:
@@ -48,7 +56,7 @@ def install(folder: Path | None = None) -> list[Path]:
         If it does not compile, or the folder cannot be written.
     """
     target = folder or usual_folder()
-    found, cxx = places.pdal(), places.compiler()
+    found, cxx = pdal(), compiler()
     if folder is not None:
         with contextlib.suppress(OSError):  # told below
             folder.mkdir(parents=True, exist_ok=True)
@@ -66,33 +74,16 @@ def install(folder: Path | None = None) -> list[Path]:
         link += [] if sys.platform == "darwin" else ["-Wl,-Bsymbolic", "-s"]
         flags = ["-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-w", f"-I{work}", f"-I{found.headers}"]
         _run([*cxx, *flags, str(SOURCE), *link, "-o", str(library)])
-        uninstall(target)
-        files = [target / library_name(kind) for kind in registry.stages()]
-        record = {
-            "pdal_stages": __version__,
-            "digest": _digest(),
-            "pdal": found.version,
-            "python": sys.prefix,
-            "files": [path.name for path in files],
-        }
-        Path(work, RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        files = [target / name for name in libraries()]
         for path in files:
             os.replace(shutil.copy(library, Path(work, path.name)), path)
-        os.replace(Path(work, RECORD), target / RECORD)
     return files
-
-
-def _digest() -> str:
-    """Changes with any stage, option, default or help."""
-    return " ".join(map(declarations.digest, registry.stages().values()))
 
 
 def uninstall(folder: Path | None = None) -> list[Path]:
     """Take the plugin away; the files that were there."""
     target = folder or usual_folder()
-    names = [*(record(target) or {}).get("files", []), *map(library_name, registry.stages()), RECORD]
-    files = [target / Path(name).name for name in dict.fromkeys(names)]  # never outside the folder
-    gone = [path for path in files if path.is_file()]
+    gone = [target / name for name in libraries() if (target / name).is_file()]
     for path in gone:
         try:
             path.unlink()
@@ -101,54 +92,127 @@ def uninstall(folder: Path | None = None) -> list[Path]:
     return gone
 
 
-def record(folder: Path) -> dict[str, Any] | None:
-    """What was put into a folder; None where nothing was."""
-    try:
-        found = json.loads((folder / RECORD).read_text())
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
 def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
-    """What is there, and what is missing or wrong, each with its cure."""
+    """What is there, and what is missing, each with its cure. A plugin of other options says so when it is run."""
     good: list[str] = []
     bad: list[str] = []
-    version = ""
-    try:
-        found = places.pdal()
-        version = found.version
-        good.append(f"PDAL {version}: {found.library}, headers {found.headers / 'pdal'}")
-    except DependencyError as error:
-        bad.append(str(error))
-    try:
-        good.append(f"filters.python: {places.plugin_folder()}")
+    looks = (
+        lambda: f"compiler: {shutil.which(compiler()[0])}",
+        lambda: "PDAL {2}: {0}, headers {1}".format(*pdal()),
+        lambda: f"filters.python: {plugin_folder()}",
+    )
+    for look in looks:
+        try:
+            good.append(look())
+        except DependencyError as error:
+            bad.append(str(error))
+    with contextlib.suppress(DependencyError):
         folder = folder or usual_folder()
-    except DependencyError as error:
-        bad.append(str(error))
-    kept = record(folder) if folder else None
-    if folder and kept is not None:
-        lacking = [n for kind in registry.stages() if not (folder / (n := library_name(kind))).is_file()]
-        place = f"the plugin in {folder}"
-        wrong = {
-            f"libraries are missing in {folder} (found {', '.join(lacking)})": bool(lacking),
-            f"{place} is of another version (found {kept.get('pdal_stages')}, package {__version__})": (
-                kept.get("pdal_stages") != __version__
-            ),
-            f"{place} is out of date: options of stages have changed since": kept.get("digest") != _digest(),
-            f"{place} was built for another PDAL (found {kept.get('pdal')})": version
-            not in ("", kept.get("pdal")),
-        }
-        bad += [f"{text}. pdal-stages plugin --install" for text, is_so in wrong.items() if is_so]
-        if not bad:
-            good.append(f"plugin: {len(kept['files'])} stages in {folder}")
-    elif folder:
-        bad.append(f"the plugin is not in {folder}. pdal-stages plugin --install")
-    try:
-        good.insert(0, f"compiler: {shutil.which(places.compiler()[0])}")
-    except DependencyError as error:
-        bad = [str(error), *bad] if bad else []  # no fault where all is built
+        lacking = [name for name in libraries() if not (folder / name).is_file()]
+        if not lacking:
+            return [*good, f"plugin: {len(libraries())} stages in {folder}"], []
+        bad.append(
+            f"the plugin is not in {folder} (missing {', '.join(lacking[:3])}). pdal-stages plugin --install"
+        )
     return good, bad
+
+
+class Pdal(NamedTuple):
+    """The PDAL that python-pdal uses."""
+
+    library: Path  #: the folder of its library
+    headers: Path  #: the folder that holds ``pdal/``
+    version: str
+
+
+def compiler() -> list[str]:
+    """The C++ compiler, $CXX first."""
+    named = os.environ.get("CXX", "").split()
+    for words in [named] if named else [["c++"], ["g++"], ["clang++"]]:
+        if shutil.which(words[0]):
+            return words
+    raise DependencyError(
+        "there is no C++ compiler",
+        found=f"CXX={' '.join(named)}" if named else "neither c++, g++ nor clang++ on PATH",
+        cure="Debian, Ubuntu: apt-get install g++. Fedora: dnf install gcc-c++. macOS: xcode-select --install. conda: "
+        f"conda install -c conda-forge cxx-compiler. Without one {_OTHER_DOORS}",
+    )
+
+
+def pdal() -> Pdal:
+    """PDAL's library and headers; :class:`DependencyError` with the cure where they are missing or do not fit."""
+    library, version = _library_folder(), pdal_env.dotted_version()
+    for prefix in dict.fromkeys([*library.parents, Path(sys.prefix)]):
+        headers = prefix / "include"
+        if not (headers / "pdal" / "Filter.hpp").is_file():
+            continue
+        found = _headers_version(headers)
+        if found not in (version, ""):
+            raise DependencyError(
+                "PDAL's headers are of another version than its library",
+                found=f"{headers / 'pdal'}: {found}, {library}: {version}",
+                cure="Install both from one place",
+            )
+        return Pdal(library, headers, version)
+    raise DependencyError(
+        "PDAL's headers are missing",
+        found=f"no include/pdal beside {library}",
+        cure="Debian, Ubuntu: apt-get install libpdal-dev. conda-forge: conda install -c conda-forge libpdal-core. "
+        f"Without them {_OTHER_DOORS}",
+    )
+
+
+def plugin_folder() -> Path:
+    """The folder of ``filters.python``, where PDAL will find our plugin too."""
+    named = [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
+    usual = [Path(sysconfig.get_path(key)) / "pdal" for key in ("platlib", "purelib")]
+    tried = list(dict.fromkeys([*named, *usual, Path(sys.prefix) / "lib"]))
+    for folder in tried:
+        if (folder / _PYTHON_FILTER).is_file():
+            return folder
+    raise DependencyError(
+        "PDAL's plugin filters.python is missing, which runs our stages",
+        found=f"{_PYTHON_FILTER} in none of {', '.join(map(str, tried))}",
+        cure="It comes with pdal-plugins: conda install -c conda-forge pdal-plugins, or pip install pdal-plugins; where it "
+        "is there already, set PDAL_DRIVER_PATH to the folder that holds it",
+    )
+
+
+class _Found(ctypes.Structure):
+    """``Dl_info`` of dladdr(3)."""
+
+    _fields_ = [
+        (name, ctypes.c_char_p if "file" in name else ctypes.c_void_p)
+        for name in ("file", "base", "name", "address")
+    ]
+
+
+def _library_folder() -> Path:
+    """The folder of the library that python-pdal is linked to."""
+    extension = importlib.import_module(f"{pdal_env.bindings().__name__}.libpdalpython").__file__ or ""
+    try:
+        address = ctypes.cast(getattr(ctypes.CDLL(extension), _OF_PDAL), ctypes.c_void_p)
+        found = _Found()
+        if ctypes.CDLL(None).dladdr(address, ctypes.byref(found)) and found.file:
+            return Path(os.fsdecode(found.file)).resolve().parent
+    except (OSError, AttributeError):
+        pass
+    raise DependencyError(
+        "the library that python-pdal uses is not found",
+        found=extension,
+        cure=f"On this system the plugin cannot be built; {_OTHER_DOORS}",
+    )
+
+
+def _headers_version(headers: Path) -> str:
+    """The version that PDAL's headers say, empty where they do not."""
+    for name in ("pdal_features.hpp", "pdal_config.hpp"):
+        path = headers / "pdal" / name
+        text = path.read_text(errors="replace") if path.is_file() else ""
+        numbers = dict(re.findall(r"#define\s+PDAL_VERSION_(MAJOR|MINOR|PATCH)\s+(\d+)", text))
+        if len(numbers) == 3:
+            return f"{numbers['MAJOR']}.{numbers['MINOR']}.{numbers['PATCH']}"
+    return ""
 
 
 def _run(command: Sequence[str]) -> None:

@@ -84,19 +84,11 @@ def digest(kind: type[Stage]) -> str:
     return hashlib.sha256(f"{kind.type} {kind.summary}{_options(kind)}".encode()).hexdigest()[:16]
 
 
-def native_options(kind: type[Stage]) -> list[Option]:
-    """A stage's options that the plugin declares: PDAL's filters have `where` by themselves, writers of older PDAL not."""
-    return [o for o in kind.all_options() if o.name != "where" or kind.type.startswith("writers.")]
-
-
-def is_list(option: Option) -> bool:
-    """Whether PDAL takes several values for an option."""
-    return _KINDS.get(option.kind) == "List"
-
-
 def _options(kind: type[Stage]) -> str:
     lines = [""]
-    for option in native_options(kind):
+    for option in kind.all_options():
+        if option.name == "where" and kind.type.startswith("filters."):
+            continue  # PDAL's filters have it by themselves, writers of older PDAL not
         default, given = option.default, option.default not in (None, "", ())
         as_number = given and option.kind in ("number", "integer", "boolean")
         text = (

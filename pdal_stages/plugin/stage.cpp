@@ -48,7 +48,7 @@ namespace declared = pdal_stages::declared;
 const char *const SCRIPT = R"python(
 def stage(ins, outs):
     try:
-        from pdal_stages.plugin.arrival import arrive
+        from pdal_stages.plugin.answers import answer
     except BaseException as error:
         import sys
         global out_metadata
@@ -66,7 +66,7 @@ def stage(ins, outs):
         leaf = {"name": "pdal_stages_error", "value": text, "type": "string", "description": ""}
         out_metadata = {"name": "pdal_stages", "value": "", "type": "string", "description": "", "children": [leaf]}
         return True
-    return arrive(globals(), ins, outs)
+    return answer(globals(), ins, outs)
 )python";
 
 // Stages after which there is one view, or several are what the user asked for.

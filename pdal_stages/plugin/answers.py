@@ -1,4 +1,4 @@
-"""Where a native stage arrives in Python: the two questions that ``stage.cpp`` asks through ``filters.python``.
+"""The answers to the two questions that ``stage.cpp`` asks through ``filters.python``.
 
 `prepare` is asked before any point is read: what is wrong with the options comes up here, and which dimensions they ask
 for. `run` does the work on one point view. An answer is metadata of the script, a list of named texts; a failure is the
@@ -19,7 +19,6 @@ from ..base.version import __version__
 from ..pipeline import lowering, runtime
 from ..stages import registry
 from ..stages.base import Stage
-from ..stages.options import Option, split_list
 from . import declarations
 
 #: Stages made when a pipeline was prepared, until it has run; of pipelines that never run, so many are kept.
@@ -28,7 +27,7 @@ _prepared: dict[str, Stage] = {}
 _Leaf = dict[str, Any]
 
 
-def arrive(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
+def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
     """Answer one question; True, whatever happened.
 
     Parameters
@@ -46,17 +45,17 @@ def arrive(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     sys.modules.pop(label, None)
     try:
         if question["step"] == "prepare":
-            answer = _prepare(question)
+            said = _prepare(question)
         else:
             stage = _prepared.get(label) or _made(question)[0]
-            answer = runtime.leaves(runtime.run_on_view(stage, module, ins, outs))
+            said = runtime.leaves(runtime.run_on_view(stage, module, ins, outs))
             if question.get("last"):
                 _prepared.pop(label, None)
     except BaseException as error:
         outs.clear()
         _prepared.pop(label, None)
-        answer = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
-    module["out_metadata"] = runtime.node("pdal_stages", answer)
+        said = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
+    module["out_metadata"] = runtime.node("pdal_stages", said)
     return True
 
 
@@ -65,8 +64,8 @@ def _prepare(question: Mapping[str, Any]) -> list[_Leaf]:
     _prepared[question["label"]] = stage
     while len(_prepared) > _MOST:
         del _prepared[next(iter(_prepared))]
-    answer = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
-    return [*answer, *([] if warning is None else [runtime.leaf("pdal_stages_warning", warning)])]
+    made = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
+    return [*made, *([] if warning is None else [runtime.leaf("pdal_stages_warning", warning)])]
 
 
 def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
@@ -79,18 +78,18 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
             f"({declarations.digest(kind)}) in {sys.prefix}",
             cure="Build it again: pdal-stages plugin --install",
         )
-    texts: dict[str, list[str]] = {}
-    for name, value in question["options"]:
-        texts.setdefault(name, []).append(value)
-    before = [_typed(stage) for stage in _stages(question["pipeline"])][:-1]
-    given = {**kind.from_pipeline(texts, before), **_parsed(kind, texts)}
+    given: dict[str, str] = {}
+    for name, value in question["options"]:  # of a list as often as it has items
+        given[name] = f"{given[name]},{value}" if name in given else value
+    before = _stages(question["pipeline"])[:-1]
+    options = {**kind.from_pipeline(given, before), **given}
     where = runtime.place(kind.type, question.get("tag"))
-    stage = kind({name: value for name, value in given.items() if name not in lowering.PDAL_OWN}, where)
+    stage = kind(_own(options), where)
     return stage, lowering.settle_upstream(stage, [(one, _creates(one)) for one in before])[1]
 
 
 def _stages(text: str) -> list[dict[str, Any]]:
-    """The pipeline up to the stage itself, as PDAL writes it."""
+    """The pipeline up to the stage itself, as PDAL writes it; before PDAL 2.9 all values are text."""
     try:
         found = json.loads(text)["pipeline"]
     except (ValueError, KeyError):  # `user_data` that is not JSON
@@ -98,57 +97,18 @@ def _stages(text: str) -> list[dict[str, Any]]:
     return found if isinstance(found, list) else [found]
 
 
-def _typed(stage: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage of PDAL's serialized pipeline, its values as one writes them in JSON; before PDAL 2.9 all of them are text."""
-    if stage.get("type") not in registry.stages():
-        return {name: _number(value) if isinstance(value, str) else value for name, value in stage.items()}
-    kind, own = registry.get(stage["type"]), {}
-    for name, value in stage.items():
-        if name not in ("type", "inputs"):
-            values = value if isinstance(value, list) else [value]
-            own[name] = [one if isinstance(one, str) else json.dumps(one) for one in values]
-    return {"type": kind.type, **_parsed(kind, own)}
+def _own(stage: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in stage.items() if name not in ("type", *lowering.PDAL_OWN)}
 
 
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
     """What a stage before makes, as far as it matters: of ours, what it says; of PDAL's, heights."""
     if stage.get("type") not in registry.stages():
         return lowering.heights_of(stage)
-    options = {k: v for k, v in stage.items() if k not in ("type", *lowering.PDAL_OWN)}
     try:
-        return registry.get(stage["type"])(options).creates()
+        return registry.get(stage["type"])(_own(stage)).creates()
     except StageError:  # its own preparation has said so
         return {}
-
-
-def _parsed(kind: type[Stage], texts: Mapping[str, list[str]]) -> dict[str, Any]:
-    """Options as text, one for each time they were given, as one writes them in JSON."""
-    known = {option.name: option for option in kind.all_options()}
-    return {name: _value(known.get(name), values) for name, values in texts.items()}
-
-
-def _value(option: Option | None, texts: list[str]) -> Any:
-    text = texts[-1]
-    if option is None:
-        return text
-    if declarations.is_list(option):
-        return [_number(part) for one in texts for part in split_list(one)]
-    if option.kind == "boolean" and text in ("true", "false", "invert"):
-        return text == "true" if text != "invert" else not option.default
-    if option.kind == "mapping":
-        with suppress(ValueError):
-            return json.loads(text)
-    return _number(text) if option.kind in ("number", "integer") else text
-
-
-def _number(text: str) -> Any:
-    """A number or truth where the text is one."""
-    if text in ("true", "false"):
-        return text == "true"
-    for kind in (int, float):
-        with suppress(ValueError):
-            return kind(text) if "_" not in text else text
-    return text
 
 
 def _end_on_interrupt() -> None:

@@ -17,7 +17,7 @@ FORMAT = 1
 _TYPES = {int: "integer", float: "number"}
 
 
-def forms(commands: Mapping[str, argparse.ArgumentParser]) -> str:
+def dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     """Commands with their arguments, stages with their options, shipped models, classes with their colors.
 
     An argument has ``name``, ``flag`` (empty for one without), ``kind`` (``number``, ``integer``, ``boolean``, ``string``),
