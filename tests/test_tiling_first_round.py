@@ -16,8 +16,6 @@ from pdal_stages.terrain.lowest import lowest_of_cells
 from pdal_stages.terrain.morphological import reach_of_cells
 from pdal_stages.tiling import run_tiled, tile
 from pdal_stages.tiling.ground import FirstRoundTask
-from pdal_stages.tiling.outputs import FileTask
-from pdal_stages.tiling.store import Store
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
 MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")
@@ -131,36 +129,6 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
     assert made == [(0, 0), (2, 2)]
     whole = np.concatenate(ps.run_pipeline([*survey, HEIGHTS]).arrays)
     assert np.array_equal(of_files(folder, "HeightAboveGround"), whole["HeightAboveGround"])
-
-
-@pytest.mark.pdal
-def test_killed_between_a_file_and_its_note(tmp_path, survey, monkeypatch):
-    """A file that a run with other options made is not taken for that of the run before, whatever was noted of that."""
-
-    def stages(least):
-        return [{"type": "filters.range", "limits": f"X[{least}:]"}, HEIGHTS]
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    folder = tmp_path / "out"
-    with monkeypatch.context() as patch:
-        patch.setattr(FileTask, "run", stop)
-        with pytest.raises(KeyboardInterrupt):
-            in_tiles(survey, stages(2), folder)
-    kept = folder / ".pdal-stages" / "kept"
-    made = {path: path.read_bytes() for path in kept.glob("*.npz")}
-    assert len(made) >= 16 and all(path.with_suffix(".json").exists() for path in made)
-    with monkeypatch.context() as patch:
-        patch.setattr(Store, "finish", lambda _, name, *rest: name.endswith(".first") and stop())
-        with pytest.raises(KeyboardInterrupt):
-            in_tiles(survey, stages(10), folder, resume=True)
-    changed = [path for path in made if path.read_bytes() != made[path]]
-    assert changed and not any(path.with_suffix(".json").exists() for path in changed)
-    assert not in_tiles(survey, stages(2), folder, resume=True).failures
-    whole = np.concatenate(ps.run_pipeline([*survey, *stages(2)]).arrays)
-    for name in MADE:
-        assert np.array_equal(of_files(folder, name), whole[name]), name
 
 
 @pytest.mark.pdal

@@ -17,12 +17,11 @@ from ..pipeline import pdal as pdal_env
 from ..pipeline.workers import TaskResult, ThisProcess, WorkerProcesses, perform
 from .settings import TilingOptions
 
-#: Seconds to wait for a worker: at the beginning, and when all are gone.
-_WAIT = 120.0
+#: Seconds to wait for the scheduler, and for a worker: at the beginning, and when all are gone.
+_CONNECT, _WAIT = 10.0, 120.0
 #: Seconds after which it is asked whether scheduler and workers are still there.
 _ASK = 10.0
 _RESUME = "Once it is there again, --resume goes on"
-_SAME = "Install the same versions of pdal-stages and PDAL on all hosts"
 
 
 class Cluster(contextlib.AbstractContextManager):
@@ -33,60 +32,50 @@ class Cluster(contextlib.AbstractContextManager):
 
     def __enter__(self) -> Cluster:
         dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
-        with contextlib.ExitStack() as stack:
-            try:
-                self._client = dask.Client(self.address, timeout=10, set_as_default=False)
-            except (OSError, ValueError) as error:  # ValueError: an address of another kind
-                raise StageError(
-                    "the Dask scheduler cannot be reached",
-                    found=f"{self.address}: {error}",
-                    cure="Is dask scheduler running there, and is that the address it printed?",
-                ) from None
-            stack.callback(self._client.close)
-            with contextlib.suppress(TimeoutError):
-                self._client.wait_for_workers(1, timeout=_WAIT)
-            threads = self._client.nthreads()
-            if not threads:
-                raise StageError(
-                    "the scheduler has no workers", found=self.address, cure="Start dask worker on some hosts"
-                )
-            self._check_workers()
-            # One tile at a time in a process; what Dask calls its threads are the cores it may use.
-            self.slots, self.threads = len(threads), max(1, min(threads.values()))
-            self._executor = self._client.get_executor(pure=False)
-            self._leave = stack.pop_all()
+        try:
+            self._client = dask.Client(self.address, timeout=_CONNECT, set_as_default=False)
+        except (OSError, ValueError) as error:  # ValueError: an address of another kind
+            raise StageError(
+                "the Dask scheduler cannot be reached",
+                found=f"{self.address}: {error}",
+                cure="Is dask scheduler running there, and is that the address it printed?",
+            ) from None
+        with contextlib.suppress(TimeoutError):
+            self._client.wait_for_workers(1, timeout=_WAIT)
+        threads = self._client.nthreads()
+        if not threads:
+            self._client.close()
+            raise StageError(
+                "the scheduler has no workers", found=self.address, cure="Start dask worker on some hosts"
+            )
+        # One tile at a time in a process; what Dask calls its threads are the cores it may use.
+        self.slots, self.threads = len(threads), max(1, min(threads.values()))
+        self._executor = self._client.get_executor(pure=False)
         return self
 
     def __exit__(self, *exc: object) -> None:
         with contextlib.suppress(Exception):
             self._executor.shutdown(wait=False)  # which cancels what waits
-        self._leave.close()
-
-    def _check_workers(self) -> None:
-        """Refuse workers whose results would not be those of this program, or would not get here."""
-        try:
-            found = self._client.run(unfit, _versions(), self.folder)
-        except Exception as error:
-            found = {self.address: f"a worker cannot say which pdal-stages it has ({error}). {_SAME}"}
-        for reason in filter(None, found.values()):
-            raise StageError(reason)
+        self._client.close()
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Send a task; as bytes, because Dask would look for its own keys in all that it holds."""
+        host, work = socket.gethostname(), pickle.dumps(task)
         try:
-            return self._executor.submit(
-                perform_for, _versions(), self.folder, socket.gethostname(), pickle.dumps(task)
-            )
+            return self._executor.submit(perform_for, _versions(), self.folder, host, work)
         except (OSError, RuntimeError):
             raise _lost() from None
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """Those that are done, at least one; StageError where scheduler or workers are lost."""
+        """Those that are done, at least one; StageError where a worker is unfit, or scheduler or workers are lost."""
         gone: float | None = None
         while True:
             done = wait(list(futures), timeout=_ASK, return_when=FIRST_COMPLETED).done
             if self._client.status != "running" or any(future.cancelled() for future in done):
                 raise _lost()
+            for future in done:
+                if future.exception() is None and isinstance(reason := future.result(), str):
+                    raise StageError(reason)
             if done:
                 return done
             with contextlib.suppress(OSError, TimeoutError):
@@ -105,30 +94,24 @@ def _versions() -> tuple[str, str]:
     return build(), pdal_env.dotted_version()
 
 
-def unfit(wanted: tuple[str, str], folder: str) -> str:
-    """Why this worker may have no tasks of a program with `wanted` versions that writes to `folder`; empty if it may."""
-    host, theirs = socket.gethostname(), _versions()
+def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> TaskResult | str:
+    """Do a task on a worker for the program on `host`, or say why results would not be those of that or not get there."""
+    here, theirs = socket.gethostname(), _versions()
     if theirs != wanted:
         return (
             f"a worker of the scheduler has other versions than this program (found pdal-stages {theirs[0]} and PDAL "
-            f"{theirs[1]} on {host}, here {wanted[0]} and {wanted[1]}). {_SAME}"
+            f"{theirs[1]} on {here}, there {wanted[0]} and {wanted[1]}). Install the same on all hosts"
         )
     for _ in range(5):  # network file systems may show a new folder late
         if os.path.isdir(folder):
-            return ""
+            break
         time.sleep(1)
-    return (
-        f"a worker of the scheduler does not see the output folder (found no {folder} on {host}). Inputs, model and outputs "
-        "must be there under the same paths on all hosts"
-    )
-
-
-def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> TaskResult:
-    """Do a task on a worker, if it is fit for the program that sent it, from `host`."""
-    if reason := unfit(wanted, folder):
-        return TaskResult(reason=reason)
+    else:
+        return (
+            f"a worker of the scheduler does not see the output folder (found no {folder} on {here}). Inputs, model and "
+            "outputs must be there under the same paths on all hosts"
+        )
     answer = perform(pickle.loads(task))
-    here = socket.gethostname()
     if answer.reason and here != host:
         answer.reason = f"on {here}: {answer.reason}"
     return answer

@@ -309,13 +309,11 @@ def _print_dry(run: TiledRun) -> None:
     workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
     print(f"{_counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it")
     print(f"{_counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
-    print(
-        f"about {s['points_read_by_a_tile']:,} points read for a tile, {s['points_of_largest_tile']:,} its own"
-    )
+    print(f"about {s['points_read_by_a_tile']:,} points read for a tile")
     print(f"up to {s['memory_mb_of_a_worker']:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
     print(f"roughly {s['core_hours']:.2f} core hours, {s['disk_gb']:,.2f} GB of disk beside the outputs")
     for job in run.tiles[:_MOST_TILES]:
-        print(f"  {job.name:24s} {job.points:>14,} points")
+        print(f"  {job.name}")
     if len(run.tiles) > _MOST_TILES:
         print(f"  and {len(run.tiles) - _MOST_TILES} more")
     print_messages(*run.messages)

@@ -74,7 +74,7 @@ class FirstRoundTask:
         for key, (index, values) in found.changed.items():
             arrays[f"{key}/index"] = index
             arrays |= {f"{key}/{name}": column for name, column in values.items()}
-        save_arrays(self.target, arrays, context.scratch)
+        save_arrays(self.target, arrays)
         return {"outputs": written([self.target]), "messages": found.messages}
 
 
@@ -86,7 +86,6 @@ class BlockTask:
     block: tuple[int, int]
     tiles: list[str]  #: files of what is left of the tiles around, as far as these were done
     target: str
-    scratch: str  #: the run's folder for temporary files
 
     def run(self) -> dict[str, Any]:
         """Write what tiles need of the block."""
@@ -100,7 +99,7 @@ class BlockTask:
         inside = (load_arrays(path, [_inside(self.block)]) for path in self.tiles)
         mine = (points for found in inside for points in found.values())
         block = stage_of(self.plan).block_of(np.concatenate(parts, axis=1).T, mine, self.block)
-        save_arrays(self.target, block, self.scratch)
+        save_arrays(self.target, block)
         return {"outputs": written([self.target])}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,6 +54,7 @@ class Job:
     )
     jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is put together from
     step: str = "tiles"  #: of the run: ``index``, ``first_rounds``, ``tiles``, ``outputs``
+    mark: str = ""  #: fingerprint of all that decides its result
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
     state: str = "waiting"
     #: What its task says of it, as it is kept in the work folder: counts, messages, outputs, cost, fingerprint.
@@ -126,14 +126,13 @@ class TiledRun:
 
     def _blocked_by(self, path: str) -> str:
         """What was not made because an input cannot be read, in words."""
-        tiles = sum(job.blocked_by == path for job in self.tiles)
-        outputs = [Path(o.outputs[0]).name for o in self.outputs if o.outputs and o.blocked_by == path]
-        parts = [f"{tiles} tile{'s' * (tiles != 1)} there"] if tiles else []
-        parts += [*outputs[:5], *([f"{len(outputs) - 5} more outputs"] if len(outputs) > 5 else [])]
-        if not parts:
+        tiles, outputs = (sum(j.blocked_by == path for j in jobs) for jobs in (self.tiles, self.outputs))
+        if not tiles and not outputs:
             return ""
-        cure = ". They are made without it where it is moved out of the inputs" if tiles else ""
-        return f" (not made because of it: {', '.join(parts)}{cure})"
+        return (
+            f" ({tiles} tiles and {outputs} outputs are not made because of it. Move it out of the inputs to make them "
+            "without it)"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able report."""

@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,6 @@ from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import run_tasks
 from .cluster import open_workers
-from .grid import Box, TileGrid, touching
 from .ground import BlockTask, FirstRoundTask, block_file, blocks_around, left_file, tiles_around
 from .head import RunContext
 from .outputs import FileTask
@@ -33,7 +32,8 @@ from .pieces import CloudIndex, sort_points
 from .plan import TilePlan, make_plan, outputs_for
 from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .settings import TilingOptions, worker_bytes
-from .store import Store, fingerprint, unchanged
+from .sources import InputSource
+from .store import Store, fingerprint
 from .survey import Survey
 from .tile import TileTask
 from .writeroptions import remarks, with_one_format
@@ -112,7 +112,7 @@ def run_plan(
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
     if chosen.resume and chosen.tile is None:  # the free memory may be another today
-        chosen = replace(chosen, tile=(Store(folder).note("run") or {}).get("tile"))
+        chosen = replace(chosen, tile=Store(folder).note("run").get("tile"))
     survey = Survey(plan, chosen)
     if survey.per == "tile":  # whose outputs have points of all readers
         plan = replace(plan, tail=with_one_format(plan.tail, survey.paths))
@@ -185,14 +185,9 @@ class _Run:
         self.messages_before: list[list[str]] = []  #: warnings and notes of the rounds before the tiles
         #: How far around a tile, in units of the coordinates, inputs are at hand: it may have to be read wider.
         self.farthest = max(4 * survey.halo_units, survey.halo_units + survey.grid.size)
-        self._marks: dict[Any, str] = {}
 
     def _do(
-        self,
-        what: str,
-        waiting: deque[Job],
-        task_of: Callable[[Job], Callable[[], Any]],
-        mark_of: Callable[[Job], str],
+        self, what: str, waiting: deque[Job], task_of: Callable[[Job], Callable[[], Any]]
     ) -> Iterator[Job]:
         """Do jobs as workers are free, note what is done, and yield each; outputs may be put in after every one.
 
@@ -214,8 +209,8 @@ class _Run:
                     job.fail(answer.reason)
                 else:
                     job.state, job.record = "done", answer.result | answer.cost
-                    with contextlib.suppress(StageError, OSError):  # no room: a later run does it again
-                        self.store.finish(job.name, mark_of(job), job.record)
+                    with contextlib.suppress(OSError):  # no room: a later run does it again
+                        self.store.finish(job.name, job.mark, job.record)
                 if job.step != "outputs":
                     done += not answer.reason
                     failures += [answer.reason] if answer.reason else []
@@ -239,36 +234,29 @@ class _Run:
         Those that an earlier run read are only read again where their points are `needed` (paths) and not there any more.
         """
         survey, store = self.survey, self.store
-        marks = {
-            s.path: fingerprint(s.path, survey.stamps[s.path], survey.grid.size)
-            for s in survey.sources
-            if s.kind == "las" and s.path not in survey.unreadable
-        }
-        copies = {path: store.path(f"{mark}.points") for path, mark in marks.items()}
-        if needed is None:
-            store.remove(".points", [copy.name for copy in copies.values()])
         waiting: deque[Job] = deque()
         for source in survey.sources:
-            if (mark := marks.get(source.path)) is None:
+            if source.kind != "las" or source.path in survey.unreadable:
                 continue
-            copy = copies[source.path]
-            known = store.note(mark)
-            if known and (copy.exists() or needed is None or source.path not in needed):
+            name = fingerprint(source.path, survey.stamps[source.path], survey.grid.size)
+            known, copy = store.note(name), store.path(f"{name}.points")
+            if known and (copy.exists() or source.path not in (needed or ())):
                 survey.indexes[source.path] = CloudIndex.of(known, str(copy))
             else:
-                waiting.append(Job(mark, survey.extents[source.path].count, source=source, step="index"))
+                points = survey.extents[source.path].count
+                waiting.append(Job(name, points, source=source, outputs=None, step="index", mark=str(copy)))
 
         def task_of(job: Job) -> Callable[[], Any]:
             assert job.source is not None
-            return partial(sort_points, job.source.path, survey.grid, str(copies[job.source.path]))
+            return partial(sort_points, job.source.path, survey.grid, job.mark)
 
-        for job in self._do("reading the inputs", waiting, task_of, lambda job: job.name):
+        for job in self._do("reading the inputs", waiting, task_of):
             assert job.source is not None
             path = job.source.path
             if job.reason:
                 survey.unreadable[path] = job.reason
                 continue
-            index = survey.indexes[path] = CloudIndex.of(job.record, str(copies[path]))
+            index = survey.indexes[path] = CloudIndex.of(job.record, job.mark)
             if index.count and (odd := lascheck.beyond_box(path, index.box)):
                 survey.messages.append(odd)
         survey.place()
@@ -285,12 +273,23 @@ class _Run:
     # ---- tiles and outputs -----------------------------------------------------------------------------------
 
     def find_jobs(self) -> None:
-        """All tiles and outputs; those that unreadable inputs are part of fail."""
-        plan, survey = self.plan, self.survey
+        """All tiles and outputs; those that unreadable inputs are part of fail.
+
+        Their marks are of all that decides a result, every input that may be read for it too.
+        """
+        plan, survey, grid = self.plan, self.survey, self.survey.grid
+        sees = plan.sees_m / survey.unit
+        tail = [plan.tail, plan.beside, survey.stamps_of(plan.tail)]
+        common = fingerprint(
+            build(),
+            [plan.head, survey.stamps_of(plan.head), plan.creates, plan.halo_m, sees],
+            [grid.size, survey.options.most_points],
+            tail if survey.per == "tile" else [],
+        )
         for tile, points in survey.tiles().items():
-            job = Job(survey.grid.name(tile), points, tile)
-            near = survey.near(tile, plan.sees_m / survey.unit)
-            if bad := [s.path for s in near if s.path in survey.unreadable]:
+            job = Job(grid.name(tile), points, tile)
+            job.mark = fingerprint(common, tile, survey.seen(survey.near(tile, max(sees, self.farthest))))
+            if bad := [s.path for s in survey.near(tile, sees) if s.path in survey.unreadable]:
                 job.fail(f"an input here cannot be read: {bad[0]}", bad[0])
             self.tiles.append(job)
         if survey.per == "tile":
@@ -304,51 +303,26 @@ class _Run:
             out = Job(f"file-{source.key}", source=source, outputs=paths, step="outputs")
             if index := survey.indexes.get(source.path):
                 out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
+            out.mark = fingerprint(survey.seen([source]), tail, [job.mark for job in out.jobs], paths)
             if source.path in survey.unreadable:
                 out.fail(f"its input cannot be read: {source.path}", source.path)
             self.outputs.append(out)
 
-    def mark_of(self, job: Job) -> str:
-        """Fingerprint of all that decides a tile's result or an output.
-
-        Of a tile that is every input that was read for it, too; its record says with how wide surroundings.
-        """
-        plan, survey = self.plan, self.survey
-        tail = [plan.tail, plan.beside, survey.stamps_of(plan.tail)]
-        if job.source is not None:
-            return fingerprint(
-                survey.seen([job.source]), tail, [self.mark_of(j) for j in job.jobs], job.outputs
-            )
-        assert job.tile is not None
-        halo_m = max(float(job.record.get("halo_m", 0.0)), plan.sees_m)
-        if (job.tile, halo_m) not in self._marks:
-            self._marks[job.tile, halo_m] = fingerprint(
-                build(),
-                [plan.head, survey.stamps_of(plan.head), plan.creates],
-                [job.tile, survey.grid.size, plan.halo_m, plan.sees_m, survey.options.most_points],
-                tail if survey.per == "tile" else [],
-                survey.seen(survey.near(job.tile, halo_m / survey.unit)),
-            )
-        return self._marks[job.tile, halo_m]
-
     def take_over(self) -> None:
         """Keep what an earlier run finished; tiles that no output waits for need not be done again."""
-        for job in self.tiles:
-            job.record = self.store.note(job.name) or {}
-        for out in self.outputs:
-            known = self.store.finished(out.name, self.mark_of(out))
-            if out.state == "waiting" and known:
-                out.state, out.record = "kept", known
+        for job in self.outputs:
+            self._keep(job)
         needed = {job.name for out in self.outputs if out.state == "waiting" for job in out.jobs}
         for job in self.tiles:
-            if job.state == "waiting":
-                same = job.record.get("fingerprint") == self.mark_of(job)
-                wanted = job.outputs is not None or job.name in needed
-                if (same and (not wanted or unchanged(job.record))) or not wanted:
-                    job.state = "kept"
-                    if same:
-                        continue
-            job.record = {}
+            if job.outputs is not None or job.name in needed:
+                self._keep(job)
+            elif job.state == "waiting":
+                known = self.store.note(job.name)
+                job.state, job.record = "kept", known if known.get("fingerprint") == job.mark else {}
+
+    def _keep(self, job: Job) -> None:
+        if job.state == "waiting" and (known := self.store.finished(job.name, job.mark)):
+            job.state, job.record = "kept", known
 
     def _context(self) -> RunContext:
         """What all tiles have in common."""
@@ -383,7 +357,7 @@ class _Run:
             given = survey.readable(sources)
             return TileTask(context, job.tile, given, complete, result, job.outputs, before).run
 
-        for job in self._do("tiles", waiting, task_of, self.mark_of):
+        for job in self._do("tiles", waiting, task_of):
             if finished is not None and job.state == "done" and job.outputs and job.record["outputs"]:
                 finished(job)
             for out in users.get(job.name, ()):
@@ -392,88 +366,89 @@ class _Run:
     def forget(self) -> None:
         """Remove what nothing waits for any more."""
         needed = {f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs}
-        if any(job.state in ("waiting", "failed") for job in self.tiles):
-            needed |= {
-                path.name for end in ("first", "block") for path in self.store.kept.glob(f"*.{end}.npz")
-            }
+        if any(job.state == "failed" for job in self.tiles):
+            needed |= {path.name for path in self.store.kept.glob("*.[bf]*.npz")}  # blocks and first rounds
         self.store.remove(".npz", needed)
         self.store.remove(".points")
 
     # ---- the rounds before the tiles ---------------------------------------------------------------------------
 
     def make_ground(self) -> None:
-        """Make what waiting tiles need, but what an earlier run left; tiles near what fails fail too."""
+        """Make what waiting tiles need, but what an earlier run left; what needs something that fails, fails too."""
         first, survey, store = self.plan.first, self.survey, self.store
         if first is None or len(self.tiles) == 1:
-            store.remove(".first.npz")
-            store.remove(".block.npz")
             return
         grid, unit, context = survey.grid, survey.unit, self._context()
         by_tile = {job.tile: job for job in self.tiles if job.tile}
-        spill = first.blocks.spill
-        blocks = {b for tile in by_tile for b in blocks_around(first, grid.box(tile), unit, spill)}
-        # An earlier run may have had other inputs.
-        store.remove(".first.npz", [left_file(job.name) for job in self.tiles])
-        store.remove(".block.npz", [block_file(block) for block in blocks])
+        places = {
+            b for tile in by_tile for b in blocks_around(first, grid.box(tile), unit, first.blocks.spill)
+        }
+        # Those of an earlier run with other inputs would be taken for blocks with points.
+        store.remove(".block.npz", [block_file(block) for block in places])
         around = self.farthest * unit + first.blocks.around
-        running = [job for job in self.tiles if job.state == "waiting" and job.tile]
-        boxes = [grid.box(job.tile) for job in running if job.tile]
-        needed = {block for box in boxes for block in blocks_around(first, box, unit, around)} & blocks
-        near = {block: tiles_around(first, grid, unit, block, by_tile) for block in sorted(needed)}
+        wanted = {
+            job.name: places.intersection(blocks_around(first, grid.box(job.tile), unit, around))
+            for job in self.tiles
+            if job.state == "waiting" and job.tile
+        }
+        near = {b: tiles_around(first, grid, unit, b, by_tile) for b in sorted(set().union(*wanted.values()))}
         head = self.plan.head[: first.at + 1]
         common = [build(), head, survey.stamps_of(head), grid.size, first.halo_m, unit, first.kept]
-        marks: dict[tuple[int, int], str] = {}
 
-        def fail(box: Box, around_m: float, reason: str) -> None:
-            wide = around_m / unit
-            for n in touching(boxes, (box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide)):
-                if running[n].state == "waiting":
-                    running[n].fail(reason)
+        def seen(tile: tuple[int, int]) -> list[InputSource]:
+            return survey.near(tile, first.halo_m / unit)
 
         def first_task(job: Job) -> Callable[[], Any]:
             assert job.tile is not None
-            sources = survey.readable(survey.near(job.tile, first.halo_m / unit))
-            return FirstRoundTask(context, first, job.tile, sources, str(store.path(f"{job.name}.npz"))).run
+            target = str(store.path(f"{job.name}.npz"))
+            return FirstRoundTask(context, first, job.tile, survey.readable(seen(job.tile)), target).run
+
+        firsts = {
+            tile: Job(
+                left_file(by_tile[tile].name).removesuffix(".npz"),
+                by_tile[tile].points,
+                tile,
+                step="first_rounds",
+                mark=fingerprint(common, tile, survey.seen([s for s, _ in survey.readable(seen(tile))])),
+            )
+            for tile in sorted({tile for found in near.values() for tile in found})
+        }
+        for job in self._unfinished("lowest points of cells", firsts.values(), first_task):
+            self.messages_before.append(job.record.get("messages", []))
 
         def block_task(job: Job) -> Callable[[], Any]:
             assert job.tile is not None
-            left = [str(store.path(left_file(by_tile[t].name))) for t in near[job.tile] if t in marks]
-            target = str(store.path(block_file(job.tile)))
-            return BlockTask(context.plan, job.tile, left, target, context.scratch).run
+            left = [str(store.path(f"{firsts[t].name}.npz")) for t in near[job.tile]]
+            target = str(store.path(f"{job.name}.npz"))
+            return BlockTask(context.plan, job.tile, left, target).run
 
-        jobs = []
-        for tile in sorted({tile for found in near.values() for tile in found}):
-            seen = survey.seen([s for s, _ in survey.readable(survey.near(tile, first.halo_m / unit))])
-            marks[tile] = fingerprint(common, tile, seen)
-            name = left_file(by_tile[tile].name).removesuffix(".npz")
-            jobs.append(Job(name, by_tile[tile].points, tile, step="first_rounds"))
-        for job in self._unfinished("lowest points of cells", jobs, first_task, lambda job: marks[job.tile]):
-            if job.reason:
-                del marks[job.tile]
-                fail(grid.box(job.tile), first.far_m, job.reason)
-            else:
-                self.messages_before.append(job.record["messages"])
-
-        def block_mark(job: Job) -> str:
-            assert job.tile is not None
-            return fingerprint(common, job.tile, [marks[tile] for tile in near[job.tile] if tile in marks])
-
-        jobs = [Job(block_file(b).removesuffix(".npz"), 1, b, step="first_rounds") for b in near]
-        for job in self._unfinished("ground by blocks", jobs, block_task, block_mark):
-            if job.reason:
-                x0, y0, x1, y1 = (side / unit for side in TileGrid(first.blocks.side).box(job.tile))
-                fail((x0, y0, x1, y1), self.plan.halo_m + first.blocks.around, job.reason)
+        blocks = {
+            block: Job(
+                block_file(block).removesuffix(".npz"),
+                1,
+                block,
+                step="first_rounds",
+                mark=fingerprint(common, block, [firsts[tile].mark for tile in tiles]),
+            )
+            for block, tiles in near.items()
+        }
+        for block, job in blocks.items():
+            if reason := next(filter(None, (firsts[tile].reason for tile in near[block])), ""):
+                job.fail(reason)
+        for _ in self._unfinished("ground by blocks", blocks.values(), block_task):
+            pass
+        for job in self.tiles:
+            if reason := next(filter(None, (blocks[b].reason for b in sorted(wanted.get(job.name, ())))), ""):
+                job.fail(reason)
 
     def _unfinished(
-        self,
-        what: str,
-        jobs: Sequence[Job],
-        task_of: Callable[[Job], Callable[[], Any]],
-        mark_of: Callable[[Any], str],
-    ) -> Iterator[Any]:
+        self, what: str, jobs: Iterable[Job], task_of: Callable[[Job], Callable[[], Any]]
+    ) -> Iterator[Job]:
         """Do what is not there from an earlier run, and yield it."""
-        waiting = deque(job for job in jobs if self.store.finished(job.name, mark_of(job)) is None)
-        return self._do(what, waiting, task_of, mark_of)
+        waiting = (job for job in jobs if job.state == "waiting")
+        return self._do(
+            what, deque(job for job in waiting if not self.store.finished(job.name, job.mark)), task_of
+        )
 
 
 def _make_ready(out: Job, waiting: deque[Job]) -> None:
@@ -493,19 +468,10 @@ def _make_ready(out: Job, waiting: deque[Job]) -> None:
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     """What a run would do: tiles, points, memory and time, as the headers of the inputs tell (``--dry-run``)."""
     grid, options, density = survey.grid, survey.options, survey.density
-    jobs = {tile: Job(grid.name(tile), tile=tile) for tile in survey.tiles()}
-    for extent in survey.extents.values():
-        x0, y0, x1, y1 = extent.box
-        for tile in grid.covering(extent.box) if extent.count else ():
-            a = grid.box(tile)
-            wide = max(min(a[2], x1) - max(a[0], x0), 0.0) or (x1 == x0)
-            high = max(min(a[3], y1) - max(a[1], y0), 0.0) or (y1 == y0)
-            share = wide * high / (max(x1 - x0, 1e-9) * max(y1 - y0, 1e-9))
-            jobs[tile].points += round(extent.count * min(1.0, share))
-    tiles = list(jobs.values())
+    tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
     outputs_for(plan, survey.names if survey.per == "file" else [job.name for job in tiles], survey.paths)
     count, read = density.points, density.read_by(grid.size, survey.halo_units)
-    seconds = count * (_OWN + _OTHER) + sum(max(0, read - job.points) for job in tiles) * _AROUND
+    seconds = count * (_OWN + _OTHER) + max(0, read * len(tiles) - count) * _AROUND
     kept = float(count * _KEPT * (survey.per == "file"))
     if plan.first is not None:
         cells = density.area * (survey.unit / plan.first.blocks.cell) ** 2
@@ -515,7 +481,6 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "workers": options.local_workers,
         "threads_per_worker": options.threads,
         "points": count,
-        "points_of_largest_tile": max((job.points for job in tiles), default=0),
         "points_read_by_a_tile": read,
         "memory_mb_of_a_worker": worker_bytes(read, largest, survey.block_bytes) / 2**20,
         "points_per_core_second": count / seconds if seconds else 0.0,

@@ -42,7 +42,7 @@ class TileTask:
             if self.outputs is not None:
                 box = context.grid.box(self.tile)
                 return record | write_tile(results, context.plan, self.outputs, box, context.scratch)
-            save_results(self.result, results, context.scratch)
+            save_results(self.result, results)
         return record | {"outputs": written([self.result])}
 
     def _settled(self, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:

@@ -340,7 +340,7 @@ class Taking:
                 arrays[f"{number}/mask"] = np.asarray(cloud.mask)
             arrays |= {f"{number}/d/{name}": np.asarray(v) for name, v in cloud.dimensions.items()}
             clouds.append({"value": value, "name": cloud.name, "dimensions": list(training.dimensions)})
-        save_arrays(outputs[0], arrays, scratch)
+        save_arrays(outputs[0], arrays)
         report = points.report
         said = {"said": report.messages, "ignored": int(report.figures.get("ignored", 0)), "clouds": clouds}
         said |= {"looked": looked} if looked else {}
