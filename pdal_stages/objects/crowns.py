@@ -83,7 +83,9 @@ def crown_cells(s: NDArray, least: float, base: float, slope: float, depth: floa
                     if _higher(z, i * columns + j, up[n]):
                         up[n] = i * columns + j
     maximum = up == np.arange(rows * columns)
-    for n in np.flatnonzero(maximum):
+    for n in range(rows * columns):
+        if not maximum[n]:
+            continue
         r, c = n // columns, n % columns
         radius = min(base + slope * z[n], reach / 2)
         k = int(radius)

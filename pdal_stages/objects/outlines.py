@@ -8,7 +8,6 @@ direction get the same coordinate at both ends, the median of what their cells s
 from __future__ import annotations
 
 import ctypes
-import importlib
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..base.errors import DependencyError, StageError, how_to_add
+from ..base.errors import StageError, optional_import
 from ..base.ownprocess import in_own_process
 from .found import Table
 
@@ -37,14 +36,7 @@ _LIKENESS, _LEAST = 0.75, 0.4
 
 def vector(name: str) -> Any:
     """shapely, pyogrio or pyproj; an error says how to get it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise DependencyError(
-            f"outlines need {name}",
-            found=str(error),
-            cure=f"Install the extra: {how_to_add('vector')}",
-        ) from None
+    return optional_import(name, "vector", "work with vector data")
 
 
 @contextmanager

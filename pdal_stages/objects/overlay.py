@@ -168,15 +168,10 @@ def _flat(crs: Any) -> Any:
 
 def points_inside(x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]) -> NDArray[np.bool_]:
     """Which points (n,) lie inside polygons, or on their edge."""
-    shapely = vector("shapely")
-    order = np.argsort(x, kind="stable")
-    x, y = x[order], y[order]
-    inside, out = np.zeros(len(x), bool), np.empty(len(x), bool)
-    for shape in polygons:
-        west, south, east, north = shape.bounds
-        near = np.arange(np.searchsorted(x, west, "left"), np.searchsorted(x, east, "right"))
-        near = near[(y[near] >= south) & (y[near] <= north) & ~inside[near]]
-        shapely.prepare(shape)
-        inside[near] = shapely.intersects_xy(shape, x[near], y[near])
-    out[order] = inside
-    return out
+    shapely, inside = vector("shapely"), np.zeros(len(x), bool)
+    whole = shapely.union_all(polygons)
+    west, south, east, north = whole.bounds
+    near = (x >= west) & (x <= east) & (y >= south) & (y <= north)
+    shapely.prepare(whole)
+    inside[near] = shapely.intersects_xy(whole, x[near], y[near])
+    return inside

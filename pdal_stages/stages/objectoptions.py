@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
 from typing import Any
@@ -26,27 +25,8 @@ _CODES = {
 }
 
 
-def _setting(name: str) -> Any:
-    one = _SETTINGS[name]
-    rule = one.metadata
-    return option(
-        "number", one.default, rule["what"], minimum=rule["low"], maximum=rule["high"], unit=rule["unit"]
-    )
-
-
 def _codes(name: str, what: str) -> Any:
     return option("codes", CLASSES[_CODES[name]], f"Class codes of {what}", may_be_empty=True)
-
-
-def check_reasons(names: Sequence[str]) -> None:
-    """Refuse what is no reason to check an object."""
-    for name in names:
-        if name not in REASONS:
-            raise OptionError(
-                "option 'refuse' names no reason",
-                found=repr(name),
-                cure=f"{suggest(str(name), REASONS)}Reasons: {', '.join(REASONS)}",
-            )
 
 
 class ObjectOptions:
@@ -58,18 +38,13 @@ class ObjectOptions:
     wires: list[int] = _codes("wires", "wires")
     decks: list[int] = _codes("decks", "bridge decks")
     towers: list[int] = _codes("towers", "towers and poles, where spans of wires end")
-    cell: float = _setting("cell")
-    building_height: float = _setting("building_height")
-    building_area: float = _setting("building_area")
-    step: float = _setting("step")
-    roof_part: float = _setting("roof_part")
-    tree_height: float = _setting("tree_height")
-    tree_area: float = _setting("tree_area")
-    window: float = _setting("window")
-    window_slope: float = _setting("window_slope")
-    saddle: float = _setting("saddle")
-    smoothing: float = _setting("smoothing")
-    span_gap: float = _setting("span_gap")
+    refuse: list[str] = option(
+        "list",
+        (),
+        "Objects with one of these reasons to be checked are none (filters.objects: their points change their class), and "
+        f"counted: {', '.join(REASONS)}",
+        may_be_empty=True,
+    )
     ignore: Selection = ignore_option("Points of no object")
 
     options: dict[str, Any]
@@ -84,9 +59,15 @@ class ObjectOptions:
         """Class codes of each kind."""
         return {kind: tuple(int(c) for c in self.options[name]) for name, kind in _CODES.items()}
 
-    def check_classes(self) -> None:
-        """Refuse a code of two kinds."""
+    def check(self) -> None:
         kind_of_code(self.classes)
+        for name in self.options["refuse"]:
+            if name not in REASONS:
+                raise OptionError(
+                    "option 'refuse' names no reason",
+                    found=repr(name),
+                    cure=f"{suggest(str(name), REASONS)}Reasons: {', '.join(REASONS)}",
+                )
 
     def cells(self, points: Points) -> Cells:
         """Records of the points that may be of objects, or are ground.
@@ -114,3 +95,12 @@ class ObjectOptions:
             x, y, z, codes = x[usable], y[usable], z[usable], codes[usable]
             told = None if told is None else told[usable]
         return Cells.of(x, y, z, codes, self.settings.cell, reliability=told, classes=self.classes)
+
+
+for _name, _one in _SETTINGS.items():
+    _rule = _one.metadata
+    _made = option(
+        "number", _one.default, _rule["what"], minimum=_rule["low"], maximum=_rule["high"], unit=_rule["unit"]
+    )
+    _made.__set_name__(ObjectOptions, _name)
+    setattr(ObjectOptions, _name, _made)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ..objects import Objects, find_objects
 from ..objects.cells import Kind, kind_of_code
 from ..objects.find import FOUND
-from ..objects.measure import CHECK, REASONS
+from ..objects.measure import CHECK
 from ..objects.view import MARGIN
 from .base import Stage
-from .objectoptions import ObjectOptions, check_reasons
+from .objectoptions import ObjectOptions
 from .options import option
 from .points import Points
 
@@ -35,12 +35,6 @@ class ObjectsFilter(ObjectOptions, Stage):
         "boolean",
         False,
         "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area, of spans their length)",
-    )
-    refuse: list[str] = option(
-        "list",
-        (),
-        f"Points of objects with one of these reasons to be checked change their class: {', '.join(REASONS)}",
-        may_be_empty=True,
     )
     refused_class: int = option("integer", 1, "The class that they get", minimum=0, maximum=255)
     details = """
@@ -69,10 +63,6 @@ the tile is read wider. To write objects as polygons and points use `pdal-stages
     before = ({"type": "filters.modelclassifier", "model": "town.model"},)
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.objects", "judged": True}
-
-    def check(self) -> None:
-        self.check_classes()
-        check_reasons(self.refuse)
 
     def reads(self) -> list[str]:
         return ["Classification"]

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import copy
-
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.outputs import Output
 from ..objects import find_objects
-from ..objects.measure import REASONS
 from ..objects.outlines import with_vector
 from .base import Stage
-from .objectoptions import ObjectOptions, check_reasons
+from .objectoptions import ObjectOptions
 from .options import option
 from .points import Points
 
@@ -37,12 +34,6 @@ class ObjectsWriter(ObjectOptions, Stage):
         "Outlines of buildings and decks: straight, along walls, or along cells",
         choices=(STRAIGHT, CELLS),
     )
-    refuse: list[str] = option(
-        "list",
-        (),
-        f"Objects with one of these reasons to be checked are left out, and counted: {', '.join(REASONS)}",
-        may_be_empty=True,
-    )
     details = """
 The objects are those of `filters.objects`, with the same ids and options. Layers and their columns (measures in meters,
 whatever the unit of the coordinates; names fit into shapefiles):
@@ -65,18 +56,10 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
     #: Whether whoever reads the files may take larger cells than `cell` where points are few.
     widens = False
 
-    def with_cell(self, cell: float) -> ObjectsWriter:
-        """The same with cells of another size."""
-        other = copy.copy(self)
-        other.options = {**self.options, "cell": cell}
-        other.__dict__.pop("settings", None)
-        return other
-
     def check(self) -> None:
         from ..reports.objectlayers import check_target
 
-        self.check_classes()
-        check_reasons(self.refuse)
+        super().check()
         with_vector(check_target, self.filename)
 
     def outputs(self) -> list[Output]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -156,7 +156,7 @@ def _objects_of_files(
     cells = _all_cells(inputs, stage, wkt, workers)
     size, thin = cells.size, cells.thin()
     while stage.widens and cells.thin() and cells.size < LARGEST:
-        stage, cells = stage.with_cell(2 * cells.size), cells.doubled()
+        cells = cells.doubled()
     if thin:
         too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
         print_messages(
@@ -164,7 +164,7 @@ def _objects_of_files(
             if stage.widens
             else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
         )
-    return find_objects(cells, stage.settings), units, wkt
+    return find_objects(cells, replace(stage.settings, cell=cells.size)), units, wkt
 
 
 def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
