@@ -20,11 +20,9 @@ import h17_oakland  # noqa: E402
 import kit  # noqa: E402
 import pts_input  # noqa: E402
 import scenes  # noqa: E402
-import tables  # noqa: E402
 import w18  # noqa: E402
 
-from pdal_stages.base.errors import StageError  # noqa: E402
-from pdal_stages.features import FeaturePlan, compute_features  # noqa: E402
+from pdal_stages.features import compute_features  # noqa: E402
 
 #: The town's ASPRS codes -> labels of the Vaihingen files that they stand in for.
 LABELS = {2: 2, 3: 1, 5: 8, 6: 5}
@@ -57,79 +55,6 @@ def folder(town, tmp_path_factory):
     return root
 
 
-# ---- tables ----------------------------------------------------------------------------------------------
-
-
-def test_table_is_markdown():
-    text = tables.table(("What", "OA"), [("ours", "96.1")])
-    assert text == "| What | OA |\n| --- | ---: |\n| ours | 96.1 |\n"
-    with pytest.raises(ValueError, match="1 cells under 2 heads"):
-        tables.table(("What", "OA"), [("ours",)])
-
-
-def test_spread_is_the_sample_deviation():
-    assert tables.spread([1.0, 3.0]) == "2.00 ± 1.41"
-    assert tables.spread([1.0]) == "1.00"
-    assert tables.spread([]) == "–"
-
-
-def test_choose_takes_absent_options_as_none():
-    runs = [{"a": 1, "b": 2}, {"a": 1}]
-    assert tables.choose(runs, a=1, b=None) == [{"a": 1}]
-
-
-# ---- cache and results -----------------------------------------------------------------------------------
-
-
-def test_cache_makes_once_and_again_for_other_keys(tmp_path):
-    made = []
-
-    def make():
-        made.append(1)
-        return np.arange(3.0)
-
-    cache = kit.Cache(tmp_path)
-    for key in ({"what": "x", "a": 1}, {"what": "x", "a": 1}, {"what": "x", "a": 2}):
-        assert cache.array(key, make).tolist() == [0, 1, 2]
-    assert len(made) == 2
-    assert not list(tmp_path.glob("*.tmp"))
-
-
-def test_cached_features_are_those_computed_and_depend_on_the_cloud(town, tmp_path):
-    cache, plan = kit.Cache(tmp_path), FeaturePlan.parse("c2", "covariance")
-    first = kit.features(town, plan, cache)
-    expected = compute_features(town.xyz, neighborhoods="c2", feature_set="covariance").values
-    np.testing.assert_array_equal(first, expected)
-    moved = clouds.Cloud("town", town.xyz * [1, 1, 2], town.labels)
-    assert not np.array_equal(kit.features(moved, plan, cache), expected)
-    assert len(list(tmp_path.glob("*.npy"))) == 2
-
-
-def test_results_resume_and_forget_other_contexts(tmp_path):
-    path, done = tmp_path / "r.jsonl", []
-
-    def make():
-        done.append(1)
-        return {"oa": 50.0}
-
-    kit.Results(path, {"data": "a"}).get({"seed": 1}, make)
-    with open(path, "a") as file:
-        file.write('{"context": {"da')  # an interrupted line
-    again = kit.Results(path, {"data": "a"})
-    assert again.get({"seed": 1}, make)["oa"] == 50.0
-    assert len(done) == 1
-    kit.Results(path, {"data": "b"}).get({"seed": 1}, make)
-    assert len(done) == 2
-
-
-def test_draw_balances_and_repeats_small_classes():
-    labels = np.array([1] * 100 + [2] * 3)
-    rows = kit.draw(labels, (1, 2), 10, 0)
-    assert np.bincount(labels[rows]).tolist() == [0, 10, 10]
-    assert len(set(rows[:10])) == 10
-    assert np.bincount(rows[10:])[100:].max() == 4
-
-
 # ---- .pts ------------------------------------------------------------------------------------------------
 
 
@@ -138,21 +63,6 @@ def test_pts_round_trip(folder, town):
     assert len(back) == len(town)
     assert sorted(back.labels) == sorted(town.labels)
     assert set(back.dimensions) == {"Intensity", "ReturnNumber", "NumberOfReturns"}
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("1 2 3 4\n", "has 4 columns, not 7"),
-        ("1 2 3 4 x 6 7\n", "no table|not a table"),
-        ("1 2 3 4 5 6 0.5\n", "whole"),
-    ],
-)
-def test_pts_that_is_none(tmp_path, text, message):
-    path = tmp_path / "bad.pts"
-    path.write_text(text)
-    with pytest.raises(StageError, match=message):
-        pts_input.read_pts([path], "bad")
 
 
 @pytest.mark.pdal
@@ -277,14 +187,6 @@ def test_w18_run(scene):
     assert "HeightAboveGround" in text
 
 
-def test_w18_groups():
-    assert w18.group("D1_0_c2") == "D1"
-    assert w18.group("Linearity_kopt") == "covariance"
-    assert w18.group("HeightStd_s5") == "geometric"
-    assert w18.group("HeightAboveGround") == w18.neighborhood("HeightAboveGround") == "HeightAboveGround"
-    assert w18.neighborhood("D1_0_c2") == "c2"
-
-
 def test_h17_thresholds_are_a_choice_between_two_tables(town):
     """What the command takes together from two tables is what the engine computes at that threshold."""
     cloud = clouds.with_height(clouds.Cloud("town", town.xyz, town.labels))
@@ -326,21 +228,6 @@ def test_h17_radii_by_dimensionality(town):
         members = town.xyz[away <= chosen]
         assert made[i, 1] == pytest.approx(np.ptp(members[:, 2]), abs=1e-5)
     assert min(n for n in fewest if n >= 10) < 30
-
-
-def test_b16_searches_the_number_of_trees():
-    """Of equals the fewest; the forest is the first trees of the largest."""
-    random = np.random.default_rng(0)
-    values = random.normal(size=(300, 4)).astype(np.float32)
-    labels = (values[:, 0] > 0).astype(int)
-    forest = kit.search_trees(values, labels, (5, 30), seed=1, threads=1)
-    small = kit.search_trees(values, labels, (len(forest.estimators_),), seed=1, threads=1)
-    assert len(forest.estimators_) in (5, 30)
-    assert np.array_equal(forest.predict_proba(values), small.predict_proba(values))
-    whole = kit.grow_forest(values, labels, trees=5, seed=1, threads=1)
-    assert np.array_equal(
-        whole.predict_proba(values), kit.search_trees(values, labels, (5,), seed=1).predict_proba(values)
-    )
 
 
 def test_h17_score_and_report(town, monkeypatch):

@@ -34,21 +34,8 @@ def written(folder, *words: object) -> set[str]:
     """What a command opened for writing, made, renamed or removed beyond what is its own."""
     log = folder / "trace.txt"
     calls = "trace=open,openat,creat,rename,renameat,renameat2,link,linkat,symlink,symlinkat,truncate,unlink,unlinkat,mkdir,mkdirat,rmdir"
-    command = [
-        "strace",
-        "-f",
-        "-qq",
-        "-y",
-        "-s",
-        "4096",
-        "-o",
-        str(log),
-        "-e",
-        calls,
-        sys.executable,
-        "-m",
-        "pdal_stages.cli",
-    ]
+    strace = ["strace", "-f", "-qq", "-y", "-s", "4096", "-o", str(log), "-e", calls]
+    command = [*strace, sys.executable, "-m", "pdal_stages.cli"]
     done = subprocess.run(
         [*command, *map(str, words)], cwd=folder, capture_output=True, text=True, timeout=500
     )
@@ -70,10 +57,6 @@ def test_files_that_are_written(tmp_path, cloud, model):
     shutil.copy(cloud, tmp_path / "raw.las")
     words = ["classify", "raw.las", "out.las", "--model", model, "--metadata", "m.json", "--log", "run.log"]
     assert written(tmp_path, *words) == {"out.las", "m.json", "run.log"}
-    small = ["--neighborhoods", "c1", "--count", "50", "--trees", "2"]
-    assert written(tmp_path, "train", "raw.las", "--model", "own.model", *small) == {"own.model"}
-    words = ["accuracy", "raw.las", "--reference", "raw.las", "--json", "a.json", "--html", "a.html"]
-    assert written(tmp_path, *words) == {"a.json", "a.html"}
     path = job(tmp_path, "raw.las", HAG, {"type": "filters.modelclassifier", "model": str(model)}, "o_#.las")
     words = ["pipeline", path, "--tile", "15", "--workers", "2", "--report", "r.html"]
     assert written(tmp_path, *words) == {"o_raw.las", "r.html"}
