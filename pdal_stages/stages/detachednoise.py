@@ -48,12 +48,11 @@ of any density. Put it first: one echo 10 m below ground spoils a ground filter,
 
 A point is suspect if it is of a cluster of at most `cluster` points that nothing joins to the rest of the cloud. A suspect
 that lies above all that is near by more than `gap` is high noise (18); one that lies below a plane under its
-surroundings by more than `depth` is low noise (7). Echoes from just below the ground, which is near enough to join them,
-show as columns with a lowest point below that plane. Not marked are what hangs in line with others, as wires do; what is as
-deep as ground near by, as courtyards and wells of light are; ditches and pits, where many columns are deep side by side;
-what is more than a fortieth of all around, or lies on one plane with half of what is low around, as the ground that a
-closed canopy shows in single points; and whatever has too little around it to be judged by. The thinner the cloud, the
-more it takes: at 0.3 points/m2 a tree may be a single point, and only what is some 15 m above everything is marked.
+surroundings by more than `depth` is low noise (7). Not marked are what hangs in line with others, as wires do; what is as
+deep as ground near by, as courtyards and wells of light are; what is more than a fortieth of all around, or under a closed
+canopy about as deep as what is low around, as the ground that shows in single points is; and whatever has too little
+around it to be judged by. The thinner the cloud, the more it takes: at 0.3 points/m2 a tree may be a single point, and only
+what is some 15 m above everything is marked.
 
 Nothing depends on the order of points, and the grid is anchored to absolute coordinates: a tile with its halo gets the
 marks of the whole cloud. The counts are in the metadata as `low` and `high`.

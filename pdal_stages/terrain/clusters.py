@@ -8,10 +8,14 @@ All is counted in whole numbers, so neither the order of points nor the tile mat
 
 from __future__ import annotations
 
-import numpy as np
+from itertools import product
+from typing import NamedTuple
 
-from ..base.jit import device, njit
-from ..base.unionfind import root as root_of
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.runs import begins_run
+from .linked import longest_sides, sums_around
 
 #: Side of a voxel, meters.
 SIDE = 1.5
@@ -29,163 +33,82 @@ LEVELS, BITS = 1 << 21, 22
 CLUSTER_REACH = (LARGEST_EXTENT + 3 * BLOCK + 2) * SIDE
 
 
-@device
-def _slot(table, keys, key):
-    """Where a key is in the table of voxel numbers, or the empty place for it."""
-    mask = np.uint64(len(table) - 1)
-    at = (np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)
-    at &= mask
-    while table[at] >= 0 and keys[table[at]] != key:
-        at = (at + np.uint64(1)) & mask
-    return at
+class Voxels(NamedTuple):
+    """Voxels that hold points, by row, column and level."""
+
+    keys: NDArray[np.int64]  #: (n,) ascending
+    counts: NDArray[np.int64]  #: (n,) points in each
+    width: int  #: columns of the raster, whose rim is empty
+
+    @classmethod
+    def of(cls, row, column, level, width: int, counts=None) -> tuple[Voxels, NDArray[np.int64]]:
+        """Voxels of points, or of others with `counts` of them; and the number of each one's voxel."""
+        keys, voxel = np.unique(((row * width + column) << BITS) + level + LEVELS, return_inverse=True)
+        return cls(keys, np.bincount(voxel, counts).astype(np.int64), width), voxel
+
+    @property
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Rows, columns and levels."""
+        return (*np.divmod(self.keys >> BITS, self.width), (self.keys & ((1 << BITS) - 1)) - LEVELS)
 
 
-@device
-def find(table, keys, key):
-    return table[_slot(table, keys, key)]
+def surroundings(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Around each voxel the usual number of points in a column, and their spacing in meters, over 3 x 3 blocks."""
+    row, column, _ = voxels.places
+    wide = voxels.width // BLOCK
+    block = (row // BLOCK) * wide + column // BLOCK
+    size = -(-(int(block.max()) + 1) // wide) * wide
+    points = np.bincount(block, voxels.counts, size).astype(np.int64).reshape(-1, wide)
+    full = np.bincount(block[begins_run(voxels.keys >> BITS)], minlength=size).reshape(-1, wide)
+    points, full, blocks = (sums_around(v, 1).ravel()[block] for v in (points, full, full > 0))
+    return points / full, np.sqrt(blocks * (BLOCK * SIDE) ** 2 / points)
 
 
-@njit
-def voxels(column, row, level, left, bottom, w):
-    """Number of each point's voxel, voxels' keys and counts, and the table that finds them."""
-    size = 1 << 12
-    table = np.full(size, -1, np.int32)
-    keys, counts = np.empty(size, np.int64), np.zeros(size, np.int32)
-    voxel = np.empty(len(column), np.int32)
-    n, last, before = 0, -1, np.int64(-1)
-    for p in range(len(column)):
-        key = (((row[p] - bottom) * w + (column[p] - left)) << BITS) + (level[p] + LEVELS)
-        if key != before or last < 0:
-            at = _slot(table, keys, key)
-            last = table[at]
-            if last < 0:
-                if 2 * n >= size:
-                    size *= 4
-                    more, number = np.empty(size, np.int64), np.zeros(size, np.int32)
-                    more[:n], number[:n] = keys[:n], counts[:n]
-                    keys, counts = more, number
-                    table = np.full(size, -1, np.int32)
-                    for k in range(n):
-                        table[_slot(table, keys, keys[k])] = k
-                    at = _slot(table, keys, key)
-                last = n
-                keys[n] = key
-                table[at] = n
-                n += 1
-            before = key
-        counts[last] += 1
-        voxel[p] = last
-    return voxel, keys[:n].copy(), counts[:n].copy(), table
+def _small(voxels: Voxels, usual: NDArray[np.float64], most: int) -> tuple[NDArray[np.bool_], NDArray]:
+    """Voxels of small components, and weak ones that no large component touches; points of each one's component."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    keys, number = voxels.keys, len(voxels.keys)
+    strong = voxels.counts > (WEAK * usual).astype(np.int64)
+    pairs = []
+    for dj, di, dl in list(product((-1, 0, 1), repeat=3))[14:]:  # those ahead
+        wanted = keys + ((dj * voxels.width + di) << BITS) + dl
+        at = np.minimum(np.searchsorted(keys, wanted), number - 1)
+        touching = np.flatnonzero(keys[at] == wanted)
+        pairs.append([touching, at[touching]])
+    one, other = np.concatenate(pairs, axis=1)
+    both = strong[one] & strong[other]
+    graph = coo_array((np.ones(both.sum(), np.int8), (one[both], other[both])), (number, number))
+    count, label = connected_components(graph, directed=False)
+    size = np.bincount(label, voxels.counts).astype(np.int64)
+    first = np.empty(count, np.int64)
+    first[label[::-1]] = np.arange(number)[::-1]  # a component's first voxel stands for it
+    widest = np.minimum(EXTENT + EXTENT_GROWTH * usual[first], LARGEST_EXTENT)
+    small = ((size <= most) & (longest_sides(label, voxels.places, count) < widest))[label]
+    large = strong & ~small
+    small[~strong] = True
+    for weak, beside in ((one, other), (other, one)):
+        small[weak[~strong[weak] & large[beside]]] = False
+    return small, size[label]
 
 
-@njit
-def surroundings(keys, counts, w, h):
-    """For each block: the usual number of points in a column, and the spacing of points in meters (over 3 x 3 blocks)."""
-    bh, bw = h // BLOCK, w // BLOCK
-    points, full = np.zeros((bh, bw), np.int64), np.zeros((bh, bw), np.int64)
-    seen = np.zeros((h, w), np.bool_)
-    for k in range(len(keys)):
-        place = keys[k] >> BITS
-        j, i = place // w, place % w
-        points[j // BLOCK, i // BLOCK] += counts[k]
-        if not seen[j, i]:
-            seen[j, i] = True
-            full[j // BLOCK, i // BLOCK] += 1
-    usual, spacing = np.ones((bh, bw)), np.full((bh, bw), 10.0)
-    for j in range(bh):
-        for i in range(bw):
-            n, c, blocks = 0, 0, 0
-            for b in range(max(j - 1, 0), min(j + 2, bh)):
-                for a in range(max(i - 1, 0), min(i + 2, bw)):
-                    n += points[b, a]
-                    c += full[b, a]
-                    blocks += full[b, a] > 0
-            if n > 0:
-                usual[j, i] = n / c
-                spacing[j, i] = np.sqrt(blocks * (BLOCK * SIDE) ** 2 / n)
-    return usual, spacing
-
-
-@njit
-def _small(keys, counts, table, usual, w, most):
-    """Voxels of small components, and weak ones that no large component touches."""
-    n = len(keys)
-    strong = np.empty(n, np.bool_)
-    parent = np.arange(n).astype(np.int32)
-    for k in range(n):
-        place = keys[k] >> BITS
-        strong[k] = counts[k] > int(WEAK * usual[place // w // BLOCK, place % w // BLOCK])
-    step = np.empty(13, np.int64)
-    m = 0
-    for dj in range(-1, 2):
-        for di in range(-1, 2):
-            for dl in range(-1, 2):
-                if dj * 9 + di * 3 + dl > 0:
-                    step[m] = ((dj * w + di) << BITS) + dl
-                    m += 1
-    for k in range(n):
-        if strong[k]:
-            for s in range(13):
-                q = find(table, keys, keys[k] + step[s])
-                if q >= 0 and strong[q]:
-                    a, b = root_of(parent, k), root_of(parent, q)
-                    if keys[a] < keys[b]:  # so that a component's first voxel stands for it
-                        parent[b] = a
-                    else:
-                        parent[a] = b
-    total = np.zeros(n, np.int64)
-    box = np.empty((n, 6), np.int32)
-    for k in range(n):
-        r = root_of(parent, k)
-        place, level = keys[k] >> BITS, keys[k] & (2 * LEVELS - 1)
-        j, i = place // w, place % w
-        if total[r] == 0:
-            box[r, 0] = box[r, 1] = j
-            box[r, 2] = box[r, 3] = i
-            box[r, 4] = box[r, 5] = level
-        total[r] += counts[k]
-        box[r, 0], box[r, 1] = min(box[r, 0], j), max(box[r, 1], j)
-        box[r, 2], box[r, 3] = min(box[r, 2], i), max(box[r, 3], i)
-        box[r, 4], box[r, 5] = min(box[r, 4], level), max(box[r, 5], level)
-    small = np.empty(n, np.bool_)
-    size = counts.astype(np.int64)
-    for k in range(n):
-        if strong[k]:
-            r = root_of(parent, k)
-            extent = max(box[r, 1] - box[r, 0], box[r, 3] - box[r, 2], box[r, 5] - box[r, 4])
-            place = keys[r] >> BITS
-            widest = EXTENT + EXTENT_GROWTH * usual[place // w // BLOCK, place % w // BLOCK]
-            small[k] = total[r] <= most and extent < min(widest, LARGEST_EXTENT)
-            size[k] = total[r]
-    for k in range(n):
-        if not strong[k]:
-            small[k] = True
-            for s in range(26):
-                q = find(table, keys, keys[k] + (step[s] if s < 13 else -step[s - 13]))
-                if q >= 0 and strong[q] and not small[q]:
-                    small[k] = False
-                    break
-    return small, size
-
-
-def small_clusters(keys, counts, table, usual, spacing, w, h, most):
+def small_clusters(
+    voxels: Voxels, usual: NDArray[np.float64], spacing: NDArray[np.float64], most: int
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Which voxels are of clusters of at most `most` points that nothing joins to the rest, and points of each one's.
 
-    The voxels, as :func:`voxels` gives them, are on a raster of `h` rows and `w` columns; `usual` and `spacing` are
-    what :func:`surroundings` says.
+    `usual` and `spacing` are what :func:`surroundings` says.
     """
-    small, size = _small(keys, counts, table, usual, w, most)
-    row, column = np.divmod(keys >> BITS, w)
-    level = (keys & ((1 << BITS) - 1)) - LEVELS
-    apart = spacing[row // BLOCK, column // BLOCK]
+    small, size = _small(voxels, usual, most)
+    row, column, level = voxels.places
     for scale in range(1, SCALES + 1):
-        thin = small & (apart * SPACINGS > SIDE * 2 ** (scale - 1))
+        thin = small & (spacing * SPACINGS > SIDE * 2 ** (scale - 1))
         if not thin.any():
             break
-        width = (w >> scale) + 2  # with one empty column on every side
-        voxel, wider, _, table = voxels((column >> scale) + 1, (row >> scale) + 1, level, 0, 0, width)
-        number = np.bincount(voxel, counts).astype(np.int64)
-        alike = np.ones(((h >> scale) // BLOCK + 1, width // BLOCK + 1))
-        still, total = _small(wider, number, table, alike, width, most)
-        small[thin], size[thin] = still[voxel[thin]], total[voxel[thin]]
+        # With one empty column on every side.
+        width = (voxels.width >> scale) + 2
+        wider, of = Voxels.of((row >> scale) + 1, (column >> scale) + 1, level, width, voxels.counts)
+        still, total = _small(wider, np.ones(len(wider.keys)), most)
+        small[thin], size[thin] = still[of[thin]], total[of[thin]]
     return small, size

@@ -114,7 +114,7 @@ class _Rims:
         )
         self._across, self._walled = (end == ACROSS).sum(axis=1), (end == WALLED).sum(axis=1)
         self._size = np.bincount(self._part)
-        self._length = 1 + longest_sides(self._part, self._row, self._column, len(self._size))
+        self._length = 1 + longest_sides(self._part, (self._row, self._column), len(self._size))
         # Where most of a deck shows what lies below, one walks on farther to land.
         shown, within = z[start[cell]] < z[self._level] - DROP, self._down == 0
         many = np.bincount(self._part, within)
@@ -202,7 +202,7 @@ class _Rims:
 
 def _goes_on(rim: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Blocks with some of the rim FAR_ENDS rows up, and some as many rows down, no more columns to a side."""
-    beside = sliding_window_view(np.pad(rim, FAR_ENDS), 2 * FAR_ENDS + 1, axis=1).any(axis=-1)
+    beside = np.any(sliding_window_view(np.pad(rim, FAR_ENDS), 2 * FAR_ENDS + 1, axis=1), axis=-1)
     return beside[: len(rim)] & beside[2 * FAR_ENDS :]
 
 

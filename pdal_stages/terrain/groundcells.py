@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 
 from ..base.jit import njit
 from ..base.runs import begins_run
-from .canopy import reach as canopy_reach
+from .belowground import pits, pits_reach
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .lowest import heights_of, lowest_points, places_of
 from .openings import HOLE, objects_of, opening_radius
 from .patches import SIDE
-from .pits import pits
-from .pits import reach as pits_reach
 from .planes import from_parents, planes_of_blocks
 from .planes import reach as planes_reach
 from .plateaus import reach as plateau_reach
@@ -97,7 +95,7 @@ class FilterOptions:
     @property
     def link(self) -> int:
         """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
-        return max(canopy_reach(self.cell), self.largest_radius, planes_reach(self.levels(FAR))) + 2
+        return max(pits_reach(self.cell), self.largest_radius, planes_reach(self.levels(FAR))) + 2
 
 
 #: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`GroundRaster.place`.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,43 +13,31 @@ from .openings import HOLE
 
 
 @njit
-def _linked(raster, offsets, steps, reach, number):
+def _linked(padded, offsets, steps, reach, number):
     """Number the measured cells of each linked set alike; returns how many sets there are."""
-    h, w = raster.shape
-    # With holes beside and below, so that no step has to look where the raster ends.
-    stride = w + 2 * reach
-    heights = np.full((h + reach) * stride + reach, HOLE)
+    h, w = number.shape
+    parent = np.arange(h * w)
     for j in range(h):
         for i in range(w):
-            heights[j * stride + reach + i] = raster[j, i]
-    parent = np.arange(len(heights))
-    ahead = offsets[:, 0] * stride + offsets[:, 1]
-    for j in range(h):
-        for at in range(j * stride + reach, j * stride + reach + w):
-            here = heights[at]
+            here, mine = padded[j, i + reach], root_of(parent, j * w + i)
             if here == HOLE:
                 continue
-            mine = root_of(parent, at)
             for k in range(len(steps)):
-                other = at + ahead[k]
-                if abs(heights[other] - here) <= steps[k] and parent[other] != mine:  # nor a hole
-                    other = root_of(parent, other)
-                    if other > mine:
-                        parent[other] = mine
-                    elif other < mine:
-                        parent[mine] = other
-                        mine = other
+                b, a = j + offsets[k, 0], i + offsets[k, 1]
+                if abs(padded[b, a + reach] - here) <= steps[k] and parent[b * w + a] != mine:  # nor a hole
+                    other = root_of(parent, b * w + a)
+                    mine, other = min(mine, other), max(mine, other)
+                    parent[other] = mine
     count = 0
-    names = np.empty(len(heights), np.int32)  # of those who stand for sets, each the first of its own
     for j in range(h):
         for i in range(w):
-            at = j * stride + reach + i
-            if heights[at] != HOLE:
-                root = root_of(parent, at)
-                if root == at:
-                    names[at] = count
+            if padded[j, i + reach] != HOLE:
+                root = root_of(parent, j * w + i)  # the first of its set
+                if root == j * w + i:
+                    number[j, i] = count
                     count += 1
-                number[j, i] = names[root]
+                else:
+                    number[j, i] = number[root // w, root % w]
     return count
 
 
@@ -64,23 +52,26 @@ def linked_cells(
     away = np.hypot(j, i)
     after = ((j > 0) | (i > 0)) & (away <= reach)
     number = np.full(raster.shape, -1)
+    # With holes beside and below, so that no step has to look where the raster ends.
+    padded = np.pad(raster, ((0, reach), (reach, reach)), constant_values=HOLE)
     offsets = np.column_stack([j[after], i[after]])
-    count = _linked(raster, offsets, step(away[after]).astype(np.float32), reach, number)
+    count = _linked(padded, offsets, step(away[after]).astype(np.float32), reach, number)
     rows, columns = np.nonzero(number >= 0)
     sets = number[rows, columns]
-    return number, np.bincount(sets, minlength=count), longest_sides(sets, rows, columns, count)
+    return number, np.bincount(sets, minlength=count), longest_sides(sets, (rows, columns), count)
 
 
 def longest_sides(
-    label: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64], count: int
+    label: NDArray[np.int64], places: Sequence[NDArray[np.int64]], count: int
 ) -> NDArray[np.int64]:
-    """Of each of `count` sets of cells, the difference of its last and first row, or column: the larger one."""
-    sides = np.zeros((2, count), np.int64)
-    for side, at in zip(sides, (row, column), strict=True):
-        first = np.full(count, at.max(initial=0))
+    """Of each of `count` sets of places, the difference of its last and first along each axis: the largest one."""
+    sides = np.zeros((len(places), count), np.int64)
+    for side, at in zip(sides, places, strict=True):
+        first, last = np.full((2, count), at[0] if len(at) else 0)
+        first[label] = last[label] = at
         np.minimum.at(first, label, at)
-        np.maximum.at(side, label, at)
-        side -= first
+        np.maximum.at(last, label, at)
+        side[:] = last - first
     return sides.max(axis=0)
 
 
@@ -93,7 +84,7 @@ def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
         last = np.minimum(np.arange(size) + reach, size - 1)
         before = np.arange(size) - reach - 1
         sums = np.take(total, last, axis)
-        inside = [slice(None)] * sums.ndim
+        inside: list = [slice(None)] * sums.ndim
         inside[axis] = before >= 0
         sums[tuple(inside)] -= np.take(total, before[before >= 0], axis)
     return sums

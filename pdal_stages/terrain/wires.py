@@ -107,7 +107,7 @@ def _find(xyz, cell, every, high, h, w) -> NDArray[np.bool_]:
     linked = near & good[other]
     pairs = scipy.sparse.coo_array((np.ones(linked.sum()), (one[linked], other[linked])), (count, count))
     parts, part = scipy.sparse.csgraph.connected_components(pairs, directed=False)
-    good &= (longest_sides(part, *np.divmod(cells, w), parts) * CELL >= LONG)[part]
+    good &= (longest_sides(part, np.divmod(cells, w), parts) * CELL >= LONG)[part]
     good[other[near & good[one]]] = True
     return good[level]
 

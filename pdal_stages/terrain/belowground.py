@@ -1,0 +1,192 @@
+"""What lies below the ground, as echoes from below do: by a plane under its surroundings.
+
+A low place lies below the plane by more than its surroundings scatter about it. It is ground after all where ground as deep
+is near, as a street is to a courtyard; and under a closed canopy, where hardly a column is
+level with others, if it is not below the plane under the low places there: single points reach the ground.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.jit import device, njit
+from .linked import linked_cells, sums_around
+from .openings import HOLE
+
+#: Columns within which a plane is fitted through the ground, and if there are too few, within which then; how many it needs.
+NEAR, WIDER, ENOUGH = 6, 13, 12
+#: How far below the plane a low place lies at least, in units of the scatter.
+SCATTERS = 4.0
+#: How far away other ground is looked for, in meters, how many columns of it show that a deep place is ground, and how much
+#: higher these may be per meter of distance.
+FAR, COMPANY, ROOM = 30.0, 4, 0.05
+#: A column of ground has so many others of its level, in meters, in the 5 x 5 round it, and such a share of those.
+SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
+#: A canopy is closed where at most such a share of the columns within so many around is level with others; low places there
+#: are compared within so many meters.
+CLOSED, AROUND, OTHERS = 1 / 3, 20, 45.0
+#: Cells of a minimum grid are linked within so many cells, across a step of so many meters, and so many per meter of
+#: distance; an island has at most so many, and is no longer, in cells, along either axis.
+LINK, STEP, GRADE, MOST, EXTENT = 3, 0.35, 0.15, 30, 20
+
+
+def reach(side: float) -> int:
+    """How far away columns of a `side` in meters change what lies below the ground, in columns."""
+    return math.ceil(max(OTHERS / side, AROUND) + max(FAR / side + 2, WIDER))
+
+
+@device
+def _plane_under(base, j, i, radius):
+    """Plane (height at the column, per column across, along; scatter below it) under the columns round one, and how
+    many these are."""
+    h, w = base.shape
+    size = min(2 * radius + 1, h) * min(2 * radius + 1, w)
+    u, v, zs = np.empty(size), np.empty(size), np.empty(size)
+    n = 0
+    for b in range(max(j - radius, 0), min(j + radius + 1, h)):
+        for a in range(max(i - radius, 0), min(i + radius + 1, w)):
+            if (b - j) ** 2 + (a - i) ** 2 <= radius * radius and (b != j or a != i) and base[b, a] < np.inf:
+                u[n], v[n], zs[n] = a - i, b - j, base[b, a]
+                n += 1
+    if n < ENOUGH:
+        return n, 0.0, 0.0, 0.0, 0.0
+    weight = np.sort(zs[:n])
+    lowest, least, most = weight[0], weight[n // 10], weight[n // 2]
+    for k in range(n):
+        weight[k] = 1.0 if least <= zs[k] <= most else 0.01
+    p0, p1, p2, scatter = 0.0, 0.0, 0.0, 0.0
+    for _turn in range(8):
+        s0 = s1 = s2 = s11 = s12 = s22 = t0 = t1 = t2 = 0.0
+        for k in range(n):
+            g = weight[k]
+            z = zs[k] - lowest
+            s0 += g
+            s1 += g * u[k]
+            s2 += g * v[k]
+            s11 += g * u[k] * u[k]
+            s12 += g * u[k] * v[k]
+            s22 += g * v[k] * v[k]
+            t0 += g * z
+            t1 += g * u[k] * z
+            t2 += g * v[k] * z
+        ridge = 1e-3 * s0
+        s11 += ridge
+        s22 += ridge
+        # Cramer's rule.
+        c0 = s11 * s22 - s12 * s12
+        c1 = s12 * s2 - s1 * s22
+        c2 = s1 * s12 - s11 * s2
+        det = s0 * c0 + s1 * c1 + s2 * c2
+        p0 = (t0 * c0 + t1 * c1 + t2 * c2) / det
+        p1 = (t0 * c1 + t1 * (s0 * s22 - s2 * s2) + t2 * (s1 * s2 - s0 * s12)) / det
+        p2 = (t0 * c2 + t1 * (s1 * s2 - s0 * s12) + t2 * (s0 * s11 - s1 * s1)) / det
+        below, number = 0.0, 0.0
+        for k in range(n):
+            off = zs[k] - lowest - p0 - p1 * u[k] - p2 * v[k]
+            weight[k] = 1.0 / (1.0 + off * off)
+            if off < 0.0:
+                weight[k] *= weight[k]
+                below += weight[k] * off * off
+                number += weight[k]
+            else:
+                weight[k] *= 0.1
+        scatter = np.sqrt(below / number) if number > 0.0 else 0.0
+    return n, p0 + lowest, p1, p2, scatter
+
+
+@njit
+def _supported(base, out):
+    """Columns with enough others of their level around."""
+    h, w = base.shape
+    for j in range(h):
+        for i in range(w):
+            level, seen = 0, 0
+            if base[j, i] < np.inf:
+                for b in range(max(j - 2, 0), min(j + 3, h)):
+                    for a in range(max(i - 2, 0), min(i + 3, w)):
+                        seen += base[b, a] < np.inf
+                        level += abs(base[b, a] - base[j, i]) <= LEVEL
+            out[j, i] = level > SUPPORT + SUPPORT_SHARE * seen
+
+
+@device
+def _has_company(base, supported, side, j, i, z, height, across, along):
+    """Whether enough other columns are about as deep as z: at least half as far below the plane."""
+    h, w = base.shape
+    far = int(np.ceil(FAR / side))
+    company, half = 0, 0.5 * (height - z)
+    for b in range(max(j - far, 0), min(j + far + 1, h)):
+        for a in range(max(i - far, 0), min(i + far + 1, w)):
+            if supported[b, a]:
+                away = side * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))
+                below = height + across * (a - i) + along * (b - j) - base[b, a]
+                company += away <= FAR and base[b, a] <= z + min(half, LEVEL + ROOM * away) and below >= half
+    return company >= COMPANY
+
+
+@njit
+def _limits(low, base, supported, side, depth, limit):
+    """Fill `limit` with the height below which each low place is deep, -inf where it is not or may be ground."""
+    for j in range(low.shape[0]):
+        for i in range(low.shape[1]):
+            if low[j, i] == np.inf:
+                continue
+            n, height, across, along, scatter = _plane_under(base, j, i, NEAR)
+            if n < ENOUGH:
+                n, height, across, along, scatter = _plane_under(base, j, i, WIDER)
+            lowest = height - depth - SCATTERS * scatter
+            if n >= ENOUGH and low[j, i] < lowest:  # noqa: SIM102
+                if not _has_company(base, supported, side, j, i, low[j, i], height, across, along):
+                    limit[j, i] = lowest
+
+
+@njit
+def _below_others(low, asked, side, depth, out):
+    """Take from `out` the places asked for that are not below the plane under the low places."""
+    radius = int(OTHERS / side)
+    for j in range(low.shape[0]):
+        for i in range(low.shape[1]):
+            if asked[j, i]:
+                n, height, _, _, scatter = _plane_under(low, j, i, radius)
+                out[j, i] = n < ENOUGH or low[j, i] < height - depth - SCATTERS * scatter
+
+
+def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -> NDArray[np.float64]:
+    """Heights (h, w) below which low places are below the ground; -inf where they are not.
+
+    `low` (h, w) has the lowest of what may be in each column, `base` that of what is not, both ``inf`` where there is none;
+    `side` is that of a column, and what is below the ground is so by `depth` at least; meters.
+    """
+    limit, supported = np.full(low.shape, -np.inf), np.zeros(low.shape, bool)
+    _supported(base, supported)
+    _limits(low, base, supported, side, depth, limit)
+    deep = limit > -np.inf
+    if deep.any():
+        rest = np.where(deep, np.inf, np.minimum(low, base))
+        filled = sums_around(deep | np.isfinite(rest), AROUND)
+        _supported(rest, supported)
+        closed = deep & (sums_around(supported, AROUND) <= CLOSED * filled)
+        below = deep.copy()
+        _below_others(np.where(deep, low, np.inf), closed, side, depth, below)
+        limit[~below] = -np.inf
+    return limit
+
+
+def pits(raster: NDArray[np.float32], cell: float) -> NDArray[np.bool_]:
+    """Cells (h, w) of a minimum grid whose lowest point is below the ground, of islands from which one walks nowhere.
+
+    `raster` has heights, holes ``inf``; `cell` is a cell's side; meters.
+    """
+    number, size, side = linked_cells(raster, LINK, lambda away: STEP + GRADE * cell * away)
+    island = np.append((size <= MOST) & (side < EXTENT), False)[number]
+    if not island.any():
+        return island
+    return below_ground(np.where(island, raster, HOLE), np.where(island, HOLE, raster), cell) > -np.inf
+
+
+def pits_reach(cell: float) -> int:
+    """How far away cells change what is a pit, in cells."""
+    return reach(cell) + EXTENT + LINK
