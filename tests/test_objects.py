@@ -277,7 +277,8 @@ def test_blocks_change_nothing(town):
     for x, y in rng.uniform(0, 150, (200, 2)) + town.xyz[:, :2].min(0):
         near = np.hypot(town.xyz[:, 0] - x, town.xyz[:, 1] - y) < 2.5
         codes[near] = np.where(codes[near] == 6, 5, np.where(codes[near] == 5, 6, codes[near]))
-    cells = Cells.of(*town.xyz.T, codes, 0.5)
+    part = (town.xyz[:, :2] < town.xyz[:, :2].min(0) + 90).all(axis=1)
+    cells = Cells.of(*town.xyz[part].T, codes[part], 0.5)
     same(find_objects(cells, progress=False), find_objects(cells, block=64, progress=False))
 
 

