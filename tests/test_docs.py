@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
+import contextlib
 import json
-import os
 import re
-import subprocess
+import runpy
 import sys
 import types
 from pathlib import Path
@@ -127,48 +126,40 @@ def test_links_between_pages_lead_somewhere():
             assert path.exists() or inside in made, f"{page.name}: {target}"
 
 
-def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it():
+def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it(monkeypatch, capsys):
     measured = ROOT / "benchmarks" / "results"
-    command = [sys.executable, str(ROOT / "benchmarks" / "surveys" / "card.py")]
-    command += ["--model", str(ROOT / "pdal_stages" / "models" / "standard.model")]
-    command += ["--scores", str(measured / "surveys.json"), "--rules", str(measured / "surveys-rules.json")]
-    environment = {**os.environ, "PYTHONUTF8": "1"}
-    made = subprocess.run(
-        command, env=environment, capture_output=True, text=True, encoding="utf-8", timeout=300
-    )
-    assert made.returncode == 0, made.stderr
+    words = ["--model", ROOT / "pdal_stages" / "models" / "standard.model"]
+    words += ["--scores", measured / "surveys.json", "--rules", measured / "surveys-rules.json"]
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "surveys"))
+    monkeypatch.setattr(sys, "argv", ["card.py", *map(str, words)])
+    with contextlib.suppress(SystemExit):
+        runpy.run_path(str(ROOT / "benchmarks" / "surveys" / "card.py"), run_name="__main__")
     card = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
-    assert made.stdout == card, "write it anew: docs/models.md, Made anew"
-    spec = importlib.util.spec_from_file_location("survey_table", ROOT / "docs" / "survey_table.py")
-    short = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(short)
-    assert short.table().strip() in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert capsys.readouterr().out == card, "write it anew: docs/models.md, Made anew"
+    short = runpy.run_path(str(ROOT / "docs" / "survey_table.py"))
+    assert short["table"]().strip() in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
     "script", sorted((ROOT / "docs" / "gallery").glob("[0-9]*.py")), ids=lambda p: p.stem
 )
-def test_gallery_scripts_run(script, tmp_path):
-    environment = {**os.environ, "GALLERY_SIZE": "80", "GALLERY_OUTPUT": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
+def test_gallery_scripts_run(script, tmp_path, monkeypatch):
+    monkeypatch.setenv("GALLERY_SIZE", "50")
+    monkeypatch.setenv("GALLERY_OUTPUT", str(tmp_path))
+    monkeypatch.syspath_prepend(str(script.parent))
+    monkeypatch.delitem(sys.modules, "_common", raising=False)
+    runpy.run_path(str(script), run_name="__main__")
     assert (tmp_path / f"{script.stem}.png").read_bytes().startswith(b"\x89PNG")
-    assert f"pictures/{script.stem}.png" in (ROOT / "docs" / "gallery" / "index.md").read_text(
-        encoding="utf-8"
-    )
+    page = (ROOT / "docs" / "gallery" / "index.md").read_text(encoding="utf-8")
+    assert f"pictures/{script.stem}.png" in page
 
 
 def test_the_picture_of_the_architecture_is_of_this_code():
-    spec = importlib.util.spec_from_file_location(
-        "architecture_picture", ROOT / "docs" / "architecture_picture.py"
-    )
-    drawn = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(drawn)
-    assert drawn.TARGET.read_text(encoding="utf-8") == drawn.picture(), "run docs/architecture_picture.py"
+    drawn = runpy.run_path(str(ROOT / "docs" / "architecture_picture.py"))
+    picture = drawn["TARGET"].read_text(encoding="utf-8")
+    assert picture == drawn["picture"](), "run docs/architecture_picture.py"
     there = {f"{p.name}/" for p in (ROOT / "pdal_stages").iterdir() if (p / "__init__.py").exists()}
-    assert {room for _, steps in drawn.COLUMNS for *_, room in steps} <= there | {"PDAL"}
+    assert {room for _, steps in drawn["COLUMNS"] for *_, room in steps} <= there | {"PDAL"}
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     assert set(re.findall(r"^\| `(\w+/)` \|", page, re.MULTILINE)) == there
     for module in re.findall(r"`(\w+/\w+\.(?:py|cpp))`", page):

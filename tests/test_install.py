@@ -48,11 +48,7 @@ def test_shell_scripts_parse_and_are_executable(name):
         ("cp: error writing 'x': No space left on device", "the disk is full"),
         ("E: Temporary failure resolving 'mirror.example'", "does not answer"),
         ("SSLError(SSLCertVerificationError(1, 'certificate verify failed'))", "certificate is not trusted"),
-        ("mkdir: cannot create directory 'x': Permission denied", "no permission to write"),
-        ("E: Could not get lock /var/lib/dpkg/lock-frontend", "another package manager"),
         ("ERROR: No matching distribution found for numba>=0.58", "no package that fits for numba>=0.58"),
-        ("THESE PACKAGES DO NOT MATCH THE HASHES", "not the file that was expected"),
-        ("fatal error: Python.h: No such file or directory", "headers are missing"),
         ("something new", "failed; see the output above"),
     ],
 )
@@ -154,7 +150,7 @@ def test_torch():
 
 @pytest.mark.parametrize(
     ("required", "failed", "skipped"),
-    [("", 0, 5), ("pdal", 2, 3), ("data", 1, 4), ("torch", 1, 4), ("pdal,data", 3, 2)],
+    [("", 0, 5), ("pdal,data", 3, 2)],
 )
 def test_skips_that_must_not_happen_fail(tmp_path, required, failed, skipped):
     shutil.copy(ROOT / "tests/conftest.py", tmp_path)

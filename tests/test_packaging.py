@@ -62,11 +62,19 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
     wheels = tmp_path / "wheels"
-    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", wheels, source]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--no-deps",
+        "-q",
+        "-w",
+        wheels,
+        source,
+    ]
     built = subprocess.run(command, capture_output=True, text=True, check=False)
-    if built.returncode and re.search(
-        "No matching distribution|Could not find a version|connection", built.stderr
-    ):
+    if built.returncode and re.search("No matching distribution|connection", built.stderr):
         pytest.skip("pip's index has no setuptools to build with")
     assert built.returncode == 0, built.stderr
     (wheel,) = wheels.glob("*.whl")
@@ -76,9 +84,7 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
     for needed in ("models/standard.model", "reports/templates/style.css", "plugin/stage.cpp", "py.typed"):
         assert f"pdal_stages/{needed}" in names, needed
     target = tmp_path / "env"
-    subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--no-deps", "-q", "--target", target, wheel], check=True
-    )
+    zipfile.ZipFile(wheel).extractall(target)
     code = (
         "import pdal_stages, pdal_stages.plugin.building as building\n"
         "from pdal_stages.stages.loading import loaded_model\n"

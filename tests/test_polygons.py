@@ -186,7 +186,7 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las, capfd):
 def test_water_of_delft_on_the_command_line(tmp_path, capsys, data_dir):
     water = data_dir / "delft/water_train.geojson"
     las = laspy.read(data_dir / "delft/train.laz")
-    near = (np.abs(las.x - 84825) < 40) & (np.abs(las.y - 447545) < 40)
+    near = (np.abs(las.x - 84825) < 25) & (np.abs(las.y - 447545) < 25)
     las.points = las.points[near]
     las.write(tmp_path / "in.laz")
     out = tmp_path / "out.laz"

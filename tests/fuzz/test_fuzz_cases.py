@@ -19,8 +19,8 @@ from targets import TARGETS
 
 CASES = sorted(path for path in (Path(__file__).resolve().parent / "cases").rglob("*") if path.is_file())
 #: Changed inputs that are tried for each target, or seconds of them.
-TRIES = {"pipeline": 800, "model": 150, "where": 300, "cloud": 500, "index": 400, "ept": 400, "store": 400,
-         "result": 300, "network": 60, "manifest": 200}  # fmt: skip
+TRIES = {"pipeline": 300, "model": 60, "where": 150, "cloud": 200, "index": 200, "ept": 200, "store": 200,
+         "result": 150, "network": 25, "manifest": 80}  # fmt: skip
 SECONDS = float(os.environ.get("PDAL_STAGES_FUZZ_SECONDS", 0))
 #: CPU seconds one input may take; beyond it is a finding.
 PATIENCE = 10.0
