@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
 from pdal_stages.base.threads import available_threads
-from pdal_stages.pipeline.tindex import locations
+from pdal_stages.pipeline.inputs_outputs import locations
 from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
@@ -576,14 +576,6 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
     for field, name, of in (("nir", "Infrared", "b"), ("red", "Red", "bc")):
         kept = np.concatenate([np.asarray(tile[field]) for tile in tiles])
         assert kept.astype(int).sum() == sum(int(made[each][name].sum()) for each in of)
-    # a pipeline of one's own, as far as its writer is to forward what the inputs have
-    options = {"forward": "scale, offset", "scale_y": 0.1, "minor_version": 4, "dataformat_id": 7}
-    writer = {"type": "writers.las", "filename": f"{tmp_path}/own_#.las", **options}
-    stages = [{"type": "readers.las", "filename": f"{folder}/*.laz"}, {"type": "filters.hag_minima"}]
-    assert not run_tiled([*stages, writer], 40, per="tile", workers=0).failures
-    for path in tmp_path.glob("own_*.las"):
-        header = laspy.read(path).header
-        assert (header.version.minor, header.point_format.id, *header.scales[:2]) == (4, 7, 0.001, 0.1)
 
 
 def test_odd_headers_are_said_of_the_inputs_alone(tmp_path, town_file):

@@ -8,10 +8,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import StageError, suggest
+from ..base.errors import StageError, optional_import, suggest
 from . import pdal as pdal_env
 from .overrides import Override, apply_overrides
-from .tindex import locations
 
 #: What the description of an EPT source is called.
 EPT = "ept.json"
@@ -71,6 +70,32 @@ def _inside(folder: Path) -> list[str]:
         cure = f"There are some further down: '{folder}/**/*{deeper.suffix}'" if deeper else None
         raise StageError("the folder holds no LAS or LAZ files", found=str(folder), cure=cure)
     return inside
+
+
+def locations(path: str, column: str = "location") -> list[str]:
+    """The files a tile index names, made by ``pdal tindex create``; relative ones count from its folder, then from here.
+
+    Raises
+    ------
+    StageError
+        If it cannot be read, or has no such column.
+    """
+    pyogrio = optional_import("pyogrio", "vector", "tile indexes")
+    try:
+        _, _, _, (names,) = pyogrio.raw.read(path, columns=[column], read_geometry=False)
+        if odd := [name for name in names if not (isinstance(name, str) and name) or "\0" in name]:
+            raise ValueError(f"{odd[0]!r} is not a file's name")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise StageError(
+            "the tile index cannot be read",
+            where=path,
+            found=str(error),
+            cure=f"It needs a column '{column}' with file names (option tindex_name)",
+        ) from None
+    if not len(names):
+        raise StageError("the tile index names no file", where=path)
+    there = {name: Path(path).absolute().parent / name for name in names}
+    return [str(file if file.exists() else Path(name).absolute()) for name, file in there.items()]
 
 
 def overlooked(names: Sequence[str], but: str = "") -> list[str]:

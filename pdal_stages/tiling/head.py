@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import PipelineError, StageError
-from ..base.las import holds_flags
 from ..pipeline.callbacks import Callbacks
-from ..pipeline.las_output import check_writers
+from ..pipeline.las_output import check_writers, flag_splitter
 from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
@@ -23,7 +22,7 @@ from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import THE_PLACES, TOUCH_NONE
 from .grid import Box, TileGrid
-from .outputs import PieceResults
+from .outputs import PieceResults, changed_in, flags_in_classes
 from .pieces import Piece
 from .plan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 from .report import left_alone
@@ -99,7 +98,7 @@ def run_head(
     from_afar = None
     found = _Found(plan.creates)
     with Callbacks() as callbacks:
-        stages = _marked(callbacks, cuts, marks)
+        stages = _marked(callbacks, marks)
         for number in range(begin, len(plan.head)):
             stage = _with_threads(plan.head[number], context.threads)
             stages.append({**stage, **_after(marks)} if number == begin else stage)
@@ -137,7 +136,7 @@ def run_first(context: RunContext, cuts: list[Piece], first: FirstRound) -> Firs
     """Run the stages before the one that looks far, on a tile and the surroundings that they need."""
     marks = _marks(cuts, context, first.kept or () if first.at else ())
     with Callbacks() as callbacks:
-        stages = _marked(callbacks, cuts, marks)
+        stages = _marked(callbacks, marks)
         head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
         head[0] |= _after(marks)
         left = _Left(Pipeline([*stages, *head], whole=False).lowered.ours[-1].stage, marks)
@@ -164,19 +163,23 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
 
 
 def _marks(cuts: list[Piece], context: RunContext, keep: Collection[str] = ()) -> list[_Mark]:
-    marks = [_Mark(number, piece, context, keep) for number, piece in enumerate(cuts)]
-    for mark in marks:
-        mark.mixed = len({one.old_format for one in marks}) > 1
-    return marks
+    return [_Mark(number, piece, context, keep) for number, piece in enumerate(cuts)]
 
 
-def _marked(callbacks: Callbacks, cuts: list[Piece], marks: list[_Mark]) -> list[dict[str, Any]]:
-    """Readers of the pieces, whose points are numbered."""
+def _marked(callbacks: Callbacks, marks: list[_Mark]) -> list[dict[str, Any]]:
+    """Readers of the pieces, whose points are numbered.
+
+    Where old PDAL reads the flags of some pieces as bits of the class, and of others apart, all have them apart.
+    """
+    mixed = len({mark.holds_flags for mark in marks}) > 1
     stages: list[dict[str, Any]] = []
-    for number, piece in enumerate(cuts):
-        reader = {**piece.reader, "filename": piece.path, "tag": f"in{number}"}
-        marked = callbacks.filter(marks[number], _MARK_TYPES, inputs=[f"in{number}"], tag=f"mark{number}")
-        stages += [reader, marked]
+    for mark in marks:
+        number, piece = mark.number, mark.piece
+        stages.append({**piece.reader, "filename": piece.path, "tag": f"in{number}"})
+        if mixed and mark.holds_flags:
+            stages.append(flag_splitter([True], inputs=[f"in{number}"], tag=f"split{number}"))
+        before = [stages[-1]["tag"]]
+        stages.append(callbacks.filter(mark, _MARK_TYPES, inputs=before, tag=f"mark{number}"))
     return stages
 
 
@@ -192,22 +195,15 @@ def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
 
 
 class _Mark:
-    """Numbers a reader's points, and keeps what they were where changes are to be found later.
-
-    Old PDAL reads the flags of LAS 1.0 to 1.3 as bits of the class. Beside a file of LAS 1.4, whose flags it reads apart,
-    stages could not tell: the bits then go where those are, and back into the results.
-    """
+    """Numbers a reader's points, and keeps what they were where changes are to be found later."""
 
     def __init__(self, number: int, piece: Piece, context: RunContext, keep: Collection[str] = ()) -> None:
         self.number, self.piece, self.keep = number, piece, list(keep)
         self.keep_all = context.plan.creates is None
         self.changed: Changed = {}  # given by the rounds before
         self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
-        self.old_format = holds_flags(piece.path)
-        self.mixed = False  # whether there are others beside it
-        self.holds_flags = False  # whether class codes of the results hold flags
+        self.holds_flags = flags_in_classes(piece.path)
         self.original: dict[str, NDArray] = {}  # dimensions of the tile's own points
-        self._flags: NDArray[np.uint8] | None = None
 
     def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         count, own = len(ins["X"]), self.piece.own
@@ -217,24 +213,15 @@ class _Mark:
         outs[INPUT] = np.full(count, self.number, np.uint32)
         outs[OUTSIDE] = self.away
         names = [name for name in ins if name not in _MARK_TYPES] if self.keep_all else self.keep
-        self.original = {name: ins[name][own] for name in names}
+        self.original = self.without_flags({name: ins[name][own] for name in names})
         for name, (rows, values) in self.changed.items():
-            outs[name] = np.array(ins[name])
-            outs[name][rows] = values
-        self.holds_flags = self.old_format and not {"Synthetic", "Withheld"} & set(ins)
-        if self.holds_flags and self.mixed:
-            codes = outs.get("Classification", ins["Classification"])
-            self._flags = codes[own] & ~np.uint8(LEGACY_LIMIT)
-            outs["Classification"] = codes & np.uint8(LEGACY_LIMIT)
-            if "ClassFlags" in ins:
-                outs["ClassFlags"] = codes >> np.uint8(LEGACY_LIMIT.bit_length())
-                if self.keep_all:
-                    self.original["ClassFlags"] = outs["ClassFlags"][own]
+            outs[name] = changed_in(name, ins[name], rows, values, self.holds_flags)
 
-    def put_flags_back(self, rows: NDArray[np.int64], values: dict[str, NDArray]) -> None:
-        """Give new class codes of some rows the flags that were taken off."""
-        if self._flags is not None and "Classification" in values:
-            values["Classification"] |= self._flags[np.searchsorted(self.piece.own, rows)]
+    def without_flags(self, values: dict[str, NDArray]) -> dict[str, NDArray]:
+        """Values whose class codes are free of the flags that old PDAL reads as bits of them."""
+        if self.holds_flags and "Classification" in values:
+            values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
+        return values
 
     def changes(self, name: str, rows: NDArray[np.int64], values: NDArray) -> NDArray[np.bool_]:
         """Which of some rows' values are not what was read; all where the dimension is new."""
@@ -316,8 +303,7 @@ def _of_piece(
     rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
     order = np.argsort(rows, kind="stable")
     values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
-    mark.put_flags_back(rows[order], values)
-    return rows[order], values
+    return rows[order], mark.without_flags(values)
 
 
 def _collect(
@@ -336,7 +322,7 @@ def _collect(
                 "a stage makes new points, which have no place in the input files",
                 cure="Run the pipeline without --tile",
             )
-        results.append(PieceResults(piece, rows, values, mark.holds_flags))
+        results.append(PieceResults(piece, rows, values))
     for name in names if creates is None else ():  # what no stage changed is as it was read
         if not any(
             mark.changes(name, result.rows, result.values[name]).any()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +44,6 @@ class PieceResults:
     piece: Piece
     rows: NDArray[np.int64]  #: (n,) rows of the piece that came out, ascending
     values: dict[str, NDArray]  #: (n,) new values of dimensions
-    holds_flags: bool = False  #: whether class codes hold the flag bits of LAS 1.0-1.3
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,29 @@ def of_own_points(result: PieceResults) -> NewValues:
     return NewValues(kept, {name: (at, values) for name, values in result.values.items()})
 
 
-def class_counts(columns: Iterable[tuple[NDArray, bool]]) -> dict[str, int]:
-    """Number of points of each class code; without the flag bits of LAS 1.0-1.3 where it is said that they are inside."""
+def class_counts(values: Iterable[Mapping[str, NDArray]]) -> dict[str, int]:
+    """Number of points of each class code, as far as there are new ones."""
     counts = np.zeros(256, np.int64)
-    for codes, holds_flags in columns:
-        codes = np.asarray(codes, np.uint8)
-        counts += np.bincount(codes & LEGACY_LIMIT if holds_flags else codes, minlength=256)
+    for one in values:
+        if "Classification" in one:
+            counts += np.bincount(one["Classification"].astype(np.uint8), minlength=256)
     return {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
+
+
+def flags_in_classes(path: str) -> bool:
+    """Whether this PDAL reads the flags of a file (LAS 1.0 to 1.3) as bits of the class."""
+    return not pdal_env.splits_class_flags() and las.holds_flags(path)
+
+
+def changed_in(
+    name: str, read: NDArray, rows: NDArray[np.int64] | None, values: NDArray, holds_flags: bool
+) -> NDArray:
+    """A dimension as it was read with new values of some rows, or of all; flags that are bits of the class stay."""
+    out = np.array(read)
+    out[slice(None) if rows is None else rows] = values
+    if holds_flags and name == "Classification":
+        out |= read & ~np.uint8(LEGACY_LIMIT)
+    return out
 
 
 def save_results(path: str | Path, results: Iterable[PieceResults]) -> None:
@@ -177,25 +193,22 @@ def merged(
     stages: list[dict[str, Any]] = []
     inputs = []
     for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
-        stages += [{**reader, "tag": f"in{number}"}, *_put(callbacks, values, number)]
+        holds_flags = flags_in_classes(reader["filename"])
+        stages += [{**reader, "tag": f"in{number}"}, *_put(callbacks, values, number, holds_flags)]
         if flags and flags[number]:
             stages.append(las_output.flag_splitter([True], inputs=[stages[-1]["tag"]], tag=f"split{number}"))
         inputs.append(stages[-1]["tag"])
     return [*stages, {"type": "filters.merge", "inputs": inputs}]
 
 
-def _put(callbacks: Callbacks, new: NewValues, number: int) -> Iterator[dict[str, Any]]:
+def _put(callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool) -> Iterator[dict[str, Any]]:
     """Filters that give a reader's points their new values, and drop some; PDAL wants the two apart."""
 
     def put(module, ins, outs) -> None:
         if len(ins["X"]) != len(new.kept):
             raise StageError(f"the reader gave {len(ins['X']):,} points of {len(new.kept):,}")
         for name, (rows, values) in new.values.items():
-            if rows is None:
-                outs[name] = np.ascontiguousarray(values, ins[name].dtype)
-            else:
-                outs[name] = np.array(ins[name])
-                outs[name][rows] = values
+            outs[name] = changed_in(name, ins[name], rows, values, holds_flags)
 
     def drop(module, ins, outs) -> None:
         outs["Mask"] = np.ascontiguousarray(new.kept, bool)
@@ -237,7 +250,7 @@ class FileTask:
             tail = on_one_grid(tail, header.box, half_open=False)
         new = self._new_values(0, self.count)
         reader = {**self.source.reader, "filename": self.source.path}
-        return run_tail([reader], [new], tail, self.outputs, self.scratch) | self._classes([new])
+        return run_tail([reader], [new], tail, self.outputs, self.scratch) | {"classes": _classes(new)}
 
     def _new_values(self, start: int, end: int) -> NewValues:
         found = read_results(self.results, self.source, self.count, start, end)
@@ -249,15 +262,10 @@ class FileTask:
             found.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types}
         )
 
-    def _classes(self, new: Iterable[NewValues]) -> dict[str, Any]:
-        flags = las.holds_flags(self.source.path)
-        codes = (each.values["Classification"][1] for each in new if "Classification" in each.values)
-        return {"classes": class_counts((column, flags) for column in codes)}
-
     def _in_parts(self, tail: list[dict[str, Any]]) -> dict[str, Any]:
         """Each part goes through tail and writers into uncompressed files, which are joined under the first one's header."""
         joined: list[_Joined] = []
-        coded: list[NewValues] = []
+        classes: Counter[str] = Counter()
 
         def check(made: Path, final: Path, number: int) -> None:
             check_complete(made, final, {"type": "writers.las", "filename": final}, joined[number].count)
@@ -276,12 +284,14 @@ class FileTask:
                 parts = [os.path.join(folder, f"out{n}.las") for n in range(len(self.outputs))]
                 new = self._new_values(start, end)
                 run_tail([{**self.source.reader, "filename": piece}], [new], tail, parts, self.scratch)
-                codes = {k: v for k, v in new.values.items() if k == "Classification"}
-                coded.append(NewValues(np.empty(0, bool), codes))
+                classes.update(_classes(new))
                 for one, part in zip(joined, parts, strict=True):
                     one.add(part)
-        record = {"outputs": written(self.outputs), "written": joined[0].count}
-        return record | self._classes(coded)
+        return {"outputs": written(self.outputs), "written": joined[0].count, "classes": dict(classes)}
+
+
+def _classes(new: NewValues) -> dict[str, int]:
+    return class_counts([{name: values for name, (_, values) in new.values.items()}])
 
 
 class _HeadersDifferError(Exception):

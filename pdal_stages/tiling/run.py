@@ -36,7 +36,6 @@ from .sources import InputSource
 from .store import Store, fingerprint
 from .survey import Survey
 from .tile import TileTask
-from .writeroptions import remarks, with_one_format
 
 #: A run stops when so many tiles failed for one reason and none succeeded.
 _HOPELESS = 10
@@ -115,9 +114,12 @@ def run_plan(
         chosen = replace(chosen, tile=Store(folder).note("run").get("tile"))
     survey = Survey(plan, chosen)
     if survey.per == "tile":  # whose outputs have points of all readers
-        plan = replace(plan, tail=with_one_format(plan.tail, survey.paths))
         files_with_flags_to_split([*plan.readers, *plan.tail])
-    survey.messages += remarks(plan.tail, survey.per)
+    if any(stage["type"] == "writers.gdal" for stage in plan.tail):
+        survey.messages.append(
+            f"writers.gdal: each raster is made of the points of its {survey.per} alone, so cells at its edge lack those "
+            "beyond; for one raster without seams see docs/large-areas.md"
+        )
     if source is not None:
         _try_on_an_input(source, survey, len(plan.readers))
     if dry_run:

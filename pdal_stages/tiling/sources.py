@@ -14,7 +14,7 @@ from typing import Any
 from ..base import las, strictjson
 from ..base.errors import PipelineError, StageError
 from ..pipeline import pdal as pdal_env
-from ..pipeline.tindex import locations
+from ..pipeline.inputs_outputs import locations
 from .grid import Box
 
 #: Readers of files whose points can be fetched by number.

@@ -82,9 +82,6 @@ class TileTask:
             raise NoTerrainError(
                 "no terrain: no point near the tile may form one", found=f"within {halo_m:.0f} m"
             )
-        columns = (
-            (r.values["Classification"], r.holds_flags) for r in head.results if "Classification" in r.values
-        )
         return head.results, {
             "points": own,
             "read": read,
@@ -92,7 +89,7 @@ class TileTask:
             "short": short,
             "widened": halo_m > least_m,
             "dropped": own - sum(len(result.rows) for result in head.results),
-            "classes": class_counts(columns),
+            "classes": class_counts(result.values for result in head.results),
             "messages": head.messages,
             "left_alone": head.left_alone,
         }

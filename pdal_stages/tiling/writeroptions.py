@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ..base import las
 from ..base.errors import StageError
@@ -16,85 +16,40 @@ from .plan import MOVING
 from .sources import ept_format, read_ept
 
 _COLORS, _INFRARED = {2, 3, 7, 8}, {8}
-#: Offsets are rounded to these, heights stay below this, in the unit of the coordinates.
-_ROUND, _HIGHEST = 1000, 20_000.0
-#: What options of ``writers.las`` begin with, and what of ``forward`` covers them.
-_FORWARDED = {
-    "minor": {"all", "header", "minor_version"},
-    "dataformat": {"all", "header", "dataformat_id"},
-    "scale": {"all", "scale"},
-    "offset": {"all", "offset"},
-}
 #: Options that say already where a raster lies.
 _PLACED = ("bounds", "origin_x", "origin_y", "width", "height")
-
-
-class _Like(NamedTuple):
-    """How an input holds its points."""
-
-    point_format: int
-    scales: tuple[float, ...]
-    offsets: tuple[float, ...]
-    box: Box
-
-
-def _like(path: str) -> _Like | None:
-    """How an input holds its points; None for what cannot be read, which is said when it is, and for no points."""
-    try:
-        if is_ept(path):
-            described = read_ept(path)
-            axes = {one["name"]: one for one in described["schema"]}
-            scales, offsets = (
-                tuple(float(axes.get(axis, {}).get(name, usual)) for axis in "XYZ")
-                for name, usual in (("scale", 0.001), ("offset", 0.0))
-            )
-            x0, y0, _, x1, y1, _ = map(float, described["boundsConforming"])
-            return _Like(ept_format(described), scales, offsets, (x0, y0, x1, y1))
-        header = las.read_header(path) if is_las(path) else None
-    except (OSError, StageError, ValueError, TypeError):
-        return None
-    if header is None or header.point_format in las.WAVES or not header.count:
-        return None
-    return _Like(header.point_format, header.scales, header.offsets, header.box)
 
 
 def one_format(paths: Sequence[str]) -> dict[str, Any]:
     """Options of ``writers.las`` that hold what each of some inputs holds; none where these are alike LAS files.
 
     The finest scale along each axis, and of the formats from LAS 1.4 the first that has all colors there are: PDAL forwards
-    only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest.
+    only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest. What cannot be
+    read is said when it is.
     """
-    inputs = [found for path in paths if (found := _like(path)) is not None]
-    formats = {one.point_format for one in inputs}
+    formats: set[int] = set()
+    places: set[tuple[float, ...]] = set()
+    for path in paths:
+        try:
+            if is_ept(path):
+                described = read_ept(path)
+                axes = {one["name"]: one for one in described["schema"]}
+                formats.add(ept_format(described))
+                found = [axes.get(axis, {}).get(name) for name in ("scale", "offset") for axis in "XYZ"]
+                places.add(tuple(float(v or (0.001, 0.0)[n > 2]) for n, v in enumerate(found)))
+            elif is_las(path) and (header := las.read_header(path)) and header.count:
+                formats.add(header.point_format)
+                places.add((*header.scales, *header.offsets))
+        except (OSError, StageError, ValueError, TypeError):
+            continue
     options: dict[str, Any] = {}
     if len(formats) > 1 or any(map(is_ept, paths)):
         colored = 8 if formats & _INFRARED else 7 if formats & _COLORS else 6
         options = {"minor_version": 4, "dataformat_id": colored}
     for axis, name in enumerate("xyz"):
-        if len({(one.scales[axis], one.offsets[axis]) for one in inputs}) <= 1:
-            continue
-        scale = min(one.scales[axis] for one in inputs)
-        low, high = -_HIGHEST, _HIGHEST
-        if axis < 2:
-            low, high = min(one.box[axis] for one in inputs), max(one.box[axis + 2] for one in inputs)
-        middle = round((low + high) / 2 / _ROUND) * _ROUND
-        fits = max(high - middle, middle - low) < (2**31 - 1) * scale
-        options |= {f"scale_{name}": scale, f"offset_{name}": middle if fits else "auto"}
+        if len({(place[axis], place[3 + axis]) for place in places}) > 1:
+            options |= {f"scale_{name}": min(place[axis] for place in places), f"offset_{name}": "auto"}
     return options
-
-
-def with_one_format(tail: Sequence[dict[str, Any]], paths: Sequence[str]) -> list[dict[str, Any]]:
-    """A tail whose writers of LAS hold what each input holds, as far as they are to forward it and not told otherwise."""
-    told = []
-    for stage in tail:
-        words = stage.get("forward", "")
-        forward = {str(one).strip() for one in (words if isinstance(words, list) else str(words).split(","))}
-        taken = {kind for kind, covering in _FORWARDED.items() if forward & covering}
-        if stage["type"] == "writers.las" and taken:
-            wanted = one_format(paths)
-            stage = {**{k: v for k, v in wanted.items() if k.partition("_")[0] in taken}, **stage}
-        told.append(stage)
-    return told
 
 
 def with_dimensions(
@@ -118,9 +73,15 @@ def on_one_grid(tail: Sequence[dict[str, Any]], box: Box, half_open: bool) -> li
     raster holds it. `half_open`: none lies on its far sides. A raster without points is empty then, where PDAL would fail.
     """
     out = []
-    for number, stage in enumerate(tail):
-        side = _side(stage, tail[:number])
-        if side is not None:
+    moved = False
+    for stage in tail:
+        moved |= stage["type"] in MOVING
+        placed = moved or stage["type"] != "writers.gdal" or any(name in stage for name in _PLACED)
+        try:
+            side = 0.0 if placed else float(stage["resolution"])
+        except (KeyError, TypeError, ValueError):
+            side = 0.0  # which PDAL says
+        if 0.0 < side < math.inf:
             left, bottom, right, top = (_cells(v, side) for v in box)
             if not half_open:
                 right, top = math.floor(right) + 1, math.floor(top) + 1
@@ -130,27 +91,6 @@ def on_one_grid(tail: Sequence[dict[str, Any]], box: Box, half_open: bool) -> li
             stage = {**stage, **place}
         out.append(stage)
     return out
-
-
-def remarks(tail: Sequence[dict[str, Any]], what: str) -> list[str]:
-    """What the user should know of rasters made for each `what`, tile or file."""
-    return [
-        f"writers.gdal: each raster is made of the points of its {what} alone, so cells at its edge lack those beyond; for "
-        "one raster without seams see docs/large-areas.md"
-        for _ in [stage for stage in tail if stage["type"] == "writers.gdal"][:1]
-    ]
-
-
-def _side(stage: dict[str, Any], before: Iterable[dict[str, Any]]) -> float | None:
-    """The side of the cells of a writer whose raster is to be placed."""
-    placed = any(name in stage for name in _PLACED) or any(one["type"] in MOVING for one in before)
-    if stage["type"] != "writers.gdal" or placed:
-        return None
-    try:
-        side = float(stage["resolution"])
-    except (KeyError, TypeError, ValueError):
-        return None  # which PDAL says
-    return side if math.isfinite(side) and side > 0 else None
 
 
 def _cells(coordinate: float, side: float) -> float:

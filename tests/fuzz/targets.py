@@ -14,8 +14,6 @@ import json
 import os
 import re
 import shutil
-import sqlite3
-import struct
 import sys
 import tempfile
 import zipfile
@@ -32,7 +30,6 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.model import assemble
-from pdal_stages.pipeline import tindex
 from pdal_stages.pipeline.lowering import lower
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.pipeline.pdal import version
@@ -177,35 +174,6 @@ def cloud(data: bytes) -> str:
     found = sources.las_extent(str(path))
     assert sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"] == found.count
     las.supersede_copc(path)
-    return "read"
-
-
-def _indexes() -> list[bytes]:
-    rows = b"".join(b" " + name.ljust(20) for name in (b"a.las", b"b/c.laz"))
-    field = b"location".ljust(11, b"\0") + b"C" + bytes(4) + b"\x14" + bytes(15)
-    dbf = struct.pack("<B3xIHH20x", 3, 2, 32 + 32 + 1, 21) + field + b"\r" + rows
-    features = [
-        {"type": "Feature", "properties": {"location": name}, "geometry": None} for name in ("a.las", "b")
-    ]
-    path = folder() / "seed.gpkg"
-    path.unlink(missing_ok=True)
-    with contextlib.closing(sqlite3.connect(path)) as base, base:
-        base.execute("PRAGMA page_size = 512")
-        base.execute("CREATE TABLE pdal (fid INTEGER, location TEXT)")
-        base.execute("INSERT INTO pdal VALUES (1, 'a.las'), (2, 'b.las')")
-    collection = json.dumps({"type": "FeatureCollection", "features": features}).encode()
-    return [b"\0" + dbf, b"\1" + collection, b"\2" + path.read_bytes()]
-
-
-@target(_indexes)
-def index(data: bytes) -> str:
-    """A tile index; the first byte says of what kind."""
-    suffix = (".shp", ".geojson", ".gpkg")[data[0] % 3] if data else ".shp"
-    path = put(f"index{suffix}", data[1:])
-    if suffix == ".shp":
-        put("index.dbf", data[1:])
-    found = tindex.locations(str(path))
-    assert found and all(isinstance(name, str) and os.path.isabs(name) for name in found)
     return "read"
 
 
