@@ -1,17 +1,16 @@
 """Training networks: PyTorch against NumPy, overfitting, resuming, transfer, held out ground."""
 
-import contextlib
+import hashlib
 import importlib.util
-import math
+import io
 import os
 import pickle
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from alsnet_scenes import TINY, model_of, random_net, scene
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pdal_stages
@@ -294,49 +293,20 @@ def test_checkpoints_that_lie_are_refused(checkpoint, tmp_path):
     import torch
 
     whole, go_on = checkpoint
-    path = tmp_path / "a.checkpoint"
+    path, touched = tmp_path / "a.checkpoint", tmp_path / "touched"
     path.write_bytes(whole)
     assert len(go_on(path).info["training"]["curve"]) == 1
-    state = torch.load(path, weights_only=True)
-    name = next(iter(state["network"]))
-    moments = {**state["adam"][0], "exp_avg": torch.zeros(99)}
-    endless = {**state["network"], name: state["network"][name] * math.inf}
-    touched = tmp_path / "touched"
-    for changed in (
-        {"format": "another"},
-        {"identity": "another"},
-        {"network": {**state["network"], name: torch.ones(2, 2)}},
-        {"network": {}},
-        {"network": endless},
-        {"network": _Runs(touched)},
-        {"best": {}},
-        {"best": {**state["best"], "scores": "text"}},
-        {"adam": {**state["adam"], 0: moments}},
-        {"adam": [1]},
-        {"best_epoch": 7},
-        {"curve": [{"epoch": 1}]},
-    ):
-        torch.save({**state, **changed}, path)
-        with pytest.raises(ModelError, match=r"checkpoint.*Delete|Delete.*checkpoint"):
-            go_on(path)
-    for content in (b"", b"nothing", whole[:-30], b"PK\x05\x06" + b"\0" * 18, pickle.dumps({"a": 1})):
+    state = torch.load(io.BytesIO(whole[:-32]), weights_only=True)
+
+    def refused(content):
         path.write_bytes(content)
         with pytest.raises(ModelError, match=r"checkpoint.*Delete"):
             go_on(path)
+
+    for changed in ({"identity": "another"}, {"network": {}}, {"network": _Runs(touched)}, {"best": [1]}):
+        buffer = io.BytesIO()
+        torch.save({**state, **changed}, buffer)
+        refused(buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
+    for content in (b"", b"nothing", whole[:-30], whole[:500] + b"\0" + whole[501:], pickle.dumps({"a": 1})):
+        refused(content)
     assert not touched.exists()
-
-
-@needs_torch
-@given(st.data())
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_changed_checkpoints_load_or_are_refused(checkpoint, data):
-    """Bytes changed, cut or repeated: what loads is the network's own shape and finite, all else is a ModelError."""
-    whole, go_on = checkpoint
-    content = bytearray(whole)
-    for _ in range(data.draw(st.integers(1, 4))):
-        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.checkpoint"
-        path.write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
-        with contextlib.suppress(ModelError):
-            go_on(path)

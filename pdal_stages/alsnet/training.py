@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
-import pickle
 import platform
 import time
-import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from io import BytesIO
@@ -40,8 +39,8 @@ from .configuration import NetworkOptions
 from .geometry import stack
 from .weights import Weights, check, fresh
 
-#: Of a checkpoint, a file of PyTorch's own that is read with ``weights_only``: nothing in it is executed.
-FORMAT = "pdal-stages alsnet checkpoint 3"
+#: Of a checkpoint: a file of PyTorch's own, read with ``weights_only`` (nothing in it is executed), and its SHA-256.
+FORMAT = "pdal-stages alsnet checkpoint 4"
 
 COORDINATES = ("X", "Y", "Z")
 
@@ -327,69 +326,51 @@ class _Session:
         labels = [list(self.classes.codes), [list(part) for part in self.classes.labels]]
         data = [[len(xyz), str(coordinate_hash(xyz, 0).sum())] for xyz in self.clouds]
         data.append([int(self.position.astype(np.int64).sum())])
-        return json.dumps([options, self.seed, self.inputs, labels, data])
+        return json.dumps([FORMAT, options, self.seed, self.inputs, labels, data])
 
     def _save(self, path: str) -> None:
-        """Write all that training changes, whole or not at all."""
+        """Write all that training changes, whole or not at all, and its digest."""
         torch, buffer = self.torch, BytesIO()
         best = {name: torch.from_numpy(array) for name, array in self.best.items()}
         torch.save(
             {
-                "format": FORMAT,
                 "identity": self._identity(),
                 "curve": self.curve,
                 "best_epoch": self.best_epoch,
                 "best": best,
                 "network": self.network.state_dict(),
-                "adam": self.optimizer.state_dict()["state"],
+                "optimizer": self.optimizer.state_dict(),
             },
             buffer,
         )
-        write_whole(path, buffer.getvalue())
+        write_whole(path, buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
 
     def _resume(self, path: str) -> None:
-        """Go on from a checkpoint of this very training; ModelError where it is damaged, hostile or of another."""
-        torch = self.torch
+        """Go on from a checkpoint of this very training; ModelError where it is damaged or of another."""
+        data = Path(path).read_bytes()
+        cure = "Delete the checkpoint to begin anew, or name another file"
+        if hashlib.sha256(data[:-32]).digest() != data[-32:]:
+            raise ModelError(
+                "this is not a checkpoint of this release, or it is damaged", where=path, cure=cure
+            )
         try:
-            if not zipfile.is_zipfile(path):
-                raise ModelError("this is not a checkpoint")
-            found = torch.load(BytesIO(Path(path).read_bytes()), map_location="cpu", weights_only=True)
-            if not isinstance(found, dict) or found.get("format") != FORMAT:
-                raise ModelError("this is not a checkpoint of this release")
-            if found["identity"] != self._identity():
-                raise ModelError(
-                    "the checkpoint belongs to another training, of other options, classes or data"
-                )
-            self.network.load_state_dict(found["network"])
-            self.best = {name: tensor.numpy() for name, tensor in found["best"].items()}
-            for weights in (self.best, self.network.dump()):
-                check(weights, self.options.configuration, len(self.inputs), self.n_classes)
-            for k, parameter in enumerate(self.network.parameters()):
-                moments = found["adam"].get(k) or {}
-                shapes = {"step": (), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
-                for name, moment in moments.items():
-                    if moment.shape != shapes[name] or not bool(torch.isfinite(moment).all()):
-                        raise ModelError("the checkpoint's moments do not fit the network or are not finite")
-            self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": found["adam"]})
-            self.curve = [
-                {"epoch": int(row["epoch"]), **row, "loss": float(row["loss"])} for row in found["curve"]
-            ]
-            self.best_epoch = int(found["best_epoch"])
-            if self.best_epoch not in range(len(self.curve) + 1):
-                raise ModelError("the checkpoint's best epoch is none of its own")
-            for row in self.curve if self.held_batches else ():
-                _score(row)
-        except ModelError as error:
-            error.cure = error.cure or "Delete the checkpoint to begin anew, or name another file"
-            raise error.at(path) from None
-        except (pickle.UnpicklingError, OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError,
-                EOFError, MemoryError) as error:  # fmt: skip
+            found = self.torch.load(BytesIO(data[:-32]), map_location="cpu", weights_only=True)
+            mine = found["identity"] == self._identity()
+            if mine:
+                self.network.load_state_dict(found["network"])
+                self.optimizer.load_state_dict(found["optimizer"])
+                self.best = {name: tensor.numpy() for name, tensor in found["best"].items()}
+                self.curve, self.best_epoch = found["curve"], found["best_epoch"]
+        except Exception as error:  # PyTorch's own, of files that somebody made
             raise ModelError(
                 "the checkpoint cannot be read",
                 where=path,
                 found=f"{type(error).__name__}: {error}".splitlines()[0][:200],
-                cure="Delete the checkpoint to begin anew, or name another file",
+                cure=cure,
             ) from error
+        if not mine:
+            what = "the checkpoint belongs to another training, of other options, classes or data"
+            raise ModelError(what, where=path, cure=cure)
 
     def notes(self) -> dict[str, Any]:
         """For the manifest: batches, epochs, curve, validation."""
