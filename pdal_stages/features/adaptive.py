@@ -30,7 +30,7 @@ from .neighborhoods import AROUND, COPT_REACH
 from .plan import Columns, FeaturePlan, columns_of
 from .search import CROWD, FIRST2, LEAST2, MORE, ROOM, gather_near, make_groups, make_near, sort_near
 from .shapes import Axes, shapes_of, write_shapes
-from .surfaces import SURFACE, agreement, write_surface
+from .surfaces import COLUMNS, FAR, SURFACE, UP, agreement
 
 #: Members of a candidate among numbers of neighbors.
 LEAST = 3
@@ -110,7 +110,7 @@ class AdaptiveNeighborhoods:
         self.chosen = [c for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
         #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
         self.tokens = [c.neighborhood.token for c in self.chosen]
-        self.columns = columns_of(self.chosen, (*MOMENT_FEATURES, "Radius"))
+        self.columns = columns_of(self.chosen, MOMENT_FEATURES)
         self.surface_columns = columns_of(self.chosen, SURFACES)
         #: Estimated cost of one query, and memory of one call of :meth:`fill` besides its rows.
         self.query_ns = sum(_cost(c) for c in self.chosen)
@@ -123,10 +123,15 @@ class AdaptiveNeighborhoods:
         self._surfaces = np.zeros((0, SURFACE), np.float32)
         if (self.surface_columns >= 0).any():
             self._surfaces = np.empty((len(grid), SURFACE), np.float32)
-            around = _by_number({}, True)
+            around = _by_number({0: (AROUND, AROUND)}, False)
 
             def surfaces(part: slice) -> None:
-                self.choose(around, self._part(part), made=self._surfaces[part])
+                points, made = self._part(part), self._surfaces[part]
+                (table,) = self.choose(around, points)
+                finish(
+                    table, 0.0, points[2], np.zeros(1, np.int64), np.ones(len(made), np.int64), COLUMNS, made
+                )
+                made[:, FAR] = table[REACH] * UP
 
             self._for_all(surfaces, threads)
 
@@ -193,14 +198,12 @@ class AdaptiveNeighborhoods:
         *,
         least=0,
         curvature=None,
-        made=None,
     ) -> np.ndarray:
         """Moments (numbers, ROWS, m) of what is chosen; shapes, surfaces and curvatures go where arguments say."""
         m = len(points[0])
         numbers = np.array(search.numbers, np.int64)
         table = np.empty((len(numbers), ROWS, m))
         curvature = np.empty(m if search.curved else 0) if curvature is None else curvature
-        made = np.empty((0, SURFACE), np.float32) if made is None else made
         least = int(search.choices[0, 2]) if len(numbers) else least
         # Surfaces of neighbors are looked at only where features are written, by a search that finds AROUND of them.
         looked = out is not None and len(numbers) > 0 and search.cap2 == math.inf
@@ -209,7 +212,7 @@ class AdaptiveNeighborhoods:
         adaptive_block(
             self.tree, *points, numbers, search.radii, search.ks, search.within2, search.cap2, search.choices,
             search.curved, least, math.nan if threshold is None else threshold, surfaces,
-            self.surface_columns, shapes, table, curvature, made, out,
+            self.surface_columns, shapes, table, curvature, out,
         )  # fmt: skip
         return table
 
@@ -261,7 +264,7 @@ def _values(chosen: list[Columns], shapes) -> dict[str, np.ndarray]:
 @njit
 def adaptive_block(
     tree, qx, qy, qz, numbers, radii, ks, within2, cap2, choices, curved, least, threshold, surfaces,
-    surface_columns, shapes, table, curvature, made, out,
+    surface_columns, shapes, table, curvature, out,
 ):  # fmt: skip
     """Moments, shapes and surfaces of the best nested neighborhoods of a block of queries.
 
@@ -281,8 +284,8 @@ def adaptive_block(
         None compiles to a kernel without them.
     table : (numbers, ROWS, m) float64 array
         Out: moments about the query, radius, and how far away points matter, infinite where there are too few.
-    curvature, made : (m,) float64, (m, SURFACE) float32 arrays
-        Out: the curvature where `curved`; the queries' own surfaces where `made` is not empty, of the only one of `ks`.
+    curvature : (m,) float64 array
+        Out: the curvature where `curved`.
     """
     order, starts = make_groups(qx, qy, qz)
     need = ks[-1] + 1 if len(ks) else 0
@@ -290,7 +293,11 @@ def adaptive_block(
     near = make_near(CROWD * need + ROOM)
     shells, count = len(radii), len(radii) + len(ks)
     s, ends = make_sums(count), np.zeros(count, np.int64)
-    own, around = np.empty(SURFACE, np.float32), 0
+    own, around, single = np.empty((1, SURFACE), np.float32), 0, np.empty((ROWS, 1))
+    none, columns = (
+        np.zeros(1, np.int64),
+        COLUMNS.copy(),
+    )  # a constant's type would have all compiled once more
     for e in range(len(ks)):
         around = e if ks[e] == AROUND else around
     record = np.empty((0, 4), np.float32)
@@ -325,12 +332,13 @@ def adaptive_block(
                     while radii[at] < CURVATURE_RADIUS:
                         at += 1
                     curvature[q] = curvature_of(s, at, least)
-                if len(made) or len(surfaces):
-                    k = shells + around
-                    far = math.sqrt(near.sorted[AROUND]) if found > AROUND else math.inf
-                    write_surface(s, k, far, own)
-                    if len(made):
-                        made[q] = own
+                if len(surfaces):
+                    if near.sorted[0] == 0.0:
+                        own[0] = surfaces[near.at[near.pos[0]]]
+                    else:  # no point of the cloud
+                        write_moments(s, shells + around, single, 0)
+                        finish(single, 1.0, qz[q : q + 1], none, none, columns, own)
+                        own[0, FAR] = math.sqrt(near.sorted[AROUND]) * UP if found > AROUND else math.inf
                 for j in range(len(numbers)):
                     first, last, members = choices[j, 0], choices[j, 1], choices[j, 2]
                     if curved and curvature[q] >= threshold:
@@ -346,7 +354,7 @@ def adaptive_block(
                         k = ks[last - 1 - shells]
                         reach = math.sqrt(near.sorted[k]) if k < found else math.inf
                     if len(surfaces) and surface_columns[numbers[j]].max() >= 0:
-                        beyond = agreement(surfaces, near, n, own, surface_columns[numbers[j]], out[q])
+                        beyond = agreement(surfaces, near, n, own[0], surface_columns[numbers[j]], out[q])
                         reach = max(reach, beyond)
                     table[j, REACH, q] = 0.0 if curved else reach
                     if shapes is not None and shapes.shaped[numbers[j]]:

@@ -74,8 +74,7 @@ class FixedRadius:
         table = self._run(points, shapes_of(self.chosen, points, seed, bins), out)
         for k, (radius, spherical) in enumerate(zip(self.radii, self.spherical, strict=True)):
             volume = 4.0 / 3.0 * math.pi * radius**3 if spherical else math.pi * radius * radius
-            columns = np.append(self.columns[k], -1)
-            finish(table[k], volume, points[2], few[k : k + 1], copies, columns, out)
+            finish(table[k], volume, points[2], few[k : k + 1], copies, self.columns[k], out)
 
     def _run(self, points: Axes, shapes, out: np.ndarray) -> np.ndarray:
         """Moments (neighborhoods, ROWS, m); shapes go where `shapes` says."""

@@ -15,8 +15,9 @@ from .neighborhoods import LEAST_RADIUS
 N, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ, LOW, HIGH, RADIUS, REACH = range(14)
 MOMENTS, ROWS = 12, 14
 
-#: Features made of them.
-FEATURES = 13
+#: Features made of them: ``names.MOMENT_FEATURES``, and the unit normal.
+FEATURES = 17
+NORMAL = (14, 15, 16)
 
 #: Queries finished at a time: small enough for the second-level cache. And columns of their scratch: not a power of two,
 #: whose rows would compete for the same cache lines.
@@ -96,8 +97,9 @@ def finish(table, volume, heights, few, copies, columns, out):
         Raised by the number of queries whose neighborhood has fewer than three points.
     copies : (m,) int64 array
         How many queries each column stands for.
-    columns : (FEATURES + 1,) int64 array
-        Where in `out` (m, F) float32 each feature of ``names.MOMENT_FEATURES`` goes, and the radius; -1: nowhere.
+    columns : (up to FEATURES,) int64 array
+        Where in `out` (m, F) float32 each feature of ``names.MOMENT_FEATURES`` goes, and x, y, z of the unit normal (0, 0, 0
+        where there is none); -1: nowhere.
     """
     # Of constant shapes: rows known not to overlap let the loops be vectorized.
     made, m = np.empty((FEATURES, WIDTH)), np.empty((6, WIDTH))
@@ -115,15 +117,21 @@ def finish(table, volume, heights, few, copies, columns, out):
             m[3, j] = moments[SXY, j] * inverse - mx * my
             m[4, j] = moments[SXZ, j] * inverse - mx * mz
             m[5, j] = moments[SYZ, j] * inverse - my * mz
-            made[9, j] = 1.0 if apart else 0.0
+            made[9, j] = n if apart else 0.0
             made[10, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
             made[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
             made[12, j] = heights[start + j] - moments[LOW, j] if n > 0.0 else 0.0
         for j in range(count):
             r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
+            made[13, j] = moments[RADIUS, j]
             made[8, j] = moments[N, j] / (4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume)
+        if len(columns) > NORMAL[0]:  # in a loop of its own: with all of the eigenvector LLVM vectorizes none
+            for j in range(count):
+                _, _, _, nx, ny, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
+                some = 1.0 if made[9, j] >= 3.0 else 0.0
+                made[14, j], made[15, j], made[16, j] = some * nx, some * ny, some * nz
         for j in range(count):
-            n = moments[N, j] * made[9, j]  # 0 where the points coincide
+            n = made[9, j]  # not from the moments, which LLVM must fear to overlap with what is written
             l1, l2, l3, _, _, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
             f = covariance_features(n, l1, l2, l3)
             made[0, j] = f[0]
@@ -138,10 +146,7 @@ def finish(table, volume, heights, few, copies, columns, out):
         for j in range(count):
             if moments[N, j] < 3.0:
                 few[0] += copies[start + j]
-        for f in range(FEATURES):
+        for f in range(len(columns)):
             if columns[f] >= 0:
                 for j in range(count):
                     out[start + j, columns[f]] = made[f, j]
-        if columns[FEATURES] >= 0:
-            for j in range(count):
-                out[start + j, columns[FEATURES]] = moments[RADIUS, j]

@@ -49,7 +49,9 @@ SHAPES = {
 SHAPE_BINS = 10
 
 #: Columns of the moment kernels, in their order.
-MOMENT_FEATURES = (*COVARIANCE, "Density", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest")
+MOMENT_FEATURES = (
+    *COVARIANCE, "Density", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest", "Radius",
+)  # fmt: skip
 SHAPE_FEATURES = tuple(f"{metric}_{b}" for metric in SHAPES for b in range(SHAPE_BINS))
 
 #: Every feature, in order. Radius is of adaptive neighborhoods alone, SURFACES of nearest neighbors.

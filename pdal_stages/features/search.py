@@ -21,7 +21,7 @@ from .kdtree import STACK, bounding_box, enough2, gather, halve
 GROUP = 8
 
 #: Bins of squared distance; behind them what lies beyond the reach.
-BINS = 256
+BINS = 64
 
 #: First guess of the squared reach, the least, and by how much the next is larger than what the last needed.
 FIRST2, LEAST2, MORE = 1.0, 1e-6, 1.2
@@ -32,9 +32,6 @@ ROOM = 256
 
 #: Squared meters too small to divide by.
 TINY = 1e-200
-
-#: From this many points in one bin a heapsort takes the place of the insertion sort.
-HEAP = 48
 
 
 class Near(NamedTuple):
@@ -109,7 +106,7 @@ def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, ne
     while True:
         box = bounding_box(qx, qy, qz, order, lo, hi)
         side = max(box[3] - box[0], box[4] - box[1], box[5] - box[2])
-        if hi - lo > 1 and side * side > reach2:
+        if hi - lo > 1 and side * side > 4.0 * reach2:
             hi = lo + 1
             continue
         count = gather(tree, box, reach2, copies, limit, near.stack, near.x, near.y, near.z, near.at)
@@ -150,14 +147,13 @@ def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
     if there < need and reach2 < cap2:
         return -1
     most = there if within2 > 0.0 else min(need, there)
-    end, last = 0, 0  # where each bin starts; up to which the bins hold enough
-    crowded = False
+    end, last, largest = 0, 0, 0  # where each bin starts; up to which the bins hold enough; what one holds
     while end < most:
         size = hist[last]
         hist[last] = end
         end += size
         last += 1
-        crowded = crowded or size > HEAP
+        largest = max(largest, size)
     place, pos = near.sorted, near.pos
     for i in range(count):
         b = bins[i]
@@ -166,13 +162,7 @@ def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
             hist[b] = p + 1
             place[p] = d2[i]
             pos[p] = i
-    if crowded:
-        first = np.int64(0)
-        for b in range(last):
-            if hist[b] - first > HEAP:
-                _heap_sort(place, pos, first, hist[b], x, y, z)
-            first = hist[b]
-    _insertion_sort(place, pos, end, x, y, z)
+    _shell_sort(place, pos, end, largest, x, y, z)
     if within2 > 0.0 and within2 < reach2:
         most = min(need, there)
         while most < there and place[most] <= within2:
@@ -193,36 +183,17 @@ def _before(d, a, e, b, x, y, z):
 
 
 @device
-def _insertion_sort(d, pos, end, x, y, z):
-    for i in range(1, end):
-        key, item = d[i], pos[i]
-        j = i
-        while j > 0 and d[j - 1] >= key:
-            if d[j - 1] == key and not _before(key, item, key, pos[j - 1], x, y, z):
-                break
-            d[j] = d[j - 1]
-            pos[j] = pos[j - 1]
-            j -= 1
-        d[j] = key
-        pos[j] = item
-
-
-@device
-def _heap_sort(d, pos, lo, hi, x, y, z):
-    start, end = (hi - lo) // 2, hi - lo
-    while end > 1:
-        if start > 0:
-            start -= 1
-        else:
-            end -= 1
-            d[lo + end], d[lo] = d[lo], d[lo + end]
-            pos[lo + end], pos[lo] = pos[lo], pos[lo + end]
-        r, a = lo + start, lo + 2 * start + 1
-        while a < lo + end:
-            if a + 1 < lo + end and _before(d[a], pos[a], d[a + 1], pos[a + 1], x, y, z):
-                a += 1
-            if not _before(d[r], pos[r], d[a], pos[a], x, y, z):
-                break
-            d[a], d[r] = d[r], d[a]
-            pos[a], pos[r] = pos[r], pos[a]
-            r, a = a, lo + 2 * (a - lo) + 1
+def _shell_sort(d, pos, end, largest, x, y, z):
+    """Sort the first `end` of candidates that lie at most `largest` places from theirs (Shell 1959, Knuth's gaps)."""
+    gap = 1
+    while 9 * gap < largest:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, end):
+            key, item = d[i], pos[i]
+            j = i
+            while j >= gap and _before(key, item, d[j - gap], pos[j - gap], x, y, z):
+                d[j], pos[j] = d[j - gap], pos[j - gap]
+                j -= gap
+            d[j], pos[j] = key, item
+        gap //= 3

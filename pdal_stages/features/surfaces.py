@@ -15,37 +15,23 @@ import math
 import numpy as np
 
 from ..base.jit import device
-from .eigen import covariance_features, eigen3
-from .moments import COINCIDENT
-from .names import SURFACES
+from .moments import FEATURES, NORMAL
+from .names import MOMENT_FEATURES, SURFACES
 
 #: Columns of the table of surfaces, float32: unit normal, surface variation, distance to the farthest of the 10 (infinite
 #: where there are fewer).
-NX, NY, NZ, VARIATION, REACH = range(5)
+NX, NY, NZ, VARIATION, FAR = range(5)
 SURFACE = 5
+
+#: Where :func:`moments.finish` writes what the 10 nearest make, all but the reach.
+COLUMNS = np.full(FEATURES, -1)
+COLUMNS[[MOMENT_FEATURES.index("SurfaceVariation"), *NORMAL]] = VARIATION, NX, NY, NZ
 
 #: What is made of a neighborhood, in the order of ``names.SURFACES``.
 MADE = len(SURFACES)
 
 #: A little more than 1, by which distances grow in float32 so that none is too short.
 UP = 1.0 + 1e-6
-
-
-@device
-def write_surface(s, j, reach, out):
-    """The surface of a point from the sums `j` about it, into ``out[:SURFACE]``."""
-    n = s.n[j]
-    w = 1.0 / (n if n > 0.0 else 1.0)
-    mx, my, mz = s.x[j] * w, s.y[j] * w, s.z[j] * w
-    ax, ay, az = s.xx[j] * w, s.yy[j] * w, s.zz[j] * w
-    xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
-    xy, xz, yz = s.xy[j] * w - mx * my, s.xz[j] * w - mx * mz, s.yz[j] * w - my * mz
-    apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
-    l1, l2, l3, nx, ny, nz = eigen3(xx, xy, xz, yy, yz, zz)
-    real = n >= 3.0 and apart
-    out[NX], out[NY], out[NZ] = (nx if real else 0.0), (ny if real else 0.0), (nz if real else 0.0)
-    out[VARIATION] = covariance_features(n if apart else 0.0, l1, l2, l3)[7]
-    out[REACH] = reach * UP
 
 
 @device
@@ -66,11 +52,11 @@ def agreement(surfaces, near, count, own, columns, out):
         d = v - first  # of equal ones the deviation is exactly 0
         total += d
         squares += d * d
-        far = max(far, math.sqrt(near.sorted[i]) + surfaces[p, REACH])
+        far = max(far, math.sqrt(near.sorted[i]) + surfaces[p, FAR])
     w = 1.0 / count
     mean = total * w
     made = (min(agree * w, 1.0), low, first + mean, math.sqrt(max(squares * w - mean * mean, 0.0)))
     for f in range(MADE):
         if columns[f] >= 0:
             out[columns[f]] = made[f]
-    return max(far, np.float64(own[REACH]))
+    return max(far, np.float64(own[FAR]))
