@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import json
 import re
+import textwrap
 from functools import partial
 from pathlib import Path
 
-from ..base.errors import OptionError
+from ..base.errors import DependencyError, OptionError, PipelineError, suggest
 from .parser import Parser
 
 
@@ -58,15 +61,63 @@ def add_commands(parser: Parser) -> None:
 
 
 def _drivers(options: argparse.Namespace) -> None:
-    from ..pipeline import describe
+    from ..pipeline.pdal import ask_program
+    from ..stages import registry
 
-    print(describe.drivers(ours_only=options.ours, as_json=options.showjson), end="")
+    ours = {name: stage.summary for name, stage in registry.stages().items()}
+    if options.showjson:
+        listed = [{"name": n, "description": text, "link": "", "extensions": []} for n, text in ours.items()]
+        if not options.ours:  # where our plugin is built, PDAL names ours too
+            theirs = json.loads(ask_program("--drivers", "--showjson"))
+            listed += [entry for entry in theirs if entry["name"] not in ours]
+        print(json.dumps(listed, indent=2))
+        return
+    width = max(map(len, ours)) + 2
+    print("=" * 80, "pdal_stages", "=" * 80, sep="\n")
+    for name, text in ours.items():
+        print(
+            textwrap.fill(f"{name:{width}}{text}", 80, subsequent_indent=" " * width, break_long_words=False)
+        )
+    print("" if options.ours else f"\n{ask_program('--drivers')}", end="")
 
 
 def _options(options: argparse.Namespace) -> None:
-    from ..pipeline import describe
+    """The options of a stage, of ours or of PDAL's, in PDAL's form."""
+    from ..pipeline.pdal import ask_program
+    from ..stages import registry
 
-    print(describe.stage_options(options.stage, as_json=options.showjson), end="")
+    name = options.stage
+    if name not in registry.stages():
+        answer = ""
+        with contextlib.suppress(DependencyError, PipelineError):
+            answer = ask_program("--options", name, *(["--showjson"] if options.showjson else []))
+        if not answer.strip() or "Unable to create" in answer or "not found" in answer:
+            raise PipelineError(
+                f"there is no stage '{name}', neither of ours nor of PDAL's",
+                cure=f"{suggest(name, registry.stages())}List them with: pdal-stages drivers",
+            )
+        print(answer, end="")
+        return
+    stage = registry.get(name)
+    if options.showjson:
+        print(json.dumps(stage.schema(), indent=2))
+        return
+    print(f"{stage.type} -- {stage.summary}", "-" * 80, sep="\n")
+    if stage.source:
+        print(f"  Source: {stage.source}\n")
+    for option in stage.all_options():
+        default = ",".join(map(str, option.default)) if isinstance(option.default, tuple) else option.default
+        shown = f"{str(default).lower() if isinstance(default, bool) else default} {option.unit}".strip()
+        text = option.help
+        if option.name == "where" and stage.where_help:
+            text = f"A condition on points (PDAL's own filters do not see the others). {stage.where_help}"
+        if option.choices:
+            text += f" (one of: {', '.join(map(str, option.choices))})"
+        print(
+            f"  {option.name}"
+            + ("  (required)" if option.required else f" [{shown}]" * bool(default not in (None, "")))
+        )
+        print(textwrap.indent(textwrap.fill(text, 74), " " * 6) + "\n")
 
 
 def _commands(parser: Parser, options: argparse.Namespace) -> None:

@@ -42,7 +42,8 @@ class _Family:
             lowered = lower_stage({"type": kind.type, **{k: v for k, v in options.items() if k not in wired}})
             runtime.remember_stdout()
             stages = [*([{"type": "filters.merge", **wired}] if merge else []), lowered.plain]
-            return _joined(stages, kind.type, options, lowered.stage)
+            shown = f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
+            return _joined(stages, shown, lowered.stage)
 
         make.__name__ = make.__qualname__ = name
         make.__signature__ = signature  # type: ignore[attr-defined]
@@ -56,16 +57,21 @@ class _Family:
 
 def _signature(kind: type[Stage]) -> inspect.Signature:
     """The required option first, by place or by name; the others by name, with their defaults."""
-    required = {option.name: inspect.Parameter.empty for option in kind.all_options() if option.required}
-    others = {option.name: option.default for option in kind.all_options() if not option.required}
-    for name, default in (("tag", None), ("inputs", None), ("merge", True)):
-        others.setdefault(name, default)
+    options = sorted(kind.all_options(), key=lambda option: not option.required)
+    parameters = [
+        inspect.Parameter(option.name, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        if option.required
+        else inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default)
+        for option in options
+    ]
+    more = {"tag": None, "inputs": None, "merge": True}
     return inspect.Signature(
         [
-            *(inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in required),
+            *parameters,
             *(
                 inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
-                for name, default in others.items()
+                for name, default in more.items()
+                if name not in {option.name for option in options}
             ),
         ]
     )
@@ -74,31 +80,21 @@ def _signature(kind: type[Stage]) -> inspect.Signature:
 def _help(kind: type[Stage]) -> str:
     lines = [f"{kind.summary}.", "", "Parameters", "----------"]
     for option in kind.all_options():
-        unit = f", {option.unit}" if option.unit else ""
-        lines += [f"{option.name} : {option.kind}{unit}", f"    {option.help}"]
-    lines += ["tag, inputs", "    As for PDAL's stages", "merge : bool"]
-    return "\n".join([*lines, "    False keeps point views apart (after filters.splitter, say)"])
+        lines += [f"{option.name} : {option.kind}", f"    {option.help}"]
+    return "\n".join(
+        [*lines, "tag, inputs", "    As for PDAL's stages", "merge : bool", "    False keeps views apart"]
+    )
 
 
-def _joined(stages: list[dict[str, Any]], type_name: str, given: dict[str, Any], made_from: Stage):
-    """The filters that PDAL runs as one object, which joins others by ``|`` and answers as python-pdal's stages do.
-
-    `given` is what the user asked for; `made_from` is kept as long as the filters are.
-    """
+def _joined(stages: list[dict[str, Any]], shown: str, made_from: Stage):
+    """The filters that PDAL runs as one object, which joins others by ``|``; `made_from` is kept as long as they are."""
     pdal = pdal_env.bindings()
 
     class Step(pdal.Filter):  # type: ignore[name-defined]
         def __repr__(self) -> str:
-            return repr(made)
+            return shown
 
     class Filter(pdal.Pipeline):  # type: ignore[name-defined]
-        type = type_name
-        tag = given.get("tag")
-
-        @property
-        def options(self) -> dict[str, Any]:
-            return {"type": type_name, **given}
-
         def pipeline(self, *arrays, loglevel: int = logging.ERROR):
             whole = pdal.Pipeline(arrays=arrays, loglevel=loglevel)
             whole |= self
@@ -112,7 +108,7 @@ def _joined(stages: list[dict[str, Any]], type_name: str, given: dict[str, Any],
             return self.pipeline(loglevel=self.loglevel)
 
         def __repr__(self) -> str:
-            return f"{type_name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"
+            return shown
 
     made = Filter()
     for stage in stages:

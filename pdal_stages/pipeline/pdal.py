@@ -11,12 +11,12 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from ..base.errors import DependencyError, PipelineError
+from ..base.errors import DependencyError, PipelineError, suggest
 from ..base.lascheck import DAMAGED, check_readable
 from .filenames import readers_files
 from .interrupts import calls_pdal
@@ -85,6 +85,25 @@ def ask_program(*arguments: str) -> str:
         return done.stdout
     said = (done.stderr or done.stdout).strip()[-500:]
     raise PipelineError(f"pdal {' '.join(arguments)} failed", found=said)
+
+
+def nearest_option(type_name: str, option: str) -> str:
+    """``Did you mean ...?`` among the options of a stage of PDAL's, and where they are listed."""
+    return f"{suggest(option, _named('--options', type_name))}List its options with: pdal-stages options {type_name}"
+
+
+def nearest_stage(type_name: str, ours: Iterable[str]) -> str:
+    """``Did you mean ...?`` among PDAL's stages and ours, and where they are listed."""
+    known = [*ours, *_named("--drivers")]
+    return f"{suggest(type_name, known)}List the stages there are with: pdal-stages drivers"
+
+
+def _named(*question: str) -> list[str]:
+    """The names in what `pdal` lists; none where it cannot."""
+    with contextlib.suppress(DependencyError, PipelineError, ValueError, OSError):
+        listed = json.loads(ask_program(*question, "--showjson"))
+        return [one["name"] for one in (listed[1] if question[0] == "--options" else listed)]
+    return []
 
 
 def execute(

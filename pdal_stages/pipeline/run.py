@@ -19,7 +19,7 @@ from ..base.lascheck import check_complete, check_readable
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..stages import registry
-from . import describe, interrupts, las_output, runtime
+from . import interrupts, las_output, runtime
 from . import pdal as pdal_env
 from .callbacks import Callbacks
 from .filenames import (
@@ -242,10 +242,10 @@ class Pipeline:
         if given.count(named[0]) == 1 and self.source.lines[given.index(named[0])]:
             error.where = self.source.where(given.index(named[0]))
         if error.cure is None and (option := _NO_OPTION.search(found)):
-            error.cure = describe.nearest_option(named[0], option[1])
+            error.cure = pdal_env.nearest_option(named[0], option[1])
         if error.cure is None and _NO_STAGE.search(found):
             error.found = found.splitlines()[0]
-            error.cure = describe.nearest_stage(named[0])
+            error.cure = pdal_env.nearest_stage(named[0], registry.stages())
         return error
 
 
