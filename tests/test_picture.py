@@ -166,7 +166,6 @@ def test_nice_step(step):
 def test_what_cannot_be_drawn_is_told():
     x, y, z = block()
     for what, arrays in {
-        "empty": (x[:0], y[:0], z[:0]),
         "finite": (x * np.nan, y, z),
         "one value per point": (x, y, z, np.zeros(3, int)),
         "0 to 255": (x, y, z, np.full(x.size, 300)),

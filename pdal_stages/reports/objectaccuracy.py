@@ -90,18 +90,15 @@ class Things:
 
 def _heights(path: str, name: str, values: Any) -> np.ndarray:
     """A column of heights as numbers, NaN where there is none; texts of numbers count as such."""
-    out = np.full(len(values), np.nan)
-    for n, value in enumerate(values.tolist()):
-        try:
-            out[n] = math.nan if value in (None, "") else float(value)
-        except (TypeError, ValueError):
-            raise StageError(
-                f"the column '{name}' must hold heights of trees, in meters",
-                where=path,
-                found=repr(value),
-                cure="Make it a number, or name it otherwise if it is something else",
-            ) from None
-    return out
+    try:
+        return np.array([math.nan if v in (None, "") else float(v) for v in values.tolist()])
+    except (TypeError, ValueError) as error:
+        raise StageError(
+            f"the column '{name}' must hold heights of trees, in meters",
+            where=path,
+            found=str(error),
+            cure="Make it a number, or name it otherwise if it is something else",
+        ) from None
 
 
 def compare_objects(

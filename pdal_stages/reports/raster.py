@@ -75,32 +75,19 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
 
 
 def shading(s: Surface) -> np.ndarray:
-    """Light on the surface, about 0.5 (dark) to 1.15: sun from the north-west and open sky.
-
-    The sun gives shape to roofs and slopes; the sky term darkens what lies lower than its surroundings, as
-    streets between houses do.
-    """
+    """Light on the surface, about 0.4 (dark) to 1.2: sun from the north-west, and less sky where surroundings are higher."""
     known = np.isfinite(s.z)
-    above = np.where(known, s.z - np.nanmedian(s.z), 0.0).astype(np.float32)
-    weight = known.astype(np.float32)
-    widest = 0.1 * max(s.z.shape)  # wider shows nothing more
+    above, weight = np.where(known, s.z - np.nanmedian(s.z), 0.0).astype(np.float32), known.astype(np.float32)
 
-    def height_around(size: float) -> np.ndarray:
-        size = min(size, widest)
-        soft = [above, weight]
-        for _ in range(2):  # two means over squares look like a Gaussian of that size, however large it is
-            soft = [ndimage.uniform_filter(a, max(1, round(2.45 * size)), mode="nearest") for a in soft]
-        return soft[0] / np.maximum(soft[1], 1e-6)
+    def smooth(size: float) -> np.ndarray:
+        soft, of = (ndimage.gaussian_filter(a, size, mode="nearest", truncate=2.0) for a in (above, weight))
+        return soft / np.maximum(of, 1e-6)
 
-    fine = height_around(0.45 * s.spacing)
-    gy, gx = np.gradient(fine, s.pixel)
-    gy = -gy  # rows run south
-    sun = (0.5 * gx - 0.5 * gy + 0.75) / np.sqrt(1 + gx * gx + gy * gy) / 0.75
-    low = 0.0
-    for size in (1.5, 6.0):
-        around = height_around(max(size / s.pixel, 1.2 * s.spacing))
-        low = low + 0.5 * np.clip((fine - around) / (1.2 * size), -1, 1)
-    light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * low
+    fine = smooth(0.45 * s.spacing)
+    south, east = np.gradient(fine, s.pixel)
+    sun = (0.5 * east + 0.5 * south + 0.75) / np.sqrt(1 + east**2 + south**2) / 0.75
+    around = smooth(min(max(4.0 / s.pixel, 1.2 * s.spacing), 0.1 * max(s.z.shape)))
+    light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * np.clip((fine - around) / 4.8, -1, 1)
     return np.where(known, np.clip(light, 0.42, 1.18), 1.0)
 
 

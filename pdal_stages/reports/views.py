@@ -73,27 +73,22 @@ def ramp(values: np.ndarray, limits: tuple[float, float] | None = None, name: st
 
 
 def columns(**arrays: npt.ArrayLike | None) -> list[np.ndarray]:
-    """Arrays of one value per point, all as long as the first and not empty; their names are for messages.
+    """Arrays of one value per point, all as long as the first; their names are for messages.
 
     ``classes``, ``predicted`` and ``truth`` are codes from 0 to 255, and become (n,) uint8.
     """
     given = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
-    first, size = next((name, a.shape) for name, a in given.items())
+    size = next(iter(given.values())).shape
     for name, a in given.items():
         if a.ndim != 1 or a.shape != size:
-            found = f"shape {a.shape}, '{first}' has {size}"
-            raise StageError(f"'{name}' must be one value per point", where="picture", found=found)
-        if not len(a):
             raise StageError(
-                "there is nothing to draw: the cloud is empty",
-                where="picture",
-                found="0 points",
-                cure="Check that the pipeline before the picture leaves points",
+                f"'{name}' must be one value per point", where="picture", found=f"shape {a.shape}"
             )
         if name in ("classes", "predicted", "truth"):
-            if a.dtype.kind not in "iub" or a.min() < 0 or a.max() > 255:
-                found = f"{a.dtype} {a.min()}..{a.max()}"
-                raise StageError("classes must be whole numbers from 0 to 255", where="picture", found=found)
+            if a.dtype.kind not in "iub" or (a != a.astype(np.uint8)).any():
+                raise StageError(
+                    "classes must be whole numbers from 0 to 255", where="picture", found=a.dtype
+                )
             given[name] = a.astype(np.uint8)
     return list(given.values())
 
