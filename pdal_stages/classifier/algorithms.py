@@ -72,7 +72,7 @@ class PredictRequest:
     #: (m,) points wanted, ascending; None for all; the others are neighbors
     rows: npt.NDArray[np.int64] | None = None
     threads: int | None = None
-    memory_mb: float = 512.0  #: for work under way
+    memory_mb: float = 256.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
     report: Report = field(default_factory=Report)  #: what is counted, complete when all blocks are read

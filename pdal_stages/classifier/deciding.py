@@ -35,7 +35,7 @@ class PredictionOptions:
     """
 
     threads: int | None = None
-    memory_mb: float = 512.0
+    memory_mb: float = 256.0
     probabilities: bool = False
     margin: bool = False
     variance: bool = False

@@ -16,8 +16,6 @@ from ..base.errors import ModelError
 
 #: As many labeled points of its rarest class count as much as the base.
 EVEN = 30
-#: From so many on, several passes on top are better than one.
-MANY = 5000
 #: Probabilities that cannot be divided by.
 NOTHING = 1e-300
 

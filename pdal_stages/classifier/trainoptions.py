@@ -32,13 +32,12 @@ DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
-def setting(default: Any, kind: str, what: str, more: str = "", **rule: Any) -> Any:
+def setting(default: Any, kind: str, help: str, more: str = "", **rule: Any) -> Any:
     """Declare an option: what it is in a sentence, for help texts too, and `more` for who reads the documentation.
 
-    `kind` is that of an option of a stage. `rule`: `low` and `high` bound a number, `above` leaves `low` out, `unit` is
-    that of both, `choices` are the words there are.
+    `kind` and `rule` (``minimum``, ``maximum``, ``exclusive``, ``unit``, ``choices``) are those of an option of a stage.
     """
-    return field(default=default, metadata={"kind": kind, "what": what, "more": more, **rule})
+    return field(default=default, metadata={"kind": kind, "help": help, "more": more, **rule})
 
 
 @dataclass(frozen=True)
@@ -78,34 +77,38 @@ class TrainingOptions:
         "All classes at once, or 'target' against all the others",
         choices=("multiclass", "binary"),
     )
-    target: int | None = setting(None, "integer", "Class to find with the binary strategy", low=0, high=255)
+    target: int | None = setting(
+        None, "integer", "Class to find with the binary strategy", minimum=0, maximum=255
+    )
     background: int = setting(
-        1, "integer", "Code given to all other classes with the binary strategy", low=0, high=255
+        1, "integer", "Code given to all other classes with the binary strategy", minimum=0, maximum=255
     )
     count: int = setting(
         40_000,
         "integer",
         "Samples per class; smaller classes are filled up with duplicates",
-        low=1,
-        high=10**8,
+        minimum=1,
+        maximum=10**8,
     )
     seed: int = setting(
         0,
         "integer",
         "Seed for sampling, trees and shape distributions",
-        low=0,
-        high=2**31 - 1,
+        minimum=0,
+        maximum=2**31 - 1,
     )
-    trees: int = setting(50, "integer", "Number of trees", low=1, high=10_000)
-    min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", low=1, high=10**6)
+    trees: int = setting(50, "integer", "Number of trees", minimum=1, maximum=10_000)
+    min_samples_leaf: int = setting(
+        3, "integer", "Minimum number of samples in a leaf", minimum=1, maximum=10**6
+    )
     max_samples: float | None = setting(
         None,
         "number",
         f"Share of the samples that each tree draws; default: as many as there are, but no more than {PER_TREE:,} of each "
         "class on average",
-        low=0,
-        high=1,
-        above=True,
+        minimum=0,
+        maximum=1,
+        exclusive=True,
     )
     max_features: str | int | float = setting(
         "auto",
@@ -117,8 +120,8 @@ class TrainingOptions:
         "number",
         "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
         "Each class's probability is multiplied by its frequency to this power.",
-        low=0,
-        high=1,
+        minimum=0,
+        maximum=1,
     )
     thin: Sequence[float] = setting(
         (),
@@ -131,8 +134,8 @@ class TrainingOptions:
         "number",
         "Side of voxels: in training and in classifying one point represents each, and the others get its class; 0 for none",
         "Bounds the cost of a point in a drone's cloud, and keeps a model near the densities it knows.",
-        low=0,
-        high=LARGEST,
+        minimum=0,
+        maximum=LARGEST,
         unit="m",
     )
     ignore: Sequence[int] = setting(
@@ -142,8 +145,8 @@ class TrainingOptions:
         None,
         "integer",
         "Folds of cross-validation by group, survey or block of ground; 0 for none; default: 5, with a quarter of the trees",
-        low=0,
-        high=1000,
+        minimum=0,
+        maximum=1000,
     )
     groups: str = setting(
         "",
@@ -159,8 +162,8 @@ class TrainingOptions:
         "a base 1, for few labels: a labeled survey gains by 2",
         "Each is trained on what the one before says of ground it has not seen. Of several on top of a base the first reads "
         "what the base says of the point itself.",
-        low=1,
-        high=MOST_PASSES,
+        minimum=1,
+        maximum=MOST_PASSES,
     )
     context: Any = setting(
         None,
@@ -194,9 +197,9 @@ class TrainingOptions:
         512.0,
         "number",
         "Memory for blocks of points, in addition to the samples",
-        low=0,
-        high=10**9,
-        above=True,
+        minimum=0,
+        maximum=10**9,
+        exclusive=True,
         unit="MB",
     )
 
@@ -205,55 +208,60 @@ class TrainingOptions:
             object.__setattr__(self, name, check(f"'{name}'", getattr(self, name), *bounds, **more))
 
         for one in fields(self):
-            rule = dict(one.metadata)
-            words = [rule.pop(key) for key in ("what", "more", "kind")]
-            value, kind = getattr(self, one.name), words[-1]
+            rule = one.metadata
+            value, kind = getattr(self, one.name), rule["kind"]
             if value is None and one.default is None:
                 continue
             if "choices" in rule:
                 checks.one_of(f"'{one.name}'", value, rule["choices"])
-            elif rule:
-                put(one.name, checks.whole if kind == "integer" else checks.number, **rule)
-            elif kind == "boolean":
-                put(one.name, checks.flag)
+            elif kind == "integer" and "minimum" in rule:
+                put(one.name, checks.whole, rule["minimum"], rule["maximum"])
+            elif kind == "number":
+                more = {"above": rule.get("exclusive", False), "unit": rule.get("unit", "")}
+                put(one.name, checks.number, rule["minimum"], rule["maximum"], **more)
         if not isinstance(self.groups, str):
             raise OptionError("'groups' must be the name of a dimension", found=repr(self.groups)[:60])
         check_side(self.voxel)
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
         self._check_algorithm()
+        base = self.base
         if self.passes is None:
-            object.__setattr__(self, "passes", DEFAULT_PASSES if self.base is None else PASSES_ON_BASE)
+            object.__setattr__(self, "passes", DEFAULT_PASSES if base is None else PASSES_ON_BASE)
         if self.context is None:
-            object.__setattr__(self, "context", self._default_context())
-        self._check_base()
+            several = DEFAULT_CONTEXT if base is None else (OWN, *DEFAULT_CONTEXT)
+            put("context", lambda *_: CONTEXT_OF_BASE if base and self.passes == 1 else several)
+        if base is not None:
+            check_base(base)
+            if self.algorithm != "random_forest":
+                raise OptionError(
+                    "only a forest is built on a 'base'", found=self.algorithm, cure="Leave 'algorithm' out"
+                )
+            if self.passes == 1:
+                object.__setattr__(self, "voxel", base.voxel)
         put("context", lambda _, tokens: Context.parse(tokens).tokens)
         if self.passes > 1 and not self.context:
             raise OptionError(
                 "several passes need a context", found="an empty list", cure="Leave 'context' out"
             )
-        if self.base is not None and OWN not in self.context:
+        if base is not None and OWN not in self.context:
             raise OptionError(f"with a 'base', 'context' must have '{OWN}'", found=", ".join(self.context))
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
             raise OptionError("'target' means something only with strategy 'binary'", found=self.target)
         m = self.max_features
-        if isinstance(m, str):
-            good = m in ("auto", "sqrt", "log2")
-        elif isinstance(m, float | np.floating):
-            good = 0.0 < m <= 1.0
-        else:
-            good = isinstance(m, int | np.integer) and not isinstance(m, bool) and m >= 1
-        if not good:
+        share = isinstance(m, float | np.floating) and 0.0 < m <= 1.0
+        whole = isinstance(m, int | np.integer) and not isinstance(m, bool) and m >= 1
+        if not (share or whole or (isinstance(m, str) and m in ("auto", "sqrt", "log2"))):
             raise OptionError(
                 "'max_features' must be auto, sqrt, log2, a number of features, or a share up to 1.0",
                 found=repr(m),
             )
         put("dimensions", checks.names)
         thin = [self.thin] if isinstance(self.thin, int | float) else self.thin
-        rule = {"low": 0, "high": 10**6, "above": True, "unit": "points/m2"}
-        put("thin", lambda what, _: tuple(checks.number(what, one, **rule) for one in thin))
+        dense = {"low": 0, "high": 10**6, "above": True, "unit": "points/m2"}
+        put("thin", lambda what, _: tuple(checks.number(what, one, **dense) for one in thin))
         ignore = [self.ignore] if isinstance(self.ignore, int) else self.ignore
         put("ignore", lambda what, _: tuple(checks.whole(what, one, 0, MAX_LABEL) for one in ignore))
         resolve_threads(self.threads)
@@ -268,22 +276,6 @@ class TrainingOptions:
         own = trainer(self.algorithm).own_options(getattr(self, self.algorithm, None))
         if own is not None:
             object.__setattr__(self, self.algorithm, own)
-
-    def _default_context(self) -> tuple[str, ...]:
-        if self.base is None:
-            return DEFAULT_CONTEXT
-        return CONTEXT_OF_BASE if self.passes == 1 else (OWN, *DEFAULT_CONTEXT)
-
-    def _check_base(self) -> None:
-        if self.base is None:
-            return
-        check_base(self.base)
-        if self.algorithm != "random_forest":
-            raise OptionError(
-                "only a forest is built on a 'base'", found=self.algorithm, cure="Leave 'algorithm' out"
-            )
-        if self.passes == 1:
-            object.__setattr__(self, "voxel", self.base.voxel)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -323,7 +315,7 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
 def _documented() -> str:
     lines = ["How a model is trained.", "", "Attributes", "----------"]
     for one in fields(TrainingOptions):
-        what = f"{one.metadata['what']}. {one.metadata['more']}".strip()
+        what = f"{one.metadata['help']}. {one.metadata['more']}".strip()
         unit = f", {one.metadata['unit']}" if one.metadata.get("unit") else ""
         lines += [f"{one.name} : {one.type}{unit}", textwrap.indent(textwrap.fill(what, 110), "    ")]
     return "\n".join([*lines, ""])

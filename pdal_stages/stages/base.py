@@ -213,10 +213,6 @@ class Stage(ABC):
         """The most neighbors that these neighbors are asked for in turn; 0: none."""
         return 0
 
-    def memory_in_tiles(self) -> int | None:
-        """What its option `memory` is in tiles where nobody gives it; None: as elsewhere."""
-        return None
-
     def check_tiled(self) -> None:
         """Refuse options whose result depends on all points at once."""
 

@@ -22,7 +22,6 @@ from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
 from ..classifier.foresttraining import SHORT
 from ..classifier.modelfile import find
-from ..classifier.refinement import MANY
 from ..classifier.sureness import of_the_base
 from .base import Stage, files_read
 from .checked import SURE, CheckedChoice, Looked
@@ -45,23 +44,13 @@ AUTO = "auto"
 def trained(name: str, /, **other: Any) -> Any:
     """An option of training, as it is declared there; `other` is what is different here, as for :class:`Option`."""
     field = _TRAINING[name]
-    rule = field.metadata
-    kind: str = rule["kind"]
+    rule = {key: value for key, value in field.metadata.items() if key != "more"}
     default: Any = field.default
-    if kind == "list" and default is not None and not isinstance(default, tuple):
+    if rule["kind"] == "list" and default is not None and not isinstance(default, tuple):
         default = (default,)
-    more: dict[str, Any] = {
-        "default": float(default) if kind == "number" and default is not None else default
-    }
-    if "low" in rule:
-        more |= {"minimum": rule["low"], "maximum": rule["high"], "exclusive": rule.get("above", False)}
-    more |= {
-        "kind": kind,
-        "help": rule["what"],
-        "unit": rule.get("unit", ""),
-        "choices": rule.get("choices", ()),
-    }
-    return option(**{**more, **other})
+    if rule["kind"] == "number" and default is not None:
+        default = float(default)
+    return option(**{"default": default, **rule, **other})
 
 
 class ClassifierModel(Stage):
@@ -80,7 +69,7 @@ class ClassifierModel(Stage):
     dimensions: list = trained(
         "dimensions",
         default=(AUTO,),
-        help=f"{_TRAINING['dimensions'].metadata['what']}; auto: HeightAboveGround and, where the points have them, Ground, "
+        help=f"{_TRAINING['dimensions'].metadata['help']}; auto: HeightAboveGround and, where the points have them, Ground, "
         "HeightAboveOpening_5, HeightAboveOpening_17 and returns",
         may_be_empty=True,
     )
@@ -291,12 +280,6 @@ classes.
             report.warnings.append(
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
                 "label some of that class too, or find this one alone (strategy binary, target)"
-            )
-        least = min(one["available"] for one in model.info["classes"] if one["samples"])
-        if self.base is not None and self.training.passes == 1 and least >= MANY:
-            report.notes.append(
-                f"there are {least:,} labels of the rarest class: so many are worth more with passes=2 (pdal-stages train "
-                "--passes 2)"
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(

@@ -15,7 +15,6 @@ from ..base.vegetation import LOW, MEDIUM, bands, by_height
 from ..classifier import Model, Prediction
 from ..classifier.deciding import UNCLASSIFIED
 from ..classifier.modelfile import find
-from ..classifier.passes import BAND
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from .base import Stage
 from .loading import loaded_model
@@ -90,7 +89,7 @@ class ModelClassifier(Stage):
         "take a third of the bytes",
     )
     memory: int = option(
-        "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
+        "integer", 256, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
     )
     details = """
 Computes the features the model needs block by block and classifies them at once, so memory does not grow with their
@@ -184,11 +183,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             f"{as_json(self.preparation)}. Here: {as_json(preparation)}. Expect lower accuracy, or use the former"
         )
 
-    def memory_in_tiles(self) -> int | None:
-        # Half of it is for features that wait for the next pass: where they fit, more is of no use.
-        columns = len(self.model.plan.names) + len(self.model.plan.dimensions)
-        return 256 if 4 * BAND * columns * len(self.model.passes) <= 128 << 20 else None
-
     def most_neighbors(self) -> int:
         return self.model.plan.most_neighbors
 
@@ -199,14 +193,10 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         return list(dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.bands else [])]))
 
     def creates(self) -> dict[str, str]:
-        out = {"Classification": "uint8_t", "Reliability": "float"}
-        if self.margin:
-            out["Margin"] = "float"
-        if self.variance:
-            out["Variance"] = "float"
+        more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
         if self.probabilities:
-            out.update({f"Probability_{code}": "float" for code, _ in self.model.classes})
-        return out
+            more += [f"Probability_{code}" for code, _ in self.model.classes]
+        return {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
 
     def halo_m(self) -> float:
         return self.model.halo_m
@@ -267,13 +257,12 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             "Classification": found.classification,
             "Reliability": found.reliability,
         }
-        if found.margin is not None:
-            values["Margin"] = found.margin
-        if found.variance is not None:
-            values["Variance"] = found.variance
+        for name in ("margin", "variance"):
+            if (value := getattr(found, name)) is not None:
+                values[name.capitalize()] = value
         if found.probabilities is not None:
-            for column, (code, _) in enumerate(self.model.classes):
-                values[f"Probability_{code}"] = found.probabilities[:, column]
+            columns = zip(self.model.codes, found.probabilities.T, strict=True)
+            values |= {f"Probability_{code}": column for code, column in columns}
         if self.compact:
             values |= {
                 name: _rounded(value, _PARTS) for name, value in values.items() if name != "Classification"

@@ -296,8 +296,6 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
         if ours.where_chooses:
             seen = f"{OUTSIDE} <= {later!r}" if later > 0 else f"{OUTSIDE} < 0"
             stage["where"] = f"({ours.where}) && ({seen})" if ours.where else seen
-        if (memory := ours.memory_in_tiles()) is not None:
-            stage.setdefault("memory", memory)
     return stage
 
 
