@@ -15,7 +15,7 @@ from pdal_stages.tiling.settings import TilingOptions
 pytestmark = pytest.mark.pdal
 
 WORDS = ["--count", "150", "--trees", "4", "--neighborhoods", "s2,k9", "--no-progress", "--classes", "2,5,6"]
-TOWN = ps.make_town(80.0, 4.0, seed=5)
+TOWN = ps.make_town(56.0, 4.0, seed=5)
 #: LAS 1.2 and 1.4, as they come; not one scale and offset.
 FORMATS = (1, 6, 6, 3)
 
@@ -25,7 +25,7 @@ def town(tmp_path_factory, write_las):
     """Four files that adjoin, with odd offsets."""
     folder = tmp_path_factory.mktemp("town")
     xyz, random = TOWN.xyz, np.random.default_rng(0)
-    east, north = xyz[:, 0] > 500_038.0, xyz[:, 1] > 5_400_043.0
+    east, north = xyz[:, 0] > 500_028.0, xyz[:, 1] > 5_400_033.0
     number = random.integers(1, 3, len(xyz)).astype(np.uint8)
     for k, point_format in enumerate(FORMATS):
         mine = (east * 2 + north) == k
@@ -52,12 +52,17 @@ def both(town, tmp_path, capsys, *more, files=("",)):
     return models, said
 
 
-@pytest.mark.parametrize("passes", [1, 2])
-def test_on_top_of_a_model(town, tmp_path, capsys, passes):
-    words = ["--base", "standard", "--passes", str(passes)]
-    (whole, tiles), (_one, _other) = both(town, tmp_path, capsys, *words)
+@pytest.fixture(scope="module")
+def base(town):
+    path = town.parent / "base.model"
+    assert main(["train", str(town / "t0.laz"), "--model", str(path), *WORDS]) == 0
+    return str(path)
+
+
+def test_on_top_of_a_model(town, base, tmp_path, capsys):
+    (whole, tiles), _ = both(town, tmp_path, capsys, "--base", base, "--passes", "2")
     assert whole == tiles
-    assert len(ps.load_model(tmp_path / "tiles.model").passes) == 3 + passes
+    assert len(ps.load_model(tmp_path / "tiles.model").passes) == 4
 
 
 def test_the_forests_are_the_same(town, tmp_path, capsys):
@@ -86,15 +91,10 @@ def test_octrees_are_read_in_tiles_too(tmp_path, capsys):
         ),
         ("--writers.classifiermodel.survey=PointSourceId",),
         ("--writers.classifiermodel.ignore=ReturnNumber[2:2]", "--filters.hag_morphological.window=20"),
-        ("--classes", '{"2": 2, "6": 6}', "--base", "BASE"),
     ],
-    ids=["groups", "surveys", "ignore", "base"],
+    ids=["groups", "surveys", "ignore"],
 )
 def test_with_other_options_too(town, tmp_path, capsys, more):
-    if "BASE" in more:
-        base = tmp_path / "base.model"
-        assert main(["train", str(town / "t0.laz"), "--model", str(base), *WORDS]) == 0
-        more = (*more[:-1], str(base))
     (whole, tiles), _ = both(town, tmp_path, capsys, *more)
     assert whole == tiles
 
@@ -160,7 +160,7 @@ def corrected(tmp_path_factory, write_las):
     xyz = np.concatenate([TOWN.xyz, TOWN.xyz[twice]])
     codes = np.concatenate([TOWN.classification, TOWN.classification[twice]]).astype(np.uint8)
     codes[random.random(len(codes)) < 0.02] = 7
-    east, north = xyz[:, 0] > 500_038.0, xyz[:, 1] > 5_400_043.0
+    east, north = xyz[:, 0] > 500_028.0, xyz[:, 1] > 5_400_033.0
     near = np.hypot(xyz[:, 0] - 500_025.0, xyz[:, 1] - 5_400_030.0) < 22.0
     for k in range(4):
         mine = (east * 2 + north) == k
@@ -175,20 +175,14 @@ def corrected(tmp_path_factory, write_las):
 @pytest.mark.parametrize(
     "more",
     [
-        (),
-        ("--base", "BASE"),
         ("--base", "BASE", "--writers.classifiermodel.where=HeightAboveGround < 6 && X < 500040"),
-        ("--base", "BASE", "--surveys", "west=*c[01].laz"),
+        ("--surveys", "west=*c[01].laz"),
         ("--writers.classifiermodel.checked_only=false",),
     ],
-    ids=["alone", "base", "where", "surveys", "as all others"],
+    ids=["base", "surveys", "as all others"],
 )
-def test_corrections_are_trained_on(town, corrected, tmp_path, capsys, more):
-    if "BASE" in more:
-        base = tmp_path / "base.model"
-        assert main(["train", str(town / "t0.laz"), "--model", str(base), *WORDS]) == 0
-        more = tuple(str(base) if word == "BASE" else word for word in more)
-        capsys.readouterr()
+def test_corrections_are_trained_on(corrected, base, tmp_path, capsys, more):
+    more = tuple(base if word == "BASE" else word for word in more)
     (whole, tiles), (one, other) = both(corrected, tmp_path, capsys, *more)
     assert whole == tiles
     assert one.out == other.out

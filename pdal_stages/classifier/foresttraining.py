@@ -32,7 +32,7 @@ from .passes import FoldForests, sample_context
 from .refinement import Blend, on_top, trust, weighed
 from .sampling import draw_samples
 from .sureness import Sureness
-from .trainoptions import PER_TREE, TrainingOptions, feature_plan
+from .trainoptions import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25
@@ -112,7 +112,8 @@ class _ForestTraining:
         self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
         share = options.max_samples
         if share is None:
-            share = min(1.0, PER_TREE * len(self.codes) / int(weight.sum()))
+            each = int(weight.sum()) / len(self.codes)
+            share = min(1.0, min(max(each / 3, LEAST_PER_TREE), PER_TREE) / each)
         self.setting: dict[str, Any] = {
             "seed": options.seed,
             "min_samples_leaf": options.min_samples_leaf,

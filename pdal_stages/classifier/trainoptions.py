@@ -22,8 +22,8 @@ from .context import OWN, Context
 
 #: Most passes a model can have.
 MOST_PASSES = 3
-#: Samples of a class that a tree draws on average, at most, where `max_samples` is not given.
-PER_TREE = 10_000
+#: Where `max_samples` is not given a tree draws a third of the samples, on average at least and at most so many of a class.
+LEAST_PER_TREE, PER_TREE = 1_000, 10_000
 #: How many it has by default, and on top of a base, where labels are few.
 DEFAULT_PASSES, PASSES_ON_BASE = 2, 1
 #: What passes after the first read of the surroundings.
@@ -104,8 +104,7 @@ class TrainingOptions:
     max_samples: float | None = setting(
         None,
         "number",
-        f"Share of the samples that each tree draws; default: as many as there are, but no more than {PER_TREE:,} of each "
-        "class on average",
+        f"Share of the samples a tree draws; default: a third, on average {LEAST_PER_TREE:,} to {PER_TREE:,} of each class",
         minimum=0,
         maximum=1,
         exclusive=True,
@@ -260,8 +259,7 @@ class TrainingOptions:
             )
         put("dimensions", checks.names)
         thin = [self.thin] if isinstance(self.thin, int | float) else self.thin
-        dense = {"low": 0, "high": 10**6, "above": True, "unit": "points/m2"}
-        put("thin", lambda what, _: tuple(checks.number(what, one, **dense) for one in thin))
+        put("thin", lambda what, _: tuple(checks.number(what, one, 0, 10**6, above=True) for one in thin))
         ignore = [self.ignore] if isinstance(self.ignore, int) else self.ignore
         put("ignore", lambda what, _: tuple(checks.whole(what, one, 0, MAX_LABEL) for one in ignore))
         resolve_threads(self.threads)
