@@ -21,11 +21,11 @@ import numpy as np
 from ..stages import registry
 from ..stages.base import Stage
 from .grid import Box, TileGrid
-from .head import Changed, FirstResults, FromBefore, RunContext, run_first
 from .pieces import CloudIndex, Piece, cut_all
 from .plan import FirstRound, TilePlan
 from .sources import InputSource
 from .store import load_arrays, save_arrays, written
+from .tile import Changed, FromBefore, RunContext, run_first
 
 
 def left_file(tile: str) -> str:
@@ -66,16 +66,14 @@ class FirstRoundTask:
         with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
             halo = self.first.halo_m / context.unit
             cuts = cut_all(context.grid, self.tile, self.sources, halo, folder)
-            found = run_first(context, cuts, self.first) if cuts else FirstResults([], {}, [])
-        arrays = {"around": np.concatenate([np.empty((0, 3)), *(one.around for one in found.left)])}
-        for block in {block for one in found.left for block in one.inside}:
-            parts = [one.inside[block] for one in found.left if block in one.inside]
-            arrays[_inside(block)] = np.concatenate(parts)
-        for key, (index, values) in found.changed.items():
-            arrays[f"{key}/index"] = index
-            arrays |= {f"{key}/{name}": column for name, column in values.items()}
+            left, arrays, messages = run_first(context, cuts, self.first) if cuts else ([], {}, [])
+        arrays["around"] = np.concatenate([np.empty((0, 3)), *(one.around for one in left)])
+        for block in {block for one in left for block in one.inside}:
+            arrays[_inside(block)] = np.concatenate(
+                [one.inside[block] for one in left if block in one.inside]
+            )
         save_arrays(self.target, arrays)
-        return {"outputs": written([self.target]), "messages": found.messages}
+        return {"outputs": written([self.target]), "messages": messages}
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def tiles_around(
 
 
 def from_before(
-    context: RunContext, folder: str, tile: tuple[int, int], read_m: float, cuts: list[Piece]
+    folder: str, context: RunContext, tile: tuple[int, int], read_m: float, cuts: list[Piece]
 ) -> FromBefore:
     """What the rounds before, which are kept in `folder`, left for a tile that is read with so many meters around it."""
     first = context.plan.first

@@ -25,8 +25,7 @@ from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import run_tasks
 from .cluster import open_workers
-from .ground import BlockTask, FirstRoundTask, block_file, blocks_around, left_file, tiles_around
-from .head import RunContext
+from .ground import BlockTask, FirstRoundTask, block_file, blocks_around, from_before, left_file, tiles_around
 from .outputs import FileTask
 from .pieces import CloudIndex, sort_points
 from .plan import TilePlan, make_plan, outputs_for
@@ -35,7 +34,7 @@ from .settings import TilingOptions, worker_bytes
 from .sources import InputSource
 from .store import Store, fingerprint
 from .survey import Survey
-from .tile import TileTask
+from .tile import RunContext, TileTask
 
 #: A run stops when so many tiles failed for one reason and none succeeded.
 _HOPELESS = 10
@@ -338,7 +337,8 @@ class _Run:
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
         """Do all waiting tiles, and outputs as soon as the last of their tiles is there. `finished` hears of outputs."""
         survey, store, context = self.survey, self.store, self._context()
-        before = str(store.kept) if self.plan.first is not None and len(self.tiles) > 1 else ""
+        many = self.plan.first is not None and len(self.tiles) > 1
+        before = partial(from_before, str(store.kept)) if many else None
         waiting = deque(job for job in self.tiles if job.state == "waiting")
         users: dict[str, list[Job]] = {}
         for out in self.outputs:

@@ -1,24 +1,352 @@
-"""One tile: cut it out with its surroundings, run the head, keep the tile's own results."""
+"""A tile: cut out with its halo, the head of the pipeline run on it, the tile's own results taken out and kept."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..base.errors import NoTerrainError
-from .grid import inside
-from .ground import from_before
-from .head import HeadRun, RunContext, run_head
-from .outputs import PieceResults, class_counts, save_results, write_tile
-from .pieces import CloudIndex, cut_all
+from ..base.asprs import LEGACY_LIMIT
+from ..base.errors import NoTerrainError, PipelineError, StageError
+from ..pipeline.callbacks import Callbacks
+from ..pipeline.las_output import check_writers, flag_splitter
+from ..pipeline.references import NO_REFERENCE
+from ..pipeline.run import Pipeline
+from ..pipeline.runtime import points_of
+from ..stages import registry
+from ..stages.base import Left, Stage
+from ..stages.points import HOLDS_NOWHERE
+from ..stages.polygons import THE_PLACES, TOUCH_NONE
+from .grid import Box, TileGrid, inside
+from .outputs import PieceResults, changed_in, class_counts, flags_in_classes, save_results, write_tile
+from .pieces import CloudIndex, Piece, cut_all
+from .plan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
+from .report import left_alone
 from .sources import InputSource
 from .store import written
 
 #: How often a tile is read again with a wider halo.
 _WIDENINGS = 3
+#: Points whose neighbors are looked at in one go where they lie far apart.
+_AT_ONCE = 100_000
+_MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
+#: The warning of `Points` in a tile: of the user's `where` with what was added for the tile, or of that alone.
+_NOWHERE = re.compile(rf"{HOLDS_NOWHERE} [\d,]+ points: (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
+
+Changed = dict[str, tuple[NDArray[np.int64], NDArray]]
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What all tiles of a run have in common."""
+
+    plan: TilePlan
+    grid: TileGrid
+    unit: float  #: meters per unit of the coordinates
+    bounds: Box  #: of all inputs
+    threads: int
+    most_points: int  #: a tile is not read with a wider halo that holds more
+    scratch: str  #: folder for temporary files
+
+
+class HeadRun(NamedTuple):
+    """What a run of the head gave."""
+
+    results: list[PieceResults]
+    need: float = 0.0  #: the halo that it took, meters
+    messages: Sequence[str] = ()  #: warnings and notes
+    left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.report`
+
+
+class FromBefore(NamedTuple):
+    """What the rounds before the tiles made for a tile."""
+
+    blocks: Any  #: for the far-reaching stage
+    changed: list[Changed]  #: of each piece: rows and new values of dimensions that the stages before it gave
+
+
+def run_head(
+    context: RunContext,
+    tile: tuple[int, int],
+    cuts: list[Piece],
+    everything: bool,
+    before: FromBefore | None = None,
+) -> HeadRun:
+    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
+    plan, first = context.plan, context.plan.first
+    if not plan.head:
+        return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts])
+    marks = _marks(cuts, context)
+    begin = 0
+    if before is not None and first is not None and first.kept is not None:
+        begin = first.at
+        for mark, changed in zip(marks, before.changed, strict=True):
+            mark.changed = changed
+    reaches: dict[int, _Reach] = {}
+    from_afar = None
+    found = _Found(plan.creates)
+    with Callbacks() as callbacks:
+        stages = _marked(callbacks, marks)
+        for number in range(begin, len(plan.head)):
+            stage = _with_threads(plan.head[number], context.threads)
+            stages.append({**stage, **_after(marks)} if number == begin else stage)
+            if before is not None and first is not None and number == first.at:
+                from_afar = len(stages) - 1
+            kind = registry.stages().get(stage["type"])
+            if kind is not None and kind.open_ended and not everything:
+                reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), plan.later[number])
+                stages.append(callbacks.filter(reach))
+        stages.append(callbacks.filter(found))
+        pipeline = Pipeline(stages, whole=False)
+        ours = pipeline.lowered.ours
+        check_writers(
+            [*pipeline.lowered.stages, *plan.tail], [(one.stage, one.place, one.index) for one in ours]
+        )
+        for one in ours:
+            one.stage.own_points = OUTSIDE
+            if before is not None and one.number == from_afar:
+                one.stage.from_blocks = before.blocks
+            if one.number in reaches:
+                reaches[one.number].stage = one.stage
+        most = max((one.stage.most_neighbors() for one in ours), default=0)
+        found.with_places = most > 0
+        pipeline.execute(arrays=False)
+    results = _collect(found.views, cuts, plan.creates, marks)
+    need = max((reach.need for reach in reaches.values()), default=0.0)
+    if not everything and any(report.beyond_halo for _, reports in pipeline.reports for report in reports):
+        second = max(one.stage.second_neighbors() for one in ours)
+        need = max(need, _far_neighbors(found.places, most, second, context, tile))
+    alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
+    return HeadRun(results, need, _messages(pipeline, context.scratch), alone)
+
+
+def run_first(
+    context: RunContext, cuts: list[Piece], first: FirstRound
+) -> tuple[list[Left], dict[str, NDArray], list[str]]:
+    """Run the stages before the one that looks far, on a tile and the surroundings that they need.
+
+    What that stage needs of the tile's own points, view by view; new values that the stages before it gave, as arrays named
+    ``INPUT/index`` (the points' numbers) and ``INPUT/DIMENSION``; messages.
+    """
+    marks = _marks(cuts, context, first.kept or () if first.at else ())
+    views: list[dict[str, NDArray]] = []
+    found: list[Left] = []
+
+    def left(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        mine = ins[OUTSIDE] < 0
+        if mine.any():
+            found.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
+        views.append({name: ins[name][mine] for name in (ROW, INPUT, *marks[0].keep)})
+
+    with Callbacks() as callbacks:
+        stages = _marked(callbacks, marks)
+        head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
+        head[0] |= _after(marks)
+        stage = Pipeline([*stages, *head], whole=False).lowered.ours[-1].stage
+        run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
+        pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
+        pipeline.execute(arrays=False)
+    changes: dict[str, NDArray] = {}
+    for mark in marks:
+        rows, values = _of_piece(views, mark, mark.keep)
+        new = np.zeros(len(rows), bool)
+        for name, column in values.items():
+            new |= mark.changes(name, rows, column)
+        if new.any():
+            key = mark.piece.source.key
+            changes[f"{key}/index"] = mark.piece.index[rows[new]]
+            changes |= {f"{key}/{name}": column[new] for name, column in values.items()}
+    return found, changes, _messages(pipeline, context.scratch)
+
+
+def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
+    """What is said of a tile, in the same words of every tile, as a run says it once; nothing of files in `scratch`."""
+    lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
+    for text in pipeline.messages:
+        if text.startswith(scratch) or NO_REFERENCE in text:  # of a piece, as is said of the input
+            continue
+        if TOUCH_NONE in text:  # the places differ from tile to tile
+            text = text[text.index(TOUCH_NONE) :].partition(THE_PLACES)[0]
+        elif nowhere := _NOWHERE.search(text):
+            if nowhere[1] is None:  # the tile has no point of its own: nothing that the user asked for
+                continue
+            text = f"{HOLDS_NOWHERE} points: {nowhere[1]}"
+        lines.append(text)
+    return lines
+
+
+def _marks(cuts: list[Piece], context: RunContext, keep: Collection[str] = ()) -> list[_Mark]:
+    return [_Mark(number, piece, context, keep) for number, piece in enumerate(cuts)]
+
+
+def _marked(callbacks: Callbacks, marks: list[_Mark]) -> list[dict[str, Any]]:
+    """Readers of the pieces, whose points are numbered.
+
+    Where old PDAL reads the flags of some pieces as bits of the class, and of others apart, all have them apart.
+    """
+    mixed = len({mark.holds_flags for mark in marks}) > 1
+    stages: list[dict[str, Any]] = []
+    for mark in marks:
+        number, piece = mark.number, mark.piece
+        stages.append({**piece.reader, "filename": piece.path, "tag": f"in{number}"})
+        if mixed and mark.holds_flags:
+            stages.append(flag_splitter([True], inputs=[f"in{number}"], tag=f"split{number}"))
+        before = [stages[-1]["tag"]]
+        stages.append(callbacks.filter(mark, _MARK_TYPES, inputs=before, tag=f"mark{number}"))
+    return stages
+
+
+def _after(marks: list[_Mark]) -> dict[str, Any]:
+    return {"inputs": [f"mark{number}" for number in range(len(marks))]}
+
+
+def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
+    if given["type"] not in registry.stages():
+        return dict(given)
+    asked = int(given.get("threads") or 0)
+    return {**given, "threads": min(asked, threads) if asked else threads}
+
+
+class _Mark:
+    """Numbers a reader's points, and keeps what they were where changes are to be found later."""
+
+    def __init__(self, number: int, piece: Piece, context: RunContext, keep: Collection[str] = ()) -> None:
+        self.number, self.piece, self.keep = number, piece, list(keep)
+        self.keep_all = context.plan.creates is None
+        self.changed: Changed = {}  # given by the rounds before
+        self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
+        self.holds_flags = flags_in_classes(piece.path)
+        self.original: dict[str, NDArray] = {}  # dimensions of the tile's own points
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        count, own = len(ins["X"]), self.piece.own
+        if count != len(self.away):
+            raise StageError(f"the reader gave {count:,} points of {len(self.away):,}")
+        outs[ROW] = np.arange(count, dtype=np.uint32)
+        outs[INPUT] = np.full(count, self.number, np.uint32)
+        outs[OUTSIDE] = self.away
+        names = [name for name in ins if name not in _MARK_TYPES] if self.keep_all else self.keep
+        self.original = self.without_flags({name: ins[name][own] for name in names})
+        for name, (rows, values) in self.changed.items():
+            outs[name] = changed_in(name, ins[name], rows, values, self.holds_flags)
+
+    def without_flags(self, values: dict[str, NDArray]) -> dict[str, NDArray]:
+        """Values whose class codes are free of the flags that old PDAL reads as bits of them."""
+        if self.holds_flags and "Classification" in values:
+            values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
+        return values
+
+    def changes(self, name: str, rows: NDArray[np.int64], values: NDArray) -> NDArray[np.bool_]:
+        """Which of some rows' values are not what was read; all where the dimension is new."""
+        if name not in self.original:
+            return np.ones(len(rows), bool)
+        return self.original[name][np.searchsorted(self.piece.own, rows)] != values
+
+
+class _Reach:
+    """Finds how far an open-ended stage reached for what is used of its results: up to `later` meters outside the tile."""
+
+    def __init__(self, box: Box, later: float) -> None:
+        self.box, self.later, self.need = box, later, 0.0
+        self.stage: Stage | None = None
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        assert self.stage is not None
+        points = points_of(self.stage, module, ins)
+        wanted = ins[OUTSIDE] <= self.later if self.later > 0 else ins[OUTSIDE] < 0
+        box = [side * points.units.horizontal for side in self.box]
+        self.need = max(self.need, self.stage.reach_of(points, wanted, box))
+
+
+class _Found:
+    """Takes what the stages gave the tile's own points, view by view: far less than all arrays of all points.
+
+    `with_places`: where all points are, too: X, Y, Z and how far outside the tile.
+    """
+
+    def __init__(self, creates: list[str] | None) -> None:
+        self.creates, self.with_places = creates, False
+        self.views: list[dict[str, NDArray]] = []
+        self.places: list[NDArray[np.float64]] = []
+
+    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        wanted = ins if self.creates is None else self.creates
+        names = [name for name in wanted if name in ins and name not in _MARK_TYPES]
+        mine = np.flatnonzero(ins[OUTSIDE] < 0)
+        self.views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
+        if self.with_places:
+            self.places.append(np.column_stack([ins[name] for name in ("X", "Y", "Z", OUTSIDE)]))
+
+
+def _of_piece(
+    views: list[dict[str, NDArray]], mark: _Mark, names: Collection[str]
+) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
+    """Rows of a piece that came out, ascending, and their values."""
+    mine = [(view, np.flatnonzero(view[INPUT] == mark.number)) for view in views]
+    rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
+    order = np.argsort(rows, kind="stable")
+    values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
+    return rows[order], mark.without_flags(values)
+
+
+def _collect(
+    views: list[dict[str, NDArray]],
+    cuts: list[Piece],
+    creates: list[str] | None,
+    marks: list[_Mark],
+) -> list[PieceResults]:
+    """Results of the tile's own points, sorted as their pieces are."""
+    names = [name for view in views[:1] for name in view if name not in _MARK_TYPES]
+    results = []
+    for piece, mark in zip(cuts, marks, strict=True):
+        rows, values = _of_piece(views, mark, names)
+        if (np.diff(rows) == 0).any():
+            raise PipelineError(
+                "a stage makes new points, which have no place in the input files",
+                cure="Run the pipeline without --tile",
+            )
+        results.append(PieceResults(piece, rows, values))
+    for name in names if creates is None else ():  # what no stage changed is as it was read
+        if not any(
+            mark.changes(name, result.rows, result.values[name]).any()
+            for result, mark in zip(results, marks, strict=True)
+        ):
+            for result in results:
+                del result.values[name]
+    return results
+
+
+def _far_neighbors(
+    places: list[NDArray[np.float64]], most: int, second: int, context: RunContext, tile: tuple[int, int]
+) -> float:
+    """Meters around the tile within which the `most` nearest neighbors of all its points lie, and the `second` of these."""
+    from scipy.spatial import cKDTree
+
+    x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
+    every = np.concatenate(places)
+    xyz = every[:, :3] * context.unit
+    mine = xyz[every[:, 3] < 0]
+    if len(xyz) <= most:
+        return 2 * (x1 - x0)
+    inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
+    tree = cKDTree(xyz)
+    beyond = np.zeros(len(xyz))
+    if second:
+        beyond = tree.query(xyz, k=[second + 1], workers=context.threads)[0][:, 0]
+    need = 0.0
+    for start in range(0, len(mine), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        away, at = tree.query(mine[part], k=most + 1, workers=context.threads)
+        need = max(need, float(((away + beyond[at]).max(axis=1) - inward[part]).max()))
+    return need
+
+
+# ---- a tile ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -32,7 +360,8 @@ class TileTask:
     complete: float  #: meters around the tile up to which these are all the inputs there are
     result: str  #: file for the results, where outputs are put together from tiles
     outputs: list[str] | None  #: otherwise: what each of the writers writes
-    before: str  #: the folder of what the rounds before made; empty where there were none
+    #: What the rounds before made for a tile that is read with so many meters around it; None where there were none.
+    before: Callable[[RunContext, tuple[int, int], float, list[Piece]], FromBefore] | None
 
     def run(self) -> dict[str, Any]:
         """Run the head; write its results, or the outputs. The record says which."""
@@ -60,10 +389,10 @@ class TileTask:
             read = sum(len(piece.index) for piece in cuts)
             own = sum(len(piece.own) for piece in cuts)
             if not own:
-                head = HeadRun([PieceResults(piece, np.empty(0, np.int64), {}) for piece in cuts], 0.0)
+                head = HeadRun([PieceResults(piece, np.empty(0, np.int64), {}) for piece in cuts])
                 break
             everything = inside(context.bounds, grid.box(self.tile, halo_m / context.unit))
-            before = from_before(context, self.before, self.tile, halo_m, cuts) if self.before else None
+            before = self.before(context, self.tile, halo_m, cuts) if self.before else None
             try:
                 head = run_head(context, self.tile, cuts, everything, before)
                 need = head.need
