@@ -16,13 +16,13 @@ from ..base.progress import Progress
 from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
-from . import pdal as pdal_env
+from .classify_request import ClassifyRequest
 from .filenames import stage_files
 from .inputs_outputs import in_folders, input_files, reader_of
 from .lowering import lower_stage
 from .overrides import Override, apply_overrides
 from .run import Pipeline
-from .runtime import wkt_of
+from .runtime import points_of_views
 
 #: What to do where nothing tells the true classes.
 WHAT_IS_TRUE = (
@@ -63,30 +63,24 @@ def compare_files(
     check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
     others = tuple(one for one in overrides if one not in own)
     parts = []
-    named = [span.dimension for span in stage.ignore.spans] if stage.ignore else []
+    kept = {"X", "Y", "Z", "Reliability", "Margin"}
+    kept |= {span.dimension for span in stage.ignore.spans} if stage.ignore else set()
     with Progress(len(pairs), "reading" if not model else "classifying", "files") as bar:
         for source, reference in pairs:
             if model:
-                mine, wkt, withheld = _classified(source, model, reference_dimension, others)
-                true, reference_name = mine, _TRUTH
+                ferry = {"type": "filters.ferry", "dimensions": f"{reference_dimension}=>{_TRUTH}"}
+                mine = _read(source, [ferry, *ClassifyRequest(model, others).stages], others)
+                judged, true = _codes(mine, "Classification", source), _codes(mine, _TRUTH, source)
             else:
-                mine, wkt, withheld = _points_of(source, dimension)
-                true, reference_name = mine, reference_dimension
-            if reference:
-                true, _, _ = _points_of(reference, reference_dimension)
-                _refuse_other_points(mine, true, source, reference)
-            elif reference_name not in (true.dtype.names or ()):
-                raise DimensionError(
-                    f"the dimension '{reference_name}' is missing",
-                    where=source,
-                    found=", ".join(true.dtype.names or ()),
-                    cure=f"{suggest(reference_name, true.dtype.names or ())}{WHAT_IS_TRUE}",
-                )
-            kept = [n for n in ("X", "Y", "Z", "Reliability", "Margin", *named) if n in mine.dtype.names]
-            judged = mine["Classification" if model else dimension]
-            codes = {"Classification": judged, "Reference": true[reference_name]}
-            arrays = {"Withheld": withheld, **{name: mine[name] for name in kept}, **codes}
-            parts.append((Path(source).name, stage.points(arrays, wkt=wkt)))
+                mine = _read(source)
+                judged, other = _codes(mine, dimension, source), mine
+                if reference:
+                    other = _read(reference)
+                    _refuse_other_points(mine, other, source, reference)
+                true = _codes(other, reference_dimension, reference or source)
+            arrays = {name: values for name, values in mine.arrays.items() if name in kept}
+            arrays |= {"Withheld": mine.flag("Withheld"), "Classification": judged, "Reference": true}
+            parts.append((Path(source).name, stage.points(arrays, wkt=mine.wkt)))
             bar.update(1)
     if not any(points.count for _, points in parts):
         raise StageError("there are no points to compare", found=", ".join(files[:3]))
@@ -102,17 +96,6 @@ def compare_files(
 
 #: Where the files' own classes are kept while a model gives others.
 _TRUTH = "TrueClass"
-
-
-def _classified(
-    source: str, model: str, truth: str, overrides: Sequence[Override]
-) -> tuple[Any, str, NDArray]:
-    """A file's points as a model classifies them, its true classes in another dimension; reference, withheld flags."""
-    from .classify_request import ClassifyRequest
-
-    request = ClassifyRequest(model, tuple(overrides))
-    ferry = {"type": "filters.ferry", "dimensions": f"{truth}=>{_TRUTH}"}
-    return _read([reader_of(source, "input"), ferry, *request.stages], overrides, source, "Classification")
 
 
 def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str, str]]:
@@ -152,44 +135,34 @@ def _places_and_names(files: Sequence[str]) -> list[tuple[str, str]]:
     return [os.path.split(name) for name in in_folders(files, [Path(file).stem for file in files])]
 
 
-def _points_of(name: str, dimension: str) -> tuple[Any, str, NDArray]:
-    """All points of a file with class codes freed of flag bits, its spatial reference, and the withheld flags."""
-    return _read([reader_of(name, "input")], (), name, dimension)
-
-
-def _read(
-    stages: list[dict[str, Any]], overrides: Sequence[Override], name: str, dimension: str
-) -> tuple[Any, str, NDArray]:
-    pipeline = Pipeline(stages, overrides)
+def _read(source: str, stages: Sequence[dict[str, Any]] = (), overrides: Sequence[Override] = ()) -> Points:
+    """All points of a file, after some stages."""
+    pipeline = Pipeline([reader_of(source, "input"), *stages], overrides)
     pipeline.execute()
-    array: Any = np.concatenate(pipeline.arrays) if pipeline.arrays else np.empty(0)
-    names = array.dtype.names or ()
-    if dimension not in names:
-        cure = suggest(dimension, names).strip() or None
+    return points_of_views(pipeline.arrays, pipeline.metadata)
+
+
+def _codes(points: Points, name: str, source: str) -> NDArray[np.uint8]:
+    """A dimension of class codes."""
+    if name not in points.arrays:
         raise DimensionError(
-            f"the dimension '{dimension}' is missing", where=name, found=", ".join(names), cure=cure
+            f"the dimension '{name}' is missing",
+            where=source,
+            found=", ".join(points.arrays),
+            cure=f"{suggest(name, points.arrays)}{WHAT_IS_TRUE}",
         )
-    points = Points(
-        {n: array[n] for n in names},
-        legacy_flags=pdal_env.flags_inside_classification(names, pipeline.metadata),
-    )
-    withheld = np.array(points.flag("Withheld"), np.uint8)
-    if "Classification" in names:
-        array["Classification"] = points.class_codes
-    readers = [v for k, v in pipeline.metadata.get("metadata", {}).items() if k.startswith("readers.")]
-    node = readers[0] if readers else None
-    return array, wkt_of(node[0] if isinstance(node, list) else node), withheld
+    return points.codes_of(name)
 
 
-def _refuse_other_points(mine: np.ndarray, true: np.ndarray, source: str, reference: str) -> None:
-    if len(mine) != len(true):
+def _refuse_other_points(mine: Points, true: Points, source: str, reference: str) -> None:
+    if mine.count != true.count:
         raise StageError(
             "the two files do not hold the same points",
-            found=f"{len(mine):,} points in {source}, {len(true):,} in {reference}",
+            found=f"{mine.count:,} points in {source}, {true.count:,} in {reference}",
             cure="Compare files of the same points, or keep the labels with filters.ferry while classifying",
         )
-    for axis in sorted({"X", "Y", "Z"} & set(mine.dtype.names or ()) & set(true.dtype.names or ())):
-        apart = np.abs(mine[axis] - true[axis])
+    for axis in sorted({"X", "Y", "Z"} & set(mine.arrays) & set(true.arrays)):
+        apart = np.abs(mine.arrays[axis] - true.arrays[axis])
         if apart.size and apart.max() > 0.01:
             raise StageError(
                 "the two files do not hold the same points in the same order",

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -106,6 +106,19 @@ def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -
         wkt=wkt_of(module.get("spatialreference")),
         legacy_flags=pdal_env.flags_inside_classification(ins, module.get("metadata")),
     )
+
+
+def points_of_views(
+    arrays: Sequence[np.ndarray], metadata: dict[str, Any], made: Callable[..., Points] = Points
+) -> Points:
+    """The points of all views that a pipeline gave, with PDAL's metadata of it, as a stage's `points` makes them."""
+    arrays = [array for array in arrays if len(array)] or list(arrays[:1])
+    names = arrays[0].dtype.names or () if arrays else ()
+    columns = {name: np.concatenate([array[name] for array in arrays]) for name in names}
+    said = [node for kind, node in metadata.get("metadata", {}).items() if kind.startswith("readers.")]
+    first = said[0] if said else None
+    wkt = wkt_of(first[0] if isinstance(first, list) else first)
+    return made(columns, wkt=wkt, legacy_flags=pdal_env.flags_inside_classification(names, metadata))
 
 
 def _made_again(arguments: Mapping[str, Any]) -> Stage:

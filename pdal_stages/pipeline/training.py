@@ -7,21 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..base.errors import OptionError, StageError
 from ..classifier.summary import FILE_NUMBER
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
 from ..stages.preparation import preparation_of
-from . import pdal as pdal_env
 from .inputs_outputs import reader_of
 from .lowering import lower_stage
 from .overrides import Override
 from .references import check_readers
 from .run import Pipeline
-from .runtime import python_filter, wkt_of
+from .runtime import points_of_views, python_filter
 
 #: PDAL calls this for the points of one reader after the other.
 _NUMBER = f"""\
@@ -104,19 +100,7 @@ def read_points(
     pipeline.execute()
     if not any(map(len, pipeline.arrays)):
         raise StageError("there are no points to train on", where=", ".join(files[:3]))
-    points = points_in(stage, pipeline.arrays, pipeline.metadata)
+    points = points_of_views(pipeline.arrays, pipeline.metadata, stage.points)
     points.report.warnings += [*told, *(f"PDAL says: {line}" for line in pipeline.log_lines[:10])]
     points.report.warnings += pipeline.messages
     return points
-
-
-def points_in(stage: ClassifierModel, arrays: Sequence[NDArray], metadata: dict[str, Any]) -> Points:
-    """The points of PDAL's views as the stage sees them; `metadata` is PDAL's. There is one point at least."""
-    arrays = [array for array in arrays if len(array)]
-    names = arrays[0].dtype.names or ()
-    columns = {name: np.concatenate([array[name] for array in arrays]) for name in names}
-    flags = pdal_env.flags_inside_classification(names, metadata)
-    readers_said = [v for k, v in metadata.get("metadata", {}).items() if k.startswith("readers.")]
-    node = readers_said[0] if readers_said else None
-    wkt = wkt_of(node[0] if isinstance(node, list) else node)
-    return stage.points(columns, wkt=wkt, legacy_flags=flags)

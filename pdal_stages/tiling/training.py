@@ -29,7 +29,8 @@ from ..pipeline.callbacks import Callbacks
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden
 from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
-from ..pipeline.training import heights_for, lowered_writer, points_in, read_points
+from ..pipeline.runtime import points_of_views
+from ..pipeline.training import heights_for, lowered_writer, read_points
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
@@ -323,7 +324,7 @@ class Taking:
             run = pdal_env.execute(stages)
         if not run.count:
             return {"outputs": []}
-        points = points_in(stage, run.arrays, run.metadata)
+        points = points_of_views(run.arrays, run.metadata, stage.points)
         run.arrays.clear()
         training = stage.training_on(points)
         arrays: dict[str, NDArray] = {}
