@@ -40,7 +40,7 @@ CLASSES: dict[Kind, tuple[int, ...]] = {
 }
 #: Cells of the ground are this many times as wide.
 GROUND_CELLS = 2
-#: Cells are too small where more than `MANY` hold fewer than `ENOUGH` points on average (``benchmarks/objectcells.py``).
+#: Cells are too small where more than `MANY` hold fewer than `ENOUGH` points on average.
 MANY, ENOUGH = 100, 1.6
 #: Height and place are counted in these, and the reliability.
 MM = 1000.0
