@@ -18,7 +18,7 @@ from ..base.errors import StageError
 from ..base.vegetation import by_height
 
 #: Rules in the order in which they are applied, and how many voxels to each side they look.
-RULES = {"ground": 2, "islands": 1, "roofs": 1, "facades": 1, "lone": 1}
+RULES = {"ground": 2, "islands": 1, "lone": 1}
 #: Side of a voxel, meters.
 SIDE = 1.0
 GROUND, VEGETATION, BUILDING = 2, (3, 4, 5), 6
@@ -26,14 +26,8 @@ GROUND, VEGETATION, BUILDING = 2, (3, 4, 5), 6
 _GROUND, _VEGETATION, _BUILDING, _OTHER = range(4)
 #: Ground lies at most this far above the terrain, and nothing above this height is ground, meters.
 LOW, HIGH = 0.3, 2.0
-#: Neighbors that are enough to judge by, and the share of them that must be buildings, or of one kind.
+#: Neighbors that are enough to judge by, and the share of them that must be of one kind.
 ENOUGH, SHARE = 10, 0.9
-#: A plane's greatest scatter, its least extent (standard deviations), and how far from it a point may lie, meters.
-SCATTER, EXTENT, NEAR = 0.1, 0.3, 0.2
-#: A wall leans less than this (vertical part of its normal), a roof more; a wall's least standard deviation of heights.
-UPRIGHT, TALL = 0.2, 0.6
-#: Coordinates in a voxel are whole numbers of this part of a meter, so that their sums are exact.
-_PARTS = 1024.0
 _NONE = np.empty(0, np.int64)
 
 
@@ -68,8 +62,7 @@ def consistent(
         Points that are neighbors, and of these, those that may be changed; by default all.
     rules : sequence of str
         Some of :data:`RULES`: ``ground``: a building that the filter calls ground, below 0.3 m and away from all
-        that stands, is ground. ``islands``: ground more than 2 m above the terrain is what its neighbors are. ``roofs``:
-        vegetation in the plane of a roof is building. ``facades``: vegetation in the plane of a wall is building.
+        that stands, is ground. ``islands``: ground more than 2 m above the terrain is what its neighbors are.
         ``lone``: one point against all its neighbors is of their class.
     vegetation_heights : pair of float, optional
         Below these heights, meters, what becomes vegetation is low (3) and medium (4), above high (5); needs `height`.
@@ -130,23 +123,16 @@ class _Voxels:
         """Points of each of four kinds in each voxel, (voxels, 4)."""
         return np.bincount(self.voxel * 4 + kind, minlength=len(self.keys) * 4).reshape(-1, 4)
 
-    def neighbors(self, voxels: NDArray, levels: int = 1) -> Iterable[tuple[tuple[int, ...], NDArray]]:
-        """Each step in the cube of voxels around some, and the voxel there, -1 where it holds no points."""
-        for step in product((-1, 0, 1), (-1, 0, 1), range(-levels, levels + 1)):
-            wanted = self.keys[voxels] + np.dot(step, self.strides)
-            at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
-            yield step, np.where(self.keys[at] == wanted, at, -1)
-
     def around(self, points: NDArray, kind: NDArray) -> NDArray[np.int64]:
-        """Points of each kind in the cubes around the voxels of these points, (points, 4)."""
+        """Points of each kind in the cubes of voxels around those of these points, (points, 4)."""
         voxels, at = np.unique(self.voxel[points], return_inverse=True)
-        return self._sums(voxels, self.counts(kind), 1)[at]
-
-    def _sums(self, voxels: NDArray, counts: NDArray, levels: int) -> NDArray[np.int64]:
-        out = np.zeros((len(voxels), 4), np.int64)
-        for _, at in self.neighbors(voxels, levels):
-            out += np.where(at[:, None] >= 0, counts[at], 0)
-        return out
+        counts = np.vstack([self.counts(kind), np.zeros(4, np.int64)])  # the last is for no voxel
+        total = np.zeros((len(voxels), 4), np.int64)
+        for step in product((-1, 0, 1), repeat=3):
+            wanted = self.keys[voxels] + np.dot(step, self.strides)
+            there = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
+            total += counts[np.where(self.keys[there] == wanted, there, -1)]
+        return total[at]
 
     def vegetation_near(self, points: NDArray, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The commonest class of vegetation around each of these points, the higher of two; where there is none, 5."""
@@ -154,11 +140,6 @@ class _Voxels:
         which[list(VEGETATION[::-1])] = range(3)
         around = self.around(points, which[codes])[:, :3]
         return np.array(VEGETATION[::-1], np.uint8)[around.argmax(axis=1)]
-
-    def places(self, points: NDArray) -> NDArray[np.float64]:
-        """Where in their voxels points lie, (m, 3), whole numbers of parts of a meter."""
-        xyz = self.xyz[self.rows[points]]
-        return np.rint((xyz - np.floor(xyz / SIDE) * SIDE) * _PARTS)
 
     def ground(self) -> tuple[NDArray, Any]:
         if self.height is None or self.flat is None:
@@ -180,51 +161,6 @@ class _Voxels:
         _, green, built, _ = self.around(wrong, self.kind).T
         some = built + green > 0
         return wrong[some], np.where(built >= green, _BUILDING, _VEGETATION)[some]
-
-    def roofs(self) -> tuple[NDArray, Any]:
-        return self._in_planes(1, upright=False)
-
-    def facades(self) -> tuple[NDArray, Any]:
-        return self._in_planes(2, upright=True)
-
-    def _in_planes(self, levels: int, upright: bool) -> tuple[NDArray, Any]:
-        """Vegetation in the planes of buildings around it: leaning ones of roofs, or `upright` ones of walls."""
-        built = np.flatnonzero(self.kind == _BUILDING)
-        counts = self.counts(self.kind)
-        green = np.flatnonzero(counts[:, _VEGETATION] > 0)
-        if not len(built) or not len(green):
-            return _NONE, _BUILDING
-        around = self._sums(green, counts, levels)
-        many = around[:, _BUILDING]
-        solid = (many >= ENOUGH) & (many >= SHARE * around[:, _VEGETATION:].sum(axis=1))
-        green, many = green[solid], many[solid, None].astype(np.float64)
-        # Sums of products of (1, x, y, z), which a step to another voxel changes by one matrix on either side.
-        held, number = np.unique(self.voxel[built], return_inverse=True)
-        at = np.column_stack([np.ones(len(built)), self.places(built)])
-        moments = np.zeros((len(held), 4, 4))
-        for i, j in product(range(4), repeat=2):
-            moments[:, i, j] = np.bincount(number, at[:, i] * at[:, j], len(held))
-        where = np.full(len(self.keys) + 1, -1)  # the last is for no voxel
-        where[held] = range(len(held))
-        total = np.zeros((len(green), 4, 4))
-        for step, voxels in self.neighbors(green, levels):
-            other = where[voxels]
-            moved = np.eye(4)
-            moved[1:, 0] = np.array(step) * SIDE * _PARTS
-            total[other >= 0] += moved @ moments[other[other >= 0]] @ moved.T
-        middle = total[:, 0, 1:] / many
-        spread = total[:, 1:, 1:] / many[..., None] - middle[:, :, None] * middle[:, None]
-        variance, axes = np.linalg.eigh(spread / _PARTS**2)
-        normal = axes[..., 0]
-        plane = (variance[:, 0] <= SCATTER**2) & (variance[:, 1] >= EXTENT**2)
-        wall = np.abs(normal[:, 2]) < UPRIGHT
-        plane &= wall & (spread[:, 2, 2] >= (TALL * _PARTS) ** 2) if upright else ~wall
-        of = np.full(len(self.keys), -1)
-        of[green[plane]] = np.flatnonzero(plane)
-        leaves = np.flatnonzero((self.kind == _VEGETATION) & (of[self.voxel] >= 0))
-        mine = of[self.voxel[leaves]]
-        away = ((self.places(leaves) - middle[mine]) * normal[mine]).sum(axis=1)
-        return leaves[np.abs(away) <= NEAR * _PARTS], _BUILDING
 
     def lone(self) -> tuple[NDArray, Any]:
         # Ground under leaves, and leaves above ground, are alone and right.

@@ -27,8 +27,6 @@ class Consistency(Stage):
         True,
         "Ground more than 2 m above the terrain is what its neighbors are, building or vegetation",
     )
-    roofs: bool = option("boolean", True, "Vegetation in the plane of a roof is building")
-    facades: bool = option("boolean", True, "Vegetation in the plane of a wall is building")
     lone: bool = option(
         "boolean", True, "A lone building or leaf among at least ten of the other is of their class"
     )
@@ -43,10 +41,8 @@ The last step after a classification. Only ground (2), vegetation (3, 4, 5) and 
 another; `ground` and `islands` need `HeightAboveGround` and `Ground`; without them they do nothing, which the metadata says.
 Each rule has an option of its name, and its number of changed points in the metadata.
 
-Neighbors are those in 3 x 3 x 3 voxels of 1 m on an absolute grid (5 high for walls), so a tile with its halo gets the
-classes of the whole cloud. Planes are fitted to the buildings among neighbors,
-where nine in ten of what is no ground are. The feet of walls stay what they are: surveys label them building as often as
-ground.
+Neighbors are those in 3 x 3 x 3 voxels of 1 m on an absolute grid, so a tile with its halo gets the classes of the whole
+cloud. The feet of walls stay what they are: surveys label them building as often as ground.
 """
     before = (
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
