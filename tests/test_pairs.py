@@ -85,7 +85,7 @@ def possible(values) -> bool:
         return False
     if door == "classify" and writer in ("gdal", "ogr", "none"):
         return False
-    if tiles != "none" and writer == "none":
+    if tiles != "none" and writer in ("gdal", "none"):
         return False
     return (row.get("model"), row.get("option")) != ("binary", "vegetation_heights")  # which is refused
 
@@ -127,7 +127,7 @@ def test_every_pair_that_makes_sense_is_there():
     assert set(left) == {
         *doors,
         *(("classify", writer) for writer in ("gdal", "ogr", "none")),
-        *((tiles, "none") for tiles in VALUES["tiles"][1:]),
+        *((tiles, writer) for tiles in VALUES["tiles"][1:] for writer in ("gdal", "none")),
         ("binary", "vegetation_heights"),
     }
     assert len(ROWS) < 140

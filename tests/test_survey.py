@@ -17,8 +17,7 @@ from pdal_stages.cli import main
 from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.tiling import TilingOptions
-from pdal_stages.tiling.settings import PARENT, Density, block_bytes, settled, worker_bytes
-from pdal_stages.tiling.sources import Extent
+from pdal_stages.tiling.settings import PARENT, Density, Extent, block_bytes, settled, worker_bytes
 
 pytestmark = pytest.mark.pdal
 OPTIONS = ("--filters.hag_minima.cell=5", "--no-progress")

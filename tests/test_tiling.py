@@ -20,12 +20,11 @@ from pdal_stages.pipeline.inputs_outputs import locations
 from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
-from pdal_stages.tiling.classify import ClassifyTask
+from pdal_stages.tiling.classify import ClassifyTask, one_format
 from pdal_stages.tiling.grid import TileGrid, inside, touching
+from pdal_stages.tiling.inputs import InputSource, find_sources, las_extent
 from pdal_stages.tiling.pieces import CloudIndex, cut_all, sort_points
 from pdal_stages.tiling.plan import make_plan
-from pdal_stages.tiling.sources import InputSource, find_sources, las_extent
-from pdal_stages.tiling.writeroptions import one_format
 
 pytestmark = pytest.mark.pdal
 

@@ -14,6 +14,8 @@ from ..stages.base import Stage
 
 #: Writers of LAS and what is made of it.
 LAS_WRITERS = ("writers.las", "writers.copc")
+#: Readers of LAS files.
+LAS_READERS = ("readers.las", "readers.copc")
 #: What stages of PDAL have that never names a file.
 _NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
 
@@ -29,7 +31,7 @@ def reader_files(stage: dict[str, Any], *, las: bool = False) -> list[str]:
     name, kind = stage.get("filename"), stage.get("type", "")
     if not isinstance(name, str) or "://" in name:
         return []
-    is_las = kind in ("readers.las", "readers.copc") or (not kind and name.lower().endswith((".las", ".laz")))
+    is_las = kind in LAS_READERS or (not kind and name.lower().endswith((".las", ".laz")))
     if not is_las and (las or (kind and not kind.startswith("readers."))):
         return []
     names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]

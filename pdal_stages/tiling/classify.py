@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +17,11 @@ from ..base.outputs import Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
 from ..pipeline.run import Pipeline
+from .inputs import ept_format, read_ept
 from .plan import TilePlan, make_plan
 from .report import Job, TiledRun, left_alone
 from .run import run_plan
 from .settings import TilingOptions, fits_whole
-from .writeroptions import one_format
 
 
 @dataclass
@@ -169,6 +169,38 @@ class ClassifyTask:
 
         source = self._pipeline.source
         return run_plan(plan, self.options, dry_run=dry_run, finished=finished_one, source=source)
+
+
+def one_format(paths: Sequence[str]) -> dict[str, Any]:
+    """Options of ``writers.las`` that hold what each of some inputs holds; none where these are alike LAS files.
+
+    The finest scale along each axis, and of the formats from LAS 1.4 the first that has all colors there are: PDAL forwards
+    only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest. What cannot be
+    read is said when it is.
+    """
+    formats: set[int] = set()
+    places: set[tuple[float, ...]] = set()
+    for path in paths:
+        try:
+            if is_ept(path):
+                described = read_ept(path)
+                axes = {one["name"]: one for one in described["schema"]}
+                formats.add(ept_format(described))
+                found = [axes.get(axis, {}).get(name) for name in ("scale", "offset") for axis in "XYZ"]
+                places.add(tuple(float(v or (0.001, 0.0)[n > 2]) for n, v in enumerate(found)))
+            elif is_las(path) and (header := las.read_header(path)) and header.count:
+                formats.add(header.point_format)
+                places.add((*header.scales, *header.offsets))
+        except (OSError, StageError, ValueError, TypeError):
+            continue
+    options: dict[str, Any] = {}
+    if len(formats) > 1 or any(map(is_ept, paths)):
+        colored = 8 if 8 in formats else 7 if formats & {2, 3, 7} else 6
+        options = {"minor_version": 4, "dataformat_id": colored}
+    for axis, name in enumerate("xyz"):
+        if len({(place[axis], place[3 + axis]) for place in places}) > 1:
+            options |= {f"scale_{name}": min(place[axis] for place in places), f"offset_{name}": "auto"}
+    return options
 
 
 def classify_file(

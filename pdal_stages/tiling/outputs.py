@@ -22,13 +22,12 @@ from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.callbacks import Callbacks
-from .grid import Box
+from ..pipeline.filenames import LAS_WRITERS
+from .inputs import InputSource
 from .pieces import BLOCK, Piece, header_of, record_blocks, write_records
 from .plan import TilePlan
 from .settings import MOST_AT_ONCE
-from .sources import InputSource
 from .store import load_arrays, save_arrays, written
-from .writeroptions import on_one_grid, with_dimensions
 
 #: PDAL's names of types that are not NumPy's with ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}
@@ -220,6 +219,17 @@ def _put(callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool) -
         yield callbacks.filter(drop, inputs=[f"put{number}"], tag=f"left{number}")
 
 
+def with_dimensions(
+    tail: list[dict[str, Any]], beside: Mapping[str, str] | None, paths: list[str]
+) -> list[dict[str, Any]]:
+    """A tail whose LAS writers are told which extra dimensions to write: the inputs' own, and those `beside` them."""
+    listed = "" if beside is None else las_output.extra_dims_option(paths, beside)
+    return [
+        {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
+        for stage in tail
+    ]
+
+
 # ---- an output for each input file -----------------------------------------------------------------------------
 
 
@@ -245,9 +255,6 @@ class FileTask:
         if plain and self.count > MOST_AT_ONCE:
             with contextlib.suppress(_HeadersDifferError):  # such as automatic offsets: written at once
                 return self._in_parts(tail)
-        header = las.read_header(self.source.path)
-        if header is not None and header.count:
-            tail = on_one_grid(tail, header.box, half_open=False)
         new = self._new_values(0, self.count)
         reader = {**self.source.reader, "filename": self.source.path}
         return run_tail([reader], [new], tail, self.outputs, self.scratch) | {"classes": _classes(new)}
@@ -337,9 +344,9 @@ class _Joined:
 
 
 def write_tile(
-    results: list[PieceResults], plan: TilePlan, outputs: list[str], box: Box, scratch: str
+    results: list[PieceResults], plan: TilePlan, outputs: list[str], scratch: str
 ) -> dict[str, Any]:
-    """Write one tile's own points, from the files that were cut for it; the record. `box`: where the tile lies."""
+    """Write one tile's own points, from the files that were cut for it; the record."""
     mine = [result for result in results if result.piece.own.size]
     if not mine:
         return {"outputs": []}
@@ -347,5 +354,4 @@ def write_tile(
         return plan.takes(mine, outputs, scratch)
     tail = with_dimensions(plan.tail, plan.beside, [result.piece.source.path for result in mine])
     readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
-    tail = on_one_grid(tail, box, half_open=True)
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, scratch)

@@ -21,7 +21,7 @@ from ..base.errors import StageError
 from ..base.runs import begins_run
 from ..pipeline.parts import las_chunks
 from .grid import Box, TileGrid, check_number
-from .sources import InputSource, fetch_ept
+from .inputs import InputSource, fetch_ept
 
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
     import laspy

@@ -38,7 +38,7 @@ _GLOBAL = _filters(
 )
 #: What PDAL takes for bare file names.
 _DRIVERS = {f".{name}": name for name in ("las", "ply", "bpf", "pcd")}
-_DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text", ".tif": "gdal"}
+_DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text"}
 
 
 @dataclass(frozen=True)
@@ -249,6 +249,12 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
         for step in writers:
             if not isinstance(step.given.get("filename"), str) or "://" in step.given["filename"]:
                 raise PipelineError("in tiles, a writer writes files", where=step.type)
+            if step.type == "writers.gdal":
+                raise PipelineError(
+                    "rasters are not written in tiles, where each would lack what lies beyond its edge",
+                    where=step.where,
+                    cure="Write LAS files, and give these to PDAL: pdal pipeline pipelines/terrain-and-surface.json",
+                )
     for step in readers:
         for name in ("count", "start", "bounds", "polygon", "resolution"):
             if name in step.given:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..base.version import __version__
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import TOUCH_NONE
-from .sources import InputSource
+from .inputs import InputSource
 
 #: Points that did not get a class from the classifier, or another one, by their names in the reports of stages.
 LEFT_ALONE = {

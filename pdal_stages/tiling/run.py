@@ -26,14 +26,13 @@ from ..pipeline.run import Pipeline
 from ..pipeline.workers import run_tasks
 from .cluster import open_workers
 from .ground import BlockTask, FirstRoundTask, block_file, blocks_around, from_before, left_file, tiles_around
+from .inputs import InputSource, Survey
 from .outputs import FileTask
 from .pieces import CloudIndex, sort_points
 from .plan import TilePlan, make_plan, outputs_for
 from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .settings import TilingOptions, worker_bytes
-from .sources import InputSource
 from .store import Store, fingerprint
-from .survey import Survey
 from .tile import RunContext, TileTask
 
 #: A run stops when so many tiles failed for one reason and none succeeded.
@@ -114,11 +113,6 @@ def run_plan(
     survey = Survey(plan, chosen)
     if survey.per == "tile":  # whose outputs have points of all readers
         files_with_flags_to_split([*plan.readers, *plan.tail])
-    if any(stage["type"] == "writers.gdal" for stage in plan.tail):
-        survey.messages.append(
-            f"writers.gdal: each raster is made of the points of its {survey.per} alone, so cells at its edge lack those "
-            "beyond; for one raster without seams see docs/large-areas.md"
-        )
     if source is not None:
         _try_on_an_input(source, survey, len(plan.readers))
     if dry_run:

@@ -12,7 +12,7 @@ from ..base.errors import OptionError
 from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..stages.base import Blocks
-from .sources import Extent
+from .grid import Box
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
@@ -107,6 +107,14 @@ class TilingOptions:
     def threads(self) -> int:
         """Threads of each local worker: workers times threads never exceed the cores."""
         return max(1, available_threads() // max(1, self.local_workers))
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What an input says of itself."""
+
+    count: int  #: points
+    box: Box
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,11 @@ from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import THE_PLACES, TOUCH_NONE
 from .grid import Box, TileGrid, inside
+from .inputs import InputSource
 from .outputs import PieceResults, changed_in, class_counts, flags_in_classes, save_results, write_tile
 from .pieces import CloudIndex, Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 from .report import left_alone
-from .sources import InputSource
 from .store import written
 
 #: How often a tile is read again with a wider halo.
@@ -369,8 +369,7 @@ class TileTask:
         with TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
             results, record = self._settled(folder)
             if self.outputs is not None:
-                box = context.grid.box(self.tile)
-                return record | write_tile(results, context.plan, self.outputs, box, context.scratch)
+                return record | write_tile(results, context.plan, self.outputs, context.scratch)
             save_results(self.result, results)
         return record | {"outputs": written([self.result])}
 

@@ -34,12 +34,12 @@ from ..pipeline.training import heights_for, lowered_writer, read_points
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
+from .inputs import find_sources, read_extent
 from .outputs import NewValues, PieceResults, merged, of_own_points
 from .plan import TilePlan, make_plan
 from .report import Job, TiledRun
 from .run import run_plan
 from .settings import TilingOptions, fits_whole
-from .sources import find_sources, read_extent
 from .store import load_arrays, save_arrays, written
 
 #: Memory of a point that is trained on in one piece, voxels and samples' surroundings included.

@@ -35,7 +35,7 @@ from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.pipeline.pdal import version
 from pdal_stages.pipeline.read import decode, parse_pipeline
 from pdal_stages.stages.where import Expression
-from pdal_stages.tiling import outputs, sources
+from pdal_stages.tiling import inputs, outputs
 from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.pieces import sort_points
 from pdal_stages.tiling.store import Store
@@ -171,7 +171,7 @@ def cloud(data: bytes) -> str:
     las.projection(path)
     las.odd_text(path)
     las.extra_dimensions(path)
-    found = sources.las_extent(str(path))
+    found = inputs.las_extent(str(path))
     assert sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"] == found.count
     las.supersede_copc(path)
     return "read"
@@ -190,7 +190,7 @@ def _epts() -> list[bytes]:
 def ept(data: bytes) -> str:
     """The description of an EPT source."""
     path = put("ept.json", data)
-    found = sources.read_extent(sources.InputSource(str(path), {"type": "readers.ept"}, "ept"))
+    found = inputs.read_extent(inputs.InputSource(str(path), {"type": "readers.ept"}, "ept"))
     assert found.count >= 0 and np.isfinite(found.box).all()
     TileGrid(10.0).covering(found.box)
     return "read"
@@ -224,7 +224,7 @@ def store(data: bytes) -> str:
     return "read" if any(found) else "refused"
 
 
-_SOURCE = sources.InputSource("/a.las", {"type": "readers.las"}, "las")
+_SOURCE = inputs.InputSource("/a.las", {"type": "readers.las"}, "las")
 
 
 def _results() -> list[bytes]:

@@ -1,29 +1,200 @@
-"""What is known of a run's inputs before any tile: which can be read, where they lie, in what unit."""
+"""The inputs of a tiled run, and what is known of them before any tile: which can be read, where they lie, in what unit."""
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import math
+import os
 import time
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..base import las, lascheck
+from ..base import las, lascheck, strictjson
 from ..base.errors import OptionError, PipelineError, StageError
 from ..base.stamps import stamp
 from ..base.units import Units
-from ..pipeline.filenames import named_files
-from ..pipeline.inputs_outputs import in_folders
+from ..pipeline import pdal as pdal_env
+from ..pipeline.filenames import LAS_READERS, named_files
+from ..pipeline.inputs_outputs import in_folders, locations
 from ..pipeline.references import Reference, check_one_reference, reference_of, without_reference
 from .grid import Box, TileGrid, check_number, touching, union
-from .pieces import CloudIndex
-from .plan import TilePlan
-from .settings import Density, TilingOptions, block_bytes, settled
-from .sources import Extent, InputSource, find_sources, read_ept, read_extent
+from .settings import Density, Extent, TilingOptions, block_bytes, settled
 from .store import fingerprint
 
+if TYPE_CHECKING:
+    from .pieces import CloudIndex
+    from .plan import TilePlan
+
+#: Bytes of an EPT source's description at most.
+_LARGEST = 16 << 20
+#: Options of readers.tindex that choose files or points, or change them.
+_TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
 #: Inputs with odd headers that are named.
 _ODD = 5
+
+
+@dataclass(frozen=True)
+class InputSource:
+    """One input."""
+
+    path: str  #: absolute, or an address
+    reader: dict[str, Any]  #: the stage that reads it
+    kind: str  #: ``las`` (LAS, LAZ, COPC) or ``ept``
+
+    @property
+    def key(self) -> str:
+        """A short name, the same in every run."""
+        return hashlib.sha1(os.fsencode(self.path)).hexdigest()[:12]
+
+    @property
+    def stem(self) -> str:
+        """The name outputs are called after."""
+        return Path(self.plain_name).stem
+
+    @property
+    def plain_name(self) -> str:
+        """The file's name, without what says that it is COPC: outputs of tiles are not."""
+        name = Path(self.path).name
+        return (
+            name[: -len(".copc.laz")] + name[-len(".laz") :] if name.lower().endswith(".copc.laz") else name
+        )
+
+    def within(self, box: Box) -> dict[str, Any]:
+        """The reader of an EPT source for a box alone."""
+        x0, y0, x1, y1 = box
+        return {**self.reader, "filename": self.path, "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])"}
+
+
+def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
+    """The inputs behind readers: names, patterns, EPT addresses, tile indexes.
+
+    Raises
+    ------
+    PipelineError
+        Where nothing is found, or a reader cannot be cut into tiles.
+    """
+    found: dict[str, InputSource] = {}
+    for reader in readers:
+        given, kind = reader.get("filename", ""), reader["type"]
+        name = str(given)
+        options = {k: v for k, v in reader.items() if k not in ("filename", "tag", "inputs")}
+        paths = given if isinstance(given, list) else [name]  # from a command all are files
+        if kind == "readers.ept":
+            for path in paths:
+                path = path.removeprefix("ept://")
+                path = path if path.endswith("ept.json") else path.rstrip("/") + "/ept.json"
+                path = path if "://" in path else os.path.abspath(path)
+                found.setdefault(path, InputSource(path, options, "ept"))
+            continue
+        if kind == "readers.tindex":
+            if ignored := [o for o in _TINDEX_QUERIES if o in reader]:
+                raise PipelineError(
+                    "in tiles all files of a tile index are read, whole, in their own reference",
+                    where=kind,
+                    found=", ".join(ignored),
+                    cure="Leave these options out, or make an index of the files you mean",
+                )
+            paths = locations(name, str(options.pop("tindex_name", "location")))
+            options = {k: v for k, v in options.items() if k in ("override_srs", "default_srs")}
+        elif kind not in LAS_READERS:
+            raise PipelineError(
+                f"{kind} cannot read a part of a file, so it cannot be cut into tiles",
+                found=name,
+                cure="Convert the input first: pdal translate INPUT input.laz",
+            )
+        elif paths == [name] and not os.path.exists(name) and any(c in name for c in "*?["):
+            paths = sorted(glob.glob(name, recursive=True))
+            if not paths:
+                raise PipelineError("no file fits the reader's pattern", where=kind, found=name)
+        for path in map(os.path.abspath, paths):
+            found.setdefault(path, InputSource(path, {**options, "type": "readers.las"}, "las"))
+    return list(found.values())
+
+
+def read_extent(source: InputSource) -> Extent:
+    """Number of points and bounding box, from the first bytes.
+
+    Raises
+    ------
+    StageError
+        If the input cannot be read.
+    """
+    if source.kind != "ept":
+        return las_extent(source.path)
+    described = read_ept(source.path)
+    x0, y0, _, x1, y1, _ = map(float, described["boundsConforming"])
+    return Extent(int(described["points"]), (x0, y0, x1, y1))
+
+
+def las_extent(path: str) -> Extent:
+    """Number of points and bounding box in the header of a LAS or LAZ file."""
+    try:
+        found = las.read_header(path)
+    except OSError as error:
+        raise StageError("the input cannot be read", where=path, found=error) from None
+    if found is None:
+        raise StageError("the input is not a LAS or LAZ file", where=path)
+    x0, y0, x1, y1 = found.box
+    if found.count and not (math.isfinite(x1 - x0 + y1 - y0) and x0 <= x1 and y0 <= y1):
+        raise StageError(
+            "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
+        )
+    return Extent(found.count, found.box)
+
+
+# ---- EPT sources ---------------------------------------------------------------------------------------------
+
+
+def read_ept(path: str) -> dict[str, Any]:
+    """The description of an EPT source."""
+    try:
+        if "://" in path:
+            import urllib.request
+
+            with urllib.request.urlopen(path, timeout=60) as answer:
+                text = answer.read(_LARGEST)
+        else:
+            with open(path, "rb") as file:
+                text = file.read(_LARGEST)
+        found = strictjson.loads(text)
+        x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
+        named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
+        if int(found["points"]) < 0 or not (x0 <= x1 and y0 <= y1) or not named:
+            raise ValueError("a description of nothing")
+        return found
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
+
+
+def ept_format(described: Mapping[str, Any]) -> int:
+    """The LAS point format that has the colors of an EPT source."""
+    names = {dimension["name"] for dimension in described["schema"]}
+    return 8 if "Infrared" in names else 7 if "Red" in names else 6
+
+
+def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
+    """Read the points of an EPT source in a box into a LAS file; whether there are any.
+
+    Scales and offsets are the source's, so coordinates stay what they are; other dimensions become extra dimensions.
+    """
+    described = read_ept(source.path)
+    form = {"minor_version": 4, "dataformat_id": ept_format(described), "extra_dims": "all"}
+    for dimension in described["schema"]:
+        if dimension["name"] in ("X", "Y", "Z"):
+            axis = dimension["name"].lower()
+            form[f"scale_{axis}"] = dimension.get("scale", 0.001)
+            form[f"offset_{axis}"] = dimension.get("offset", 0.0)
+    writer = {"type": "writers.las", "filename": target, **form}
+    run = pdal_env.execute([source.within(box), writer], arrays=False)
+    return bool(run.count and las_extent(target).count)
+
+
+# ---- all of them ---------------------------------------------------------------------------------------------
 
 
 class Survey:
@@ -37,13 +208,10 @@ class Survey:
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
         self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
         self.sources = find_sources(plan.readers)
+        self.paths = [source.path for source in self.sources]
         others = named_files([*plan.head, *plan.tail])
         #: What inputs, and other files that stages read, were like when the run began.
         self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
-        if any("t_srs" in reader for reader in plan.readers):
-            self.messages.append(
-                "readers.tindex: in tiles points keep the reference of their file, t_srs is left out"
-            )
         self._read_headers()
         files = all(source.kind == "las" for source in self.sources)
         if options.per == "file" and not files:
@@ -78,18 +246,11 @@ class Survey:
         self.messages += odd[:_ODD]
         if len(odd) > _ODD:
             self.messages.append(f"so it is with {len(odd) - _ODD:,} more inputs: their headers are odd, too")
-        if len(self.unreadable) == len(self.sources):
-            raise self._none_readable()
         if lost := len(self.sources) - len(self.extents):
             self.messages.append(
                 f"{lost:,} of the inputs without a readable header: where they lie is not known, and tiles beside them may "
                 "lack neighbors. Once they can be read, --resume runs those tiles again"
             )
-
-    def _none_readable(self) -> StageError:
-        return StageError(
-            "none of the inputs can be read", found=next(iter(self.unreadable.values()), "no input")
-        )
 
     def _unit(self, plan: TilePlan) -> float:
         """Meters per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
@@ -97,9 +258,8 @@ class Survey:
         groups: dict[str, list[InputSource]] = {}
         for source in self.sources:
             if source.path not in self.unreadable:
-                own = (
-                    read_ept(source.path).get("srs") if source.kind == "ept" else las.projection(source.path)
-                )
+                ept = source.kind == "ept"
+                own = read_ept(source.path).get("srs") if ept else las.projection(source.path)
                 groups.setdefault(fingerprint(source.reader, own), []).append(source)
         found: dict[str, Reference] = {}
         for group in groups.values():
@@ -115,7 +275,8 @@ class Survey:
                     found[source.path] = Reference(Units())  # nobody asks
                     break
         if not found:
-            raise self._none_readable()
+            reasons = iter(self.unreadable.values())
+            raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if needed:
             without = set(check_one_reference(found))
             alike = [[source.path for source in group] for group in groups.values()]
@@ -140,11 +301,6 @@ class Survey:
             boxes.append(index.box if index and index.count else self.extents[source.path].box)
         self._boxes = np.array(boxes, np.float64)
         self.bounds: Box = union(boxes)
-
-    @property
-    def paths(self) -> list[str]:
-        """Of all inputs."""
-        return [source.path for source in self.sources]
 
     @property
     def names(self) -> list[str]:
