@@ -25,9 +25,8 @@ from pdal_stages.alsnet.batches import (
     spread,
 )
 from pdal_stages.alsnet.geometry import build
-from pdal_stages.base import kinds
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.base.kinds import kind_of
+from pdal_stages.base.outputs import CHECKPOINT, kind_of
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 
 needs_torch = pytest.mark.skipif(
@@ -274,7 +273,7 @@ def checkpoint(tmp_path_factory):
     setting = {"configuration": Configuration("least", 64, (level,), head=(4,)), "epochs": 1}
     clouds = [TrainingCloud(xyz, labels, values)]
     fit(clouds, checkpoint=str(path), **setting)
-    assert kind_of(path) == kinds.CHECKPOINT
+    assert kind_of(path) == CHECKPOINT
     return path.read_bytes(), lambda path: fit(clouds, checkpoint=str(path), **setting)
 
 

@@ -24,7 +24,7 @@ import pytest
 import tiling_clouds as clouds
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.threads import available_threads
+from pdal_stages.base.resources import available_threads
 from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform
 from pdal_stages.tiling import cluster as dask_cluster

@@ -14,7 +14,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from pdal_stages.base.hashing import coordinate_hash
+from pdal_stages.base.arrays import coordinate_hash
 from pdal_stages.terrain import filtered_ground
 
 GROUND, VEGETATION, BUILDING = 2, 5, 6

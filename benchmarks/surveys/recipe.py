@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without_returns
 
-from pdal_stages.base.hashing import coordinate_hash
+from pdal_stages.base.arrays import coordinate_hash
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.features.voxels import represent
 from pdal_stages.stages.preparation import PREPARATION

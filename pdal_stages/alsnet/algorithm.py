@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
-from ..base.threads import map_blocks, resolve_threads
+from ..base.resources import map_blocks, resolve_threads
 from ..classifier.algorithms import ArrayRule, Block, Column, InputPlan, PredictRequest
 from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from ..base.hashing import coordinate_hash
+from ..base.arrays import coordinate_hash
 from ..base.jit import njit
 from .configuration import Configuration
 

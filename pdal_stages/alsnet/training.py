@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base import kinds
+from ..base.arrays import coordinate_hash
 from ..base.errors import DependencyError, ModelError, OptionError
 from ..base.files import write_whole
-from ..base.hashing import coordinate_hash
-from ..base.outputs import Output
+from ..base.outputs import CHECKPOINT, Output
 from ..base.progress import Progress
-from ..base.threads import map_blocks, resolve_threads
+from ..base.resources import map_blocks, resolve_threads
 from ..base.version import __version__
 from ..classifier.classes import ClassMap
 from ..classifier.clouds import TrainingCloud, densities, label_classes
@@ -51,7 +50,7 @@ reports_training = True
 def outputs(options: TrainingOptions) -> list[Output]:
     """The checkpoint, if one is wanted."""
     path = options.alsnet.checkpoint
-    return [Output(path, "checkpoint", kinds.CHECKPOINT)] if path else []
+    return [Output(path, "checkpoint", CHECKPOINT)] if path else []
 
 
 def own_options(given: Any) -> NetworkOptions:

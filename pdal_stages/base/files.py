@@ -23,85 +23,13 @@ from pathlib import Path
 from typing import Any
 
 from .errors import StageError
-from .kinds import kind_of
+from .outputs import check_writable, is_stream, kind_of, real_path
 
 #: How the hidden folders' names begin.
 PREFIX = ".pdal-stages-partial-"
 #: What the system says where a file has no room, or none is left to this user.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-#: Bytes a file's name may have, on every usual file system.
-_LONGEST_NAME = 255
 _swept: set[str] = set()
-
-
-def check_writable(path: str | os.PathLike, what: str = "output", kind: str = "") -> None:
-    """Refuse an output that cannot be written, before any work is done.
-
-    Parameters
-    ----------
-    path : path
-    what : str
-        What messages call it.
-    kind : str
-        The kind of file it will be, one of :mod:`pdal_stages.base.kinds`, where that is known.
-
-    Raises
-    ------
-    StageError
-        If its folder is missing or read-only, its name is too long, or what is there must not be replaced: a folder, a
-        write-protected file, a file that is known to be of another kind.
-    """
-    if is_stream(path):
-        if not os.access(path, os.W_OK) or stat.S_IFMT(os.stat(path).st_mode) in (
-            stat.S_IFBLK,
-            stat.S_IFSOCK,
-        ):
-            raise StageError(f"the {what} file is a device that cannot be written to", found=str(path))
-        return
-    real = _real(path)
-    if len(real.name.encode(errors="surrogateescape")) > _LONGEST_NAME:
-        raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
-    if not real.parent.is_dir():
-        cure = "Create it first"
-        if not str(real.parent).isascii() and sys.getfilesystemencoding() != "utf-8":
-            cure = _locale_cure()
-        raise StageError(f"the folder of the {what} file does not exist", found=str(real.parent), cure=cure)
-    if real.is_symlink():
-        raise StageError(f"the {what} file is a link that leads to itself", found=str(path))
-    if real.is_dir():
-        raise StageError(f"the {what} file names a folder", found=str(path), cure="Give a file name")
-    if not os.access(real.parent, os.W_OK):
-        raise StageError(f"the folder of the {what} file cannot be written to", found=str(real.parent))
-    if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
-        cure = "Give another name, or change its mode"
-        raise StageError(f"the {what} file is write-protected", found=str(path), cure=cure)
-    older = kind_of(real) if kind else ""
-    if older and older != kind:
-        cure = "Give another name, or remove that file first"
-        raise StageError(f"the {what} file would replace {older}", found=str(path), cure=cure)
-
-
-def is_stream(path: str | os.PathLike) -> bool:
-    """Whether a name stands for something to write into: a device, a pipe, or what this process has open."""
-    try:
-        kind = stat.S_IFMT(os.stat(path).st_mode)
-    except (OSError, ValueError):
-        return False
-    opened = os.path.abspath(path).startswith(("/dev/std", "/dev/fd/", "/proc/"))
-    return kind not in (stat.S_IFREG, stat.S_IFDIR) or (kind == stat.S_IFREG and opened)
-
-
-def _real(path: str | os.PathLike) -> Path:
-    """The file that a name leads to."""
-    try:
-        return Path(os.path.realpath(path))
-    except UnicodeEncodeError as error:
-        what = "the name of the file cannot be written in this locale"
-        raise StageError(what, found=ascii(str(path)), cure=_locale_cure()) from error
-
-
-def _locale_cure() -> str:
-    return f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}"
 
 
 def open_to_append(path: str | os.PathLike) -> Any:
@@ -111,7 +39,9 @@ def open_to_append(path: str | os.PathLike) -> Any:
     ------
     OSError
     """
-    return open(path if is_stream(path) else _real(path), "a", encoding="utf-8", errors="backslashreplace")
+    return open(
+        path if is_stream(path) else real_path(path), "a", encoding="utf-8", errors="backslashreplace"
+    )
 
 
 def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -> Path:
@@ -197,7 +127,7 @@ class _Place:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        parent = Path(tempfile.gettempdir()) if is_stream(path) else _real(path).parent
+        parent = Path(tempfile.gettempdir()) if is_stream(path) else real_path(path).parent
         if str(parent) not in _swept:
             _swept.add(str(parent))
             sweep(parent)
@@ -224,7 +154,7 @@ def _give_name(made: Path, target: Path) -> None:
         with open(made, "rb") as file:
             _pour(file, target)
         return
-    real = _real(target)
+    real = real_path(target)
     with contextlib.suppress(FileNotFoundError):
         older = real.stat()
         if hasattr(os, "chown") and (older.st_uid, older.st_gid) != (os.geteuid(), os.getegid()):

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.arrays import begins_run, coordinate_hash
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
-from ..base.hashing import coordinate_hash
 from ..base.progress import Progress
-from ..base.runs import begins_run
 from ..features.cells import cell_keys
 from ..features.voxels import represent
 from .classes import MAX_LABEL, ClassMap, as_labels

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from ..base.threads import map_blocks
+from ..base.resources import map_blocks
 from ..features.cells import WHOLE, cell_keys, cell_means, take_means
 from ..features.neighborhoods import SIDES
 

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, OptionError
-from ..base.memory import free_memory
 from ..base.outputs import Output
 from ..base.progress import Progress
+from ..base.resources import free_memory
 from ..base.version import __version__
 from ..features.engine import fit_clouds
 from ..features.returns import SOURCES

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.runs import begins_run
-from ..base.threads import map_blocks
+from ..base.arrays import begins_run
+from ..base.resources import map_blocks
 from ..features import FeaturePlan
 from ..features.index import cell_numbers
 from .algorithms import Block, InputPlan, PredictRequest

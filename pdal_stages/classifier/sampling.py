@@ -15,8 +15,8 @@ from zlib import crc32
 import numpy as np
 import numpy.typing as npt
 
+from ..base.arrays import coordinate_hash
 from ..base.errors import OptionError
-from ..base.hashing import coordinate_hash
 from ..base.progress import Progress
 
 #: Side of a cell of the curve in meters.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..base.errors import ModelError, OptionError
-from ..base.plain import one_line
+from ..base.messages import one_line
 from .algorithms import REFINED, Column
 
 #: The dimension in which the command `train` numbers its files.

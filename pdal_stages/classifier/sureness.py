@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
-from ..base.plain import one_line
+from ..base.messages import one_line
 
 #: Reliabilities are counted in so many bins from 0 to 1, the last of which holds 1.
 BINS = 64

@@ -13,7 +13,7 @@ import numpy as np
 from ..base import checks
 from ..base.asprs import NOISE
 from ..base.errors import OptionError, suggest
-from ..base.threads import resolve_threads
+from ..base.resources import resolve_threads
 from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
 from .algorithms import ALGORITHMS, trainer

@@ -9,9 +9,8 @@ import sys
 from collections.abc import Sequence
 
 from ..base.errors import StageError
+from ..base.messages import LoggedStream, PlainStream, RunLog, print_messages
 from ..base.outputs import Output, check_outputs
-from ..base.plain import PlainStream, print_messages
-from ..base.runlog import LoggedStream, RunLog
 from ..base.version import __version__
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..base.plain import print_messages
+from ..base.messages import print_messages
 from ..tiling.command import add_arguments
 from ..tiling.objects import add_arguments as add_objects_arguments
 from .parser import INPUTS, Parser, switch

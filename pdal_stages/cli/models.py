@@ -6,10 +6,9 @@ import argparse
 import json
 from pathlib import Path
 
-from ..base import kinds
 from ..base.errors import StageError
-from ..base.outputs import Output, check_outputs
-from ..base.plain import print_messages
+from ..base.messages import print_messages
+from ..base.outputs import HTML, JSON, Output, check_outputs
 from ..tiling.command import add_tile_arguments
 from .parser import INPUTS, OVERRIDES, Parser
 
@@ -189,7 +188,7 @@ def _compare_objects(options: argparse.Namespace) -> None:
             found=", ".join(options.inputs),
         )
     found, reference = options.inputs[0], options.objects
-    pages = {"json": kinds.JSON, "html": kinds.HTML}
+    pages = {"json": JSON, "html": HTML}
     outputs = [Output(path, k, kind) for k, kind in pages.items() if (path := getattr(options, k))]
     check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
     figures, one, two = objectaccuracy.compare_objects(found, reference, options.area)
@@ -211,7 +210,7 @@ def _model(options: argparse.Namespace) -> None:
     if options.html:
         from ..reports.modelpage import write_model_report
 
-        check_outputs([Output(options.html, "html", kinds.HTML)], [options.file])
+        check_outputs([Output(options.html, "html", HTML)], [options.file])
         write_model_report(options.html, model, Path(options.file).name)
     if options.showjson:
         print(json.dumps(model.describe(), indent=2, default=str))

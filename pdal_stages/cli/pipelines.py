@@ -10,11 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..base import kinds
 from ..base.errors import StageError
 from ..base.files import write_whole
-from ..base.outputs import Output, check_outputs
-from ..base.plain import print_messages
+from ..base.messages import print_messages
+from ..base.outputs import JSON, Output, check_outputs
 from ..tiling.command import add_arguments
 from .parser import Parser
 
@@ -93,7 +92,7 @@ def executed(options: argparse.Namespace, pipeline: Pipeline) -> list[str]:
 
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
     more = [Output(options.log, "log")] if options.log else []
-    pipeline.check_outputs(*more, *([Output(metadata, "metadata", kinds.JSON)] if metadata else []))
+    pipeline.check_outputs(*more, *([Output(metadata, "metadata", JSON)] if metadata else []))
     before = list(pipeline.lowered.warnings)
     print_messages(*before)
     end_at_once(options)
@@ -112,7 +111,7 @@ def _expand(options: argparse.Namespace) -> None:
     pipeline = _built(options)
     text = pipeline.json + "\n"
     if options.output:
-        check_outputs([Output(options.output, "output", kinds.JSON)], pipeline.inputs())
+        check_outputs([Output(options.output, "output", JSON)], pipeline.inputs())
         write_whole(options.output, text.encode())
     else:
         sys.stdout.write(text)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..base.jit import device, njit
-from ..base.threads import map_blocks
+from ..base.resources import map_blocks
 from .bins import ShapeBins
 from .entropy import add_up, eigenvalues_of, lowest_entropy, make_sums, write_moments
 from .index import CellGrid

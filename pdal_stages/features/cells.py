@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.arrays import begins_run
 from ..base.jit import njit
-from ..base.runs import begins_run
 from .index import cell_numbers
 
 #: Points whose cells are numbered in one go: they stay in a core's cache.

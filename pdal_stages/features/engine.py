@@ -13,7 +13,7 @@ from ..base import checks
 from ..base.errors import DimensionError, OptionError, StageError
 from ..base.progress import Progress
 from ..base.report import Report
-from ..base.threads import map_blocks, resolve_threads
+from ..base.resources import map_blocks, resolve_threads
 from .bins import ShapeBins
 from .index import CellGrid, build_grid, check_xyz
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan

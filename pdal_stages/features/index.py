@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..base.arrays import begins_run
 from ..base.errors import StageError
 from ..base.jit import device, njit
-from ..base.runs import begins_run
 
 #: Coordinates beyond this many meters are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import device, njit
-from ..base.threads import map_blocks
+from ..base.resources import map_blocks
 
 #: A leaf holds at most this many points.
 LEAF = 24

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.hashing import GOLDEN, finalise
+from ..base.arrays import GOLDEN, finalise
 from ..base.jit import device, njit
 from .bins import ShapeBins
 from .names import SHAPE_FEATURES

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.arrays import hash_of
 from ..base.errors import OptionError
-from ..base.hashing import hash_of
 from ..base.jit import njit
 from .cells import cell_keys
 

@@ -7,8 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from ..base import kinds
-from ..base.outputs import Output
+from ..base.outputs import LAS, Output
 from ..classifier.modelfile import find
 from ..stages.base import Stage
 
@@ -104,7 +103,7 @@ def writes_las(writer: dict[str, Any]) -> bool:
 def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:
     """Files that PDAL's writers write."""
     writers = [stage for stage in stages if is_writer(stage, stages)]
-    return [Output(s["filename"], "output", kinds.LAS if writes_las(s) else "") for s in writers]
+    return [Output(s["filename"], "output", LAS if writes_las(s) else "") for s in writers]
 
 
 def with_outputs(stages: list[dict[str, Any]], names: list[Any]) -> list[dict[str, Any]]:

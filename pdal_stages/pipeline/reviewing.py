@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..accuracy.expected import Patches, ReviewCells, find_patches, side_for
-from ..base import checks, kinds
+from ..base import checks
 from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.las import read_header
-from ..base.outputs import Output, check_outputs
-from ..base.plain import print_messages
+from ..base.messages import print_messages
+from ..base.outputs import HTML, JSON, Output, check_outputs
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..classifier.modelfile import STANDARD
@@ -203,7 +203,7 @@ def write_review(
 ) -> Review:
     """Review files, and write a vector file, a page and figures; `how`: see :func:`review_files`."""
     check_target(output, LAYERS)
-    pages = {"html": (html, kinds.HTML), "json": (json_file, kinds.JSON)}
+    pages = {"html": (html, HTML), "json": (json_file, JSON)}
     outputs = [Output(path, what, kind) for what, (path, kind) in pages.items() if path]
     check_outputs([Output(output, "review"), *outputs], [*input_files(inputs), *inputs])
     found = review_files(inputs, **how)

@@ -21,9 +21,8 @@ from typing import Any
 from ..base import checks
 from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
-from ..base.plain import PlainStream
-from ..base.runlog import LoggedStream
-from ..base.threads import CORES, available_threads
+from ..base.messages import LoggedStream, PlainStream
+from ..base.resources import CORES, available_threads
 from .interrupts import check, gentle
 
 #: Of a worker that died.

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from ..base.errors import PipelineError, StageError, how_to_add
 from ..base.jit import kept_kernels
-from ..base.memory import free_memory
-from ..base.threads import available_threads
+from ..base.resources import available_threads, free_memory
 from ..base.version import __version__
 from ..classifier.modelfile import STANDARD
 from ..pipeline import pdal as pdal_env

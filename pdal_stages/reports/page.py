@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..accuracy.text import percent
 from ..base.asprs import class_color
-from ..base.plain import plain
+from ..base.messages import plain
 from ..base.version import __version__
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.plain import one_line
+from ..base.messages import one_line
 from .objectlayers import qml
 from .page import duration, render
 

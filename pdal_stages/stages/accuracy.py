@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
-from ..base import kinds
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import check_writable, write_whole
-from ..base.outputs import Output
-from ..base.plain import plain
+from ..base.messages import plain
+from ..base.outputs import HTML, JSON, Output
 from ..base.report import Report
 from ..base.units import name_of_wkt
 from .base import Stage, files_read
@@ -123,7 +122,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
             loaded_model(self.model_file)
 
     def outputs(self) -> list[Output]:
-        found = [(self.json, "json", kinds.JSON), (self.html, "html", kinds.HTML)]
+        found = [(self.json, "json", JSON), (self.html, "html", HTML)]
         return [Output(path, what, kind) for path, what, kind in found if path]
 
     def reads(self) -> list[str]:

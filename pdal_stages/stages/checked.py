@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import coordinate_hash
 from ..base.errors import StageError
-from ..base.hashing import coordinate_hash
 from ..base.report import Report
 from ..classifier.dimensions import CHECKED
 

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import kinds
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.files import check_writable
-from ..base.outputs import Output
+from ..base.outputs import MODEL, Output
 from ..base.report import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, trainer
@@ -217,7 +216,7 @@ classes.
             check_writable(output.path, output.what, output.kind)
 
     def outputs(self) -> list[Output]:
-        return [Output(self.filename, "model", kinds.MODEL), *self._trainer.outputs(self.training)]
+        return [Output(self.filename, "model", MODEL), *self._trainer.outputs(self.training)]
 
     def reads(self) -> list[str]:
         own = [name for name in (self.survey, self.groups) if name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numpy.typing import NDArray
 
-from ..base.vegetation import bands
+from ..base.asprs import bands
 from ..objects.consistency import RULES, consistent, reach
 from .base import Stage
 from .options import ignore_option, keep_option, option, vegetation_heights_option

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import HIGH as HIGH_VEGETATION
+from ..base.asprs import LOW, MEDIUM, bands, by_height
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
-from ..base.vegetation import HIGH as HIGH_VEGETATION
-from ..base.vegetation import LOW, MEDIUM, bands, by_height
 from ..classifier import Model, Prediction
 from ..classifier.deciding import UNCLASSIFIED
 from ..classifier.modelfile import find

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import kinds, strictjson
+from ..base import strictjson
 from ..base.errors import OptionError, StageError
 from ..base.files import write_whole
-from ..base.outputs import Output
+from ..base.outputs import JSON, Output
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.neighborhoods import parse_neighborhoods
@@ -111,7 +111,7 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
                 )
 
     def outputs(self) -> list[Output]:
-        return [Output(self.bins, "bins", kinds.JSON)] if self.bins and not Path(self.bins).exists() else []
+        return [Output(self.bins, "bins", JSON)] if self.bins and not Path(self.bins).exists() else []
 
     def creates(self) -> dict[str, str]:
         return dict.fromkeys(self.columns, "float")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, StageError
-from ..base.memory import give_back
 from ..base.report import Report
+from ..base.resources import give_back
 from ..base.units import Units, reprojection_cure, units_of_wkt
 from .selection import Selection
 from .where import Expression

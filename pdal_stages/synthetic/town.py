@@ -12,7 +12,7 @@ import numpy as np
 from ..base import checks
 from ..base.errors import OptionError, suggest
 from ..base.progress import Progress
-from ..base.threads import map_blocks
+from ..base.resources import map_blocks
 from .districts import fill
 from .solids import VEGETATION, build_scene, cast
 from .townplan import block_at, heights, plan_town

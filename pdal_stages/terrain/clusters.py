@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.runs import begins_run
+from ..base.arrays import begins_run
 from .linked import longest_sides, sums_around
 
 #: Side of a voxel, meters.

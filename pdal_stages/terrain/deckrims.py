@@ -7,8 +7,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from ..base.unionfind import root as root_of
-from .linked import longest_sides, sums_around
+from .linked import longest_sides, root_of, sums_around
 from .walkable import (
     ACROSS,
     AHEAD,

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base.arrays import begins_run
 from ..base.asprs import NOISE
 from ..base.errors import StageError
 from ..base.jit import device, njit
-from ..base.runs import begins_run
 from .belowground import AROUND, ENOUGH, below_ground
 from .belowground import reach as below_reach
 from .clusters import BITS, BLOCK, CLUSTER_REACH, SCALES, SIDE, Voxels, small_clusters, surroundings

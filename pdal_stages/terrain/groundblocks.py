@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.runs import begins_run
+from ..base.arrays import begins_run
 from .decks import decks_of_levels, levels_near_decks
 from .groundcells import (
     BLOCK_SIDE,

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import begins_run
 from ..base.jit import njit
-from ..base.runs import begins_run
 from .belowground import pits, pits_reach
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH

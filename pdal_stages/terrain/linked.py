@@ -7,9 +7,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import njit
-from ..base.unionfind import root as root_of
+from ..base.jit import device, njit
 from .openings import HOLE
+
+
+@device
+def root_of(parent, member):
+    """The member that stands for a set, in sets that are joined one by one; the way to it gets shorter for who asks next."""
+    while parent[member] != member:
+        parent[member] = parent[parent[member]]
+        member = parent[member]
+    return member
 
 
 @njit

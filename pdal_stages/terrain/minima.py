@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
+from ..base.arrays import begins_run
 from ..base.errors import NoTerrainError, OptionError, StageError
-from ..base.runs import begins_run
 from .columns import columns
 
 #: Largest cell index either side of zero; beyond it coordinates cannot be terrain.

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import OptionError, StageError
-from ..base.threads import map_blocks
+from ..base.resources import map_blocks
 from .columns import columns
 from .decks import decks_of_levels, find_decks
 from .groundcells import FAR, NEAR, CellMeans, FilterOptions, GroundCells, GroundRaster, ground_raster

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.runs import begins_run
+from ..base.arrays import begins_run
 
 #: The largest raster that is made in one piece, in cells; else squares of this side plus the reach.
 LARGEST, SIDE = 2048 * 2048, 1024

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base import checks, kinds, las
+from ..base import checks, las
 from ..base.errors import StageError
-from ..base.outputs import Output, check_outputs
+from ..base.outputs import MODEL, Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_las
 from ..stages.loading import digest_of, load_model
@@ -68,7 +68,7 @@ class AdaptTask:
         """
         sure = checks.number("'--sure'", self.sure, 0.0, 1.0)
         teacher, files = load_model(self.teacher), input_files(self.inputs)
-        check_outputs([Output(self.model, "model", kinds.MODEL)], files)
+        check_outputs([Output(self.model, "model", MODEL)], files)
         chosen, told = spread(files)
         model = Path(self.model).absolute()
         place = model.parent if model.is_file() or not model.exists() else None  # not beside a device

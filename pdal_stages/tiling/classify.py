@@ -10,10 +10,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..base import kinds, las
+from ..base import las
 from ..base.errors import OptionError, StageError
 from ..base.files import write_whole
-from ..base.outputs import Output, check_outputs
+from ..base.outputs import JSON, Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
 from ..pipeline.run import Pipeline
@@ -159,7 +159,7 @@ class ClassifyTask:
         plan = self.plan()
         if not dry_run:
             self._make_folders(outputs)
-        more = [("metadata", self.metadata, kinds.JSON), ("log", self.log, "")]
+        more = [("metadata", self.metadata, JSON), ("log", self.log, "")]
         check_outputs([Output(name, what, kind) for what, name, kind in more if name], self.files)
 
         def finished_one(job: Job) -> None:
@@ -208,7 +208,7 @@ def classify_file(
 ) -> Written:
     """Classify a file in one piece; `metadata` and `log` are files that are written beside."""
     pipeline = request.pipeline(source, target)
-    more = [("log", log, ""), ("metadata", metadata, kinds.JSON)]
+    more = [("log", log, ""), ("metadata", metadata, JSON)]
     pipeline.check_outputs(*(Output(name, what, kind) for what, name, kind in more if name))
     count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
     if metadata:

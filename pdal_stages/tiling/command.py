@@ -16,8 +16,8 @@ from pathlib import Path
 from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
 from ..base.files import check_writable, write_whole
-from ..base.memory import parse_size
-from ..base.plain import one_line, print_messages
+from ..base.messages import one_line, print_messages
+from ..base.resources import parse_size
 from ..pipeline.inputs_outputs import is_ept, is_folder, is_las
 from ..pipeline.read import PipelineSource
 from ..pipeline.run import Pipeline

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import kinds
 from ..base.errors import OptionError, StageError
 from ..base.files import write_whole
-from ..base.outputs import Output, check_outputs
-from ..base.plain import print_messages
+from ..base.messages import print_messages
+from ..base.outputs import JSON, Output, check_outputs
 from ..base.progress import Progress
 from ..base.units import Units
 from ..base.version import __version__
@@ -66,7 +65,7 @@ def run_command(options: argparse.Namespace) -> int:
     check_target(options.output)
     inputs = input_files(options.inputs)
     print_messages(*overlooked(options.inputs))
-    more = [Output(options.metadata, "metadata", kinds.JSON)] if options.metadata else []
+    more = [Output(options.metadata, "metadata", JSON)] if options.metadata else []
     check_outputs(
         [*(Output(str(file), "objects") for file in target_files(options.output)), *more],
         [*inputs, *options.inputs],

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import begins_run
 from ..base.errors import StageError
-from ..base.runs import begins_run
 from ..pipeline.parts import las_chunks
 from .grid import Box, TileGrid, check_number
 from .inputs import InputSource, fetch_ept

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..base import kinds
 from ..base.errors import PipelineError, StageError
-from ..base.outputs import Output, check_outputs
+from ..base.outputs import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
 from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
@@ -330,7 +329,7 @@ def outputs_for(plan: TilePlan, names: list[str], inputs: Iterable[str]) -> list
             raise PipelineError(
                 "'#' goes into the file's name, not its folder", where=writer["type"], found=str(path)
             )
-        kind = kinds.LAS if writes_las(writer) else ""
+        kind = LAS if writes_las(writer) else ""
         path = path.absolute()
         found.append([Output(str(path.parent / path.name.replace("#", n)), "output", kind) for n in names])
     flat = [output for outputs in found for output in outputs]

@@ -16,7 +16,7 @@ from ..base import lascheck
 from ..base.errors import DependencyError, StageError
 from ..base.files import sweep
 from ..base.jit import kept_kernels
-from ..base.plain import print_messages
+from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
 from ..pipeline.las_output import files_with_flags_to_split

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 from ..base import checks
 from ..base.errors import OptionError
-from ..base.memory import free_memory
-from ..base.threads import available_threads
+from ..base.resources import available_threads, free_memory
 from ..stages.base import Blocks
 from .grid import Box
 

@@ -1,4 +1,4 @@
-"""Numbers that look random and follow from what is hashed alone: splitmix64 (Steele, Lea, Flood 2014).
+"""Runs of equal values, and hashes that follow from what is hashed alone: splitmix64 (Steele, Lea, Flood 2014).
 
 :func:`finalise` serves NumPy arrays as it is, and kernels through ``njit(forceinline=True)(finalise)``.
 """
@@ -10,6 +10,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+
+def begins_run(ascending: npt.NDArray) -> npt.NDArray[np.bool_]:
+    """Which values of a sorted array (n,) are not those before them."""
+    new = np.ones(len(ascending), np.bool_)
+    np.not_equal(ascending[1:], ascending[:-1], out=new[1:])
+    return new
+
 
 #: Values hashed in one go: they stay in a core's cache, and take no memory to speak of.
 _TOGETHER = 1 << 16

@@ -1,17 +1,88 @@
-"""How much memory there is, sizes of memory as people write them, and memory given back."""
+"""What the machine offers: threads over blocks of work, stopping at once on Ctrl-C, and memory.
+
+Kernels are compiled with ``nogil``, so plain Python threads use every core. numba's own parallel loops are not used: its
+portable threading layer aborts the process when two Python threads enter it together, and users do run pipelines in threads.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import math
 import mmap
 import os
 import re
 import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from . import checks
 from .errors import OptionError
+
+#: Where a cgroup of version 2, and one of version 1, says how many microseconds of CPU it may use in how many.
+_QUOTAS = ("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")
+
+#: By which a worker is told how many cores are its own; joblib, and so scikit-learn, heeds it too.
+CORES = "LOKY_MAX_CPU_COUNT"
+
+
+@cache
+def available_threads() -> int:
+    """Cores this process may use: its CPU affinity, bounded by a cgroup quota and by :data:`CORES`."""
+    bounds = [os.cpu_count() or 1, *_quota()]
+    if hasattr(os, "sched_getaffinity"):
+        bounds.append(len(os.sched_getaffinity(0)))
+    with contextlib.suppress(ValueError):
+        bounds.append(int(os.environ.get(CORES, "")))
+    return max(1, min(bounds))
+
+
+def _quota(folder: str = "/sys/fs/cgroup") -> Iterator[int]:
+    """The cores that a cgroup's quota is worth, where there is one."""
+    for files in _QUOTAS:
+        with contextlib.suppress(OSError, ValueError, ArithmeticError):  # no such file; "max": no bound
+            quota, period = (int(word) for file in files for word in Path(folder, file).read_text().split())
+            if quota > 0:
+                yield math.ceil(quota / period)
+
+
+def resolve_threads(threads: int | None) -> int:
+    """``None`` or 0: every core on offer; a positive number: that many."""
+    if threads is None or (threads == 0 and not isinstance(threads, bool)):
+        return available_threads()
+    return checks.whole("'threads'", threads, 0)
+
+
+def map_blocks(
+    function: Callable[[Any], Any], blocks: Sequence[Any], threads: int | None = None, ahead: int = 2
+) -> Iterator[Any]:
+    """Yield ``function(block)`` for every block, in order, computed by several `threads`; it should release the GIL.
+
+    At most ``threads * ahead`` results wait unread, so memory stays bounded when the reader is slower than the workers. An
+    exception (Ctrl-C too) stops handing out blocks and is raised once the blocks in work are finished.
+    """
+    count = resolve_threads(threads)
+    if count == 1 or len(blocks) <= 1:
+        yield from map(function, blocks)
+        return
+    pool = ThreadPoolExecutor(count, thread_name_prefix="pdal-stages")
+    pending: deque[Future] = deque()
+    try:
+        for block in blocks:
+            pending.append(pool.submit(function, block))
+            if len(pending) == count * ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
 
 #: Bytes of each unit, by its first letter.
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}

@@ -1,9 +1,11 @@
-"""The log file of a run: what was asked for, what was said, how it ended."""
+"""What a command says: text that is safe for terminals, and the log file of a run."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 import shlex
+import sys
 import threading
 import time
 from collections.abc import Iterable, Sequence
@@ -11,9 +13,44 @@ from typing import Any
 
 from .errors import StageError
 from .files import open_to_append
-from .kinds import kind_of
-from .plain import one_line
+from .outputs import kind_of
 from .version import __version__
+
+_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def plain(text: str) -> str:
+    """Text with such characters written as their codes; only line breaks and tabs stay."""
+    return _COMMANDS.sub(lambda match: ascii(match.group())[1:-1], text)
+
+
+def one_line(text: str) -> str:
+    """The same with line breaks as codes too, so that a name cannot pass for lines of its own."""
+    return plain(text).replace("\n", "\\n")
+
+
+def print_messages(*lines: str) -> None:
+    """Print messages for the user on standard error, as the command does."""
+    for line in lines:
+        print(f"pdal-stages: {line}", file=sys.stderr)
+
+
+class PlainStream:
+    """A text stream whose text is :func:`plain`; all else is the stream's."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        self.stream.write(plain(text))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
 
 
 class RunLog:
