@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from importlib import metadata as packages
 
 import laspy
@@ -91,26 +90,6 @@ def test_copc_is_written(cloud, tmp_path):
     assert 0 < len(read) < len(before) and read["X"].max() <= 500_010
 
 
-def test_las_14_unless_told_otherwise(cloud, tmp_path, wide_model):
-    needs(2, 8, 0)
-    assert pdal_env.las_writer_defaults() == (4, 7)
-    out = tmp_path / "out.las"
-    ps.run_pipeline([str(cloud), {"type": "filters.modelclassifier", "model": str(wide_model)}, str(out)])
-    las = laspy.read(out)
-    assert (las.header.version.minor, las.header.point_format.id) == (4, 7)
-    assert set(np.unique(las.classification)) == {2, 64}
-
-
-@pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_classes_above_31(cloud, tmp_path, wide_model, suffix):
-    if suffix == "laz":
-        needs(2, 3, 0)
-    out = tmp_path / f"out.{suffix}"
-    writer = {"type": "writers.las", "filename": str(out), "forward": "all"}
-    ps.run_pipeline([str(cloud), {"type": "filters.modelclassifier", "model": str(wide_model)}, writer])
-    assert set(np.unique(laspy.read(out).classification)) == {2, 64}
-
-
 @pytest.mark.parametrize("point_format", [1, 6])
 def test_flags_are_dimensions_of_their_own(tmp_path, write_las, wide_model, point_format):
     needs(2, 6, 0)
@@ -182,16 +161,6 @@ def test_objects_say_what_they_are(pdal_module):
     assert python["pdalargs"]["options"] == {"cell": 15}
     shown = repr(next(s for s in made.stages if s.type == "filters.python"))
     assert "filters.hag_minima" in shown and "cell=15" in shown and "def stage" not in shown
-
-
-def test_arrays_and_logs(pdal_module):
-    points = np.zeros(400, [("X", "f8"), ("Y", "f8"), ("Z", "f8")])
-    points["X"], points["Y"] = np.random.default_rng(0).uniform(0, 30, (2, 400))
-    pipeline = pdal_module.Pipeline(ps.Filter.hag_minima().stages, arrays=[points])
-    pipeline.loglevel = logging.DEBUG
-    assert pipeline.execute() == 400
-    assert "filters.python" in pipeline.log
-    assert np.allclose(pipeline.arrays[0]["HeightAboveGround"], 0)
 
 
 def test_what_cannot_stream_says_so(cloud, pdal_module):

@@ -21,7 +21,6 @@ import pytest
 
 from pdal_stages.base.version import __version__
 from pdal_stages.cli import main
-from pdal_stages.synthetic import TownOptions, write_town
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = ROOT / "qgis" / "pdal_stages"
@@ -274,11 +273,9 @@ def session(around, profile):
     return run
 
 
-@pytest.fixture(scope="module")
-def town(tmp_path_factory):
-    path = tmp_path_factory.mktemp("town") / "town.laz"
-    write_town(TownOptions(size=60.0, density=4.0, seed=3), path)
-    return path
+@pytest.fixture
+def town(ready_town):
+    return ready_town
 
 
 @needs_qgis
