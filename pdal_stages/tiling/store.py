@@ -122,7 +122,7 @@ class Store:
     def finished(self, name: str, mark: str) -> dict[str, Any] | None:
         """What was noted, where `mark` is still the same and the files that were written are there unchanged."""
         found = self.note(name)
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
             files = found.get("outputs", [])
             if found.get("fingerprint") == mark and written([path for path, *_ in files]) == files:
                 return found
