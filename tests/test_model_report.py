@@ -1,6 +1,5 @@
 """The page about a model file: what it shows for a forest and a network, and what odd manifests do to it."""
 
-import json
 import re
 from html.parser import HTMLParser
 
@@ -9,7 +8,6 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.cli import main
-from pdal_stages.reports.modelpage import model_page
 
 
 class _Balance(HTMLParser):
@@ -54,30 +52,4 @@ def test_a_forest(searched, tmp_path, capsys):
     row = searched.info["accuracy"]["cross_validation"]["chosen"]
     assert f"{100 * row['overall_accuracy']:.1f}" in words
     assert "Prior factor" in words and not re.search(r"\d\.\d{7,}", words)
-    assert "By neighborhood" in words and "Epoch" not in words and "random_forest" in said
-
-
-@pytest.mark.parametrize(
-    ("curve", "shown"),
-    [
-        ([{"epoch": 1, "loss": 1.2, "mean_f1": 0.4}, {"epoch": 2, "loss": 0.7, "mean_f1": 0.625}], "62.5 %"),
-        ([{"epoch": 1, "loss": 1.0}, {"epoch": 2, "loss": 0.0}], "Best: 0 in epoch 2"),
-        ([{"epoch": 1, "loss": 0.5}], None),
-        ([{"epoch": "<b>", "loss": float("nan")}, 7, None, {"epoch": 2, "loss": True}], None),
-        ("no list", None),
-    ],
-)
-def test_the_curve_of_a_network(searched, curve, shown):
-    words = read(model_page(_with(searched, curve), "x"))
-    assert ("Epoch" in words) == (shown is not None)
-    assert shown is None or shown in words
-
-
-def _with(model, curve):
-    import copy
-
-    other = copy.copy(model)
-    info = json.loads(json.dumps(model.info))
-    info["training"]["curve"] = curve
-    object.__setattr__(other, "info", info)
-    return other
+    assert "By neighborhood" in words and "random_forest" in said

@@ -98,7 +98,7 @@ def add_commands(parser: Parser) -> None:
     takes = parser.command("model", _model, "Describe a model file")
     takes("file")
     takes("--showjson", action="store_true", help="Everything, as JSON")
-    takes("--html", help="Write a page with its scores, training curve and importances to this file")
+    takes("--html", help="Write a page with its scores and importances to this file")
 
 
 def _models(options: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""A model file as one self-contained HTML page: classes, scores, the curve of a network's training, importances."""
+"""A model file as one self-contained HTML page: classes, scores, importances."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from ..base import checks
 from ..base.files import write_whole
 from ..classifier.summary import held_out, held_out_by
 from .page import render
-
-#: A curve with more is nonsense: the manifest's free parts may hold anything.
-_MOST_EPOCHS = 10**6
 
 if TYPE_CHECKING:
     from ..classifier import Model
@@ -52,7 +49,6 @@ def model_page(model: Model, name: str = "") -> str:
         scores=_scores(described),
         f1=held_out(described).get("f1") or {},
         prior_factors=priors,
-        curves=_curves(described["training"].get("curve")),
         settings=_settings(described),
     )
 
@@ -70,27 +66,6 @@ def _scores(d: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         (title, percent(checks.finite(row.get(key)), 1), "%", detail if key == "overall_accuracy" else "")
         for key, title in titles.items()
     ]
-
-
-def _curves(rows: Any) -> list[dict[str, Any]]:
-    """Loss, and the mean F1 on the ground held out, epoch by epoch: the best value, and of at most 30 epochs a bar each."""
-    rows = [r for r in rows if isinstance(r, dict)] if isinstance(rows, list) else []
-    curves = []
-    for key, title in (("loss", "Loss"), ("mean_f1", "Mean F1 on the ground held out")):
-        pairs = [(checks.finite(r.get("epoch")), checks.finite(r.get(key))) for r in rows]
-        points = sorted((a, b) for a, b in pairs if a is not None and b is not None and 0 < a <= _MOST_EPOCHS)
-        if len(points) < 2:
-            continue
-        most = max(b for _, b in points)
-        epoch, best = (max if key == "mean_f1" else min)(points, key=lambda p: p[1])
-
-        def said(value: float, share: bool = key == "mean_f1") -> str:
-            return f"{100 * value:.1f} %" if share else f"{value:.4g}"
-
-        shown = points[:: max(1, -(-len(points) // 30))]
-        bars = [(f"Epoch {a:g}", max(b / most, 0.0) if most > 0 else 0.0, said(b)) for a, b in shown]
-        curves.append({"heading": title, "caption": f"Best: {said(best)} in epoch {epoch:g}.", "bars": bars})
-    return curves
 
 
 def _settings(d: Mapping[str, Any]) -> dict[str, Any]:

@@ -232,13 +232,9 @@ def test_names_that_command_a_terminal_or_pass_for_lines(command, tmp_path, clou
 
 
 def test_figures_of_any_size(command, tmp_path, model):
-    curve = [
-        {"epoch": e, "loss": v, "mean_f1": v} for e, v in ((0, 1), (10**400, 10**400), (1, 0.5), (-3, -1))
-    ]
     for edit in (
         lambda h, _: (h["training"].update(huge=10**400), h["passes"][0]["parameters"].update(trees=10**400)),
-        lambda h, _: h["training"].update(curve=curve),
-        lambda h, _: h["training"].update(curve=curve[:1] * 2),
+        lambda h, _: h["training"].update(curve=[10**400]),
     ):
         odd, page = repack(model, tmp_path / "odd.model", edit), tmp_path / "page.html"
         done = command("model", odd, "--html", page)
