@@ -93,24 +93,6 @@ def inside_of(
     return points_inside(x, y, shapes), len(shapes), note
 
 
-def lies_elsewhere(overlay: Overlay, wkt: str, box: Box) -> str:
-    """Where a file's polygons lie and where the points do, each in its own reference system, in words."""
-    pyogrio = vector("pyogrio")
-    with reading(overlay.file):
-        info = pyogrio.read_info(overlay.file, layer=overlay.check(), force_total_bounds=True)
-    bounds = info["total_bounds"]
-    if not info["features"] or bounds is None:
-        return f"it holds none, the points lie at {_extent(box, wkt)}"
-    return f"they lie at {_extent(bounds, info['crs'])}, the points at {_extent(box, wkt)}"
-
-
-def _extent(box: Box, crs: str | None) -> str:
-    name = vector("pyproj").CRS.from_user_input(crs).name if crs else "no reference system"
-    digits = 5 if max(map(abs, box)) <= 360 else 0
-    west, south, east, north = (f"{value:.{digits}f}" for value in box)
-    return f"{west} to {east}, {south} to {north} ({name})"
-
-
 def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[list[Any], str]:
     """Polygons near a box, in the reference system of `wkt`, as the box is; and what the user should know.
 

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..objects.outlines import with_vector
-from ..objects.overlay import Overlay, inside_of, lies_elsewhere
+from ..objects.overlay import Overlay, inside_of
 from .base import Stage
 from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
 from .selection import Selection
 
-#: How the warning begins that none of a file's polygons is near the points; what follows `THE_PLACES` is of these points.
-TOUCH_NONE, THE_PLACES = "no polygon is where the points are:", "; "
+#: How the warning begins that none of a file's polygons is near the points.
+TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
 
 
 class Polygons(Stage):
@@ -79,8 +79,7 @@ class a point has.
             counts[f"{name}={overlay.code}"] = {"polygons": polygons, "points": len(found)}
             notes += [note] if note else []
             if not polygons:
-                places = with_vector(lies_elsewhere, overlay, points.wkt, box)
-                points.report.warnings.append(f"{TOUCH_NONE} {name}{THE_PLACES}{places}")
+                points.report.warnings.append(f"{TOUCH_NONE} {name}")
         points.report.figures["polygons"] = counts
         points.report.figures["classes"] = class_counts(codes[change])
         points.report.notes += notes

@@ -21,7 +21,7 @@ from ..pipeline.runtime import points_of
 from ..stages import registry
 from ..stages.base import Left, Stage
 from ..stages.points import HOLDS_NOWHERE
-from ..stages.polygons import THE_PLACES, TOUCH_NONE
+from ..stages.polygons import TOUCH_NONE
 from .grid import Box, TileGrid, inside
 from .inputs import InputSource
 from .outputs import PieceResults, changed_in, class_counts, flags_in_classes, save_results, write_tile
@@ -170,8 +170,8 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     for text in pipeline.messages:
         if text.startswith(scratch) or NO_REFERENCE in text:  # of a piece, as is said of the input
             continue
-        if TOUCH_NONE in text:  # the places differ from tile to tile
-            text = text[text.index(TOUCH_NONE) :].partition(THE_PLACES)[0]
+        if TOUCH_NONE in text:
+            text = text[text.index(TOUCH_NONE) :]
         elif nowhere := _NOWHERE.search(text):
             if nowhere[1] is None:  # the tile has no point of its own: nothing that the user asked for
                 continue
