@@ -43,11 +43,7 @@ COPT_RADII = (0.5, 2.0, 0.05)
 COPT_K = (10, 50)
 
 #: Queries computed at a time for a whole cloud.
-CHUNK = 16_384
-
-#: Estimated cost of one query on one core, nanoseconds, to cut blocks of about equal time.
-NS_QUERY = {"knn": 3000.0, "kopt": 6000.0, "ropt": 6000.0, "copt": 9000.0}
-NS_SHAPES = 2000.0
+CHUNK = 4096
 
 
 def radii_of(first: float, last: float, step: float) -> np.ndarray:
@@ -112,12 +108,6 @@ class AdaptiveNeighborhoods:
         self.tokens = [c.neighborhood.token for c in self.chosen]
         self.columns = columns_of(self.chosen, MOMENT_FEATURES)
         self.surface_columns = columns_of(self.chosen, SURFACES)
-        #: Estimated cost of one query, and memory of one call of :meth:`fill` besides its rows.
-        self.query_ns = sum(_cost(c) for c in self.chosen)
-        most = max(
-            (c.neighborhood.parameters[-1] for c in self.chosen if c.neighborhood.parameters), default=0.0
-        )
-        self.scratch_bytes = 2_000_000 + int(500 * most)
         self.searches = _searches(self.chosen, plan.least_members)
         self.tree = build_tree(grid.x, grid.y, grid.z, threads)
         self._surfaces = np.zeros((0, SURFACE), np.float32)
@@ -215,17 +205,6 @@ class AdaptiveNeighborhoods:
             self.surface_columns, shapes, table, curvature, out,
         )  # fmt: skip
         return table
-
-
-def _cost(columns: Columns) -> float:
-    """Estimated nanoseconds of a query; relative to the usual numbers of neighbors, or the area of the largest radius."""
-    one = columns.neighborhood
-    load = 1.0
-    if one.reach is None:
-        load = max(one.parameters[-1], 20.0) / 100.0
-    elif one.kind == "ropt":
-        load = max(one.parameters[1] / 2.0, 0.5) ** 2
-    return NS_QUERY[one.kind] * load + NS_SHAPES * columns.shapes
 
 
 def _by_number(ranges: dict[int, tuple[int, int]], around: bool) -> Search:

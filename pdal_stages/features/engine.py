@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,11 +26,9 @@ if TYPE_CHECKING:
     from .fixed import FixedRadius
 
 
-#: Estimated nanoseconds a block may take on one core: Ctrl-C waits for the blocks in work.
-BLOCK_NS = 1.5e8
-
-#: Rows of a block, whatever the memory allows; bytes of a row besides its features, and for each neighborhood.
-MOST_ROWS = 16_384
+#: Rows of a block, whatever the memory allows: Ctrl-C waits for the blocks in work.
+MOST_ROWS = 4096
+#: Bytes of a row besides its features, and for each neighborhood.
 ROW_BYTES, NEIGHBORHOOD_BYTES = 200, 130
 
 #: The queries' own dimensions: (m,) values each, or what gives those of a block's queries, named by their indices.
@@ -211,13 +210,8 @@ class FeatureEngine:
             Where a dimension of the plan is not given, or has not one value per query.
         """
         run = Run(self, queries, dimensions, threads, memory_mb)
-
-        def compute(block: tuple[int, int]):
-            positions, values, tally = run.compute(*block)
-            rows = positions if run.indices is None else run.indices[positions]
-            return rows, values if apply is None else apply(values, rows), len(rows), tally
-
-        yield from run.iterate(compute, progress, self._count)
+        for _, rows, result in run.blocks(progress, apply):
+            yield rows, result
 
     def table(
         self,
@@ -231,23 +225,9 @@ class FeatureEngine:
         """The features of all queries as one table, row i for query i; parameters as for :meth:`blocks`."""
         run = Run(self, queries, dimensions, threads, memory_mb)
         values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
-
-        def compute(block: tuple[int, int]):
-            positions, part, tally = run.compute(*block)
-            values[positions] = part  # blocks are disjoint
-            return positions, None, len(positions), tally
-
-        for _ in run.iterate(compute, progress, self._count):
-            pass
+        for positions, _, part in run.blocks(progress):
+            values[positions] = part
         return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
-
-    def _count(self, count: int, tally: Tally) -> None:
-        with self._lock:
-            self.report.figures["queries"] += count
-            totals = {"beyond_halo": self.report.beyond_halo, **self.report.figures}
-            for key, counts in tally.items():
-                for token, n in counts.items():
-                    totals[key][token] = totals[key].get(token, 0) + n
 
 
 class Run:
@@ -280,29 +260,12 @@ class Run:
         new = np.ones(count, np.bool_)
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
         self.distinct = np.append(np.flatnonzero(new), count)
-        self._cut(float(memory_mb) * 2**20)
-
-    def _cut(self, budget: float) -> None:
-        """Cut the queries into blocks of bounded rows and time; use fewer threads where scratch is large."""
-        points = np.diff(self.engine.grid.cell_start).astype(float)
-        usual = float(points @ points / points.sum())  # points of the cell that a point lies in
-        cost = self.fixed.cost(
-            points if self.grid is self.engine.grid else np.full(len(self.grid.cell_ix), usual)
-        )
-        scratch = float(self.fixed.scratch_bytes(int(usual)))
-        if self.adaptive is not None:
-            cost = cost + self.adaptive.query_ns
-            scratch += self.adaptive.scratch_bytes
-        self.threads = int(max(1, min(self.threads, 0.5 * budget // scratch)))
         # Two results per thread may wait (map_blocks) and one is being made; copies of points double a block.
         row = 8 * len(self.plan.names) + ROW_BYTES + NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods)
-        rows = min(max((budget - self.threads * scratch) / ((2 * self.threads + 1) * row), 64), MOST_ROWS)
-        cells = np.searchsorted(self.distinct, self.grid.cell_start)
-        total = float(cost @ np.diff(cells))
-        most = min(BLOCK_NS, max(total / (4 * self.threads), 5e6))
-        parts = np.append(0.0, np.cumsum(np.maximum(cost / most, 1.0 / rows) * np.diff(cells)))
-        inner = np.ceil(np.interp(np.arange(1.0, parts[-1]), parts, cells)).astype(np.int64)
-        self.starts = np.unique(np.concatenate(([0], inner, cells[-1:])))
+        rows = min(memory_mb * 2**20 / ((2 * self.threads + 1) * row), MOST_ROWS, count / (4 * self.threads))
+        self.starts = np.append(
+            np.arange(0, len(self.distinct) - 1, max(int(rows), 64)), len(self.distinct) - 1
+        )
 
     def compute(self, begin: int, end: int) -> tuple[np.ndarray, np.ndarray, Tally]:
         """Positions (in the user's order) and values of the distinct queries begin..end, and what to report."""
@@ -340,25 +303,35 @@ class Run:
             return self.dimensions(positions if self.indices is None else self.indices[positions])
         return {name: values[positions] for name, values in self.dimensions.items()}
 
-    def iterate(
-        self,
-        compute: Callable[[tuple[int, int]], tuple[np.ndarray, Any, int, Tally]],
-        progress: Any,
-        count: Callable[[int, Tally], None],
-    ) -> Iterator[tuple[np.ndarray, Any]]:
-        """Rows and results of the blocks as threads finish them; `count` gets the queries of each, and its tally."""
-        blocks = list(zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True))
-        own = Progress(len(self.grid), "features") if progress is True else None
-        bar = own if own is not None else progress or None
+    def blocks(
+        self, progress: Progress | bool | None, apply: Callable[[np.ndarray, np.ndarray], Any] | None = None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, Any]]:
+        """Positions, rows, and values or what `apply` makes of them, as threads finish the blocks."""
+
+        def compute(block: tuple[int, int]):
+            positions, values, tally = self.compute(*block)
+            rows = positions if self.indices is None else self.indices[positions]
+            return positions, rows, values if apply is None else apply(values, rows), tally
+
+        bar = Progress(len(self.grid), "features") if progress is True else progress or None
         try:
-            for rows, result, number, tally in map_blocks(compute, blocks, self.threads):
-                count(number, tally)
+            blocks = list(pairwise(self.starts.tolist()))
+            for positions, rows, result, tally in map_blocks(compute, blocks, self.threads):
+                self._count(len(rows), tally)
                 if bar is not None:
-                    bar.update(number)
-                yield rows, result
+                    bar.update(len(rows))
+                yield positions, rows, result
         finally:
-            if own is not None:
-                own.close()
+            if progress is True and bar is not None:
+                bar.close()
+
+    def _count(self, count: int, tally: Tally) -> None:
+        report = self.engine.report
+        report.figures["queries"] += count
+        totals = {"beyond_halo": report.beyond_halo, **report.figures}
+        for key, counts in tally.items():
+            for token, n in counts.items():
+                totals[key][token] = totals[key].get(token, 0) + n
 
 
 def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -18,9 +18,6 @@ from .names import MOMENT_FEATURES
 from .plan import FeaturePlan, columns_of
 from .shapes import Axes, shapes_of, write_shapes
 
-#: Estimated cost on one core, to cut blocks of about equal time: nanoseconds.
-NS_CANDIDATE, NS_NEIGHBORHOOD, NS_SHAPES, NS_MEMBER = 0.7, 150.0, 1500.0, 1.2
-
 
 class FixedRadius:
     """The fixed-radius neighborhoods of `plan` on `grid`, the sorted cloud; :meth:`fill` computes a block."""
@@ -37,17 +34,6 @@ class FixedRadius:
 
     def __len__(self) -> int:
         return len(self.chosen)
-
-    def cost(self, points: np.ndarray) -> np.ndarray:
-        """Estimated nanoseconds of one query in cells of so many points, where those around hold as many."""
-        cells = np.pi * (self.radii / self.grid.cell + 1) ** 2
-        shaped = np.array([c.shapes for c in self.chosen], float)
-        each = len(self) * NS_NEIGHBORHOOD + shaped.sum() * NS_SHAPES
-        return each + points * float(cells @ (NS_CANDIDATE + NS_MEMBER * shaped))
-
-    def scratch_bytes(self, points: int) -> int:
-        """Memory of one call of :meth:`fill` besides its rows, where cells hold at most so many points."""
-        return 48 * int(points * (2 * self.widths.max(initial=0) + 1)) + 100_000
 
     def shape_values(self, points: Axes, seed: int) -> dict[str, np.ndarray]:
         """By neighborhood the metrics of all pulls round a few points, (m, 5, 255) float32, comparable."""

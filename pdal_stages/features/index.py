@@ -186,54 +186,18 @@ def _before(ax, ay, az, bx, by, bz):
 
 @njit
 def sort_cells(x, y, z, order, cell_start):
-    """Sort the points of every cell by x, then y, then z, in place; O(m log m) for a cell of m points."""
+    """Sort the points of every cell by x, then y, then z, in place (Shell 1959, Knuth's gaps)."""
     for cell in range(len(cell_start) - 1):
         first, last = cell_start[cell], cell_start[cell + 1]
-        if last - first > 48:
-            _merge_sort(x[first:last], y[first:last], z[first:last], order[first:last])
-            continue
-        for i in range(first + 1, last):
-            px, py, pz, po = x[i], y[i], z[i], order[i]
-            j = i - 1
-            while j >= first and _before(px, py, pz, x[j], y[j], z[j]):
-                x[j + 1], y[j + 1], z[j + 1], order[j + 1] = x[j], y[j], z[j], order[j]
-                j -= 1
-            x[j + 1], y[j + 1], z[j + 1], order[j + 1] = px, py, pz, po
-
-
-@device
-def _merge_sort(x, y, z, order):
-    """Bottom-up merge sort of row numbers, then one permutation."""
-    n = len(x)
-    rows, spare = np.empty(n, np.int64), np.empty(n, np.int64)
-    for k in range(n):
-        rows[k] = k
-    width = 1
-    while width < n:
-        for low in range(0, n, 2 * width):
-            middle, high = min(low + width, n), min(low + 2 * width, n)
-            i, j = low, middle
-            for k in range(low, high):
-                left = i < middle
-                if left and j < high:
-                    a, b = rows[i], rows[j]
-                    left = not _before(x[b], y[b], z[b], x[a], y[a], z[a])
-                if left:
-                    spare[k] = rows[i]
-                    i += 1
-                else:
-                    spare[k] = rows[j]
-                    j += 1
-        rows, spare = spare, rows
-        width *= 2
-    _take(x, rows)
-    _take(y, rows)
-    _take(z, rows)
-    _take(order, rows)
-
-
-@device
-def _take(values, rows):
-    before = values.copy()
-    for k in range(len(rows)):
-        values[k] = before[rows[k]]
+        gap = 1
+        while 9 * gap < last - first:
+            gap = 3 * gap + 1
+        while gap > 0:
+            for i in range(first + gap, last):
+                px, py, pz, po = x[i], y[i], z[i], order[i]
+                j = i - gap
+                while j >= first and _before(px, py, pz, x[j], y[j], z[j]):
+                    x[j + gap], y[j + gap], z[j + gap], order[j + gap] = x[j], y[j], z[j], order[j]
+                    j -= gap
+                x[j + gap], y[j + gap], z[j + gap], order[j + gap] = px, py, pz, po
+            gap //= 3
