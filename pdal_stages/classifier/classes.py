@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base import checks
 from ..base.asprs import NAMES, UNINFORMATIVE, class_name
 from ..base.errors import OptionError, suggest
 
@@ -22,23 +23,9 @@ MAX_LABEL = 65535
 # Words people use where ASPRS has another.
 _WORDS = {
     **{name.lower(): code for code, name in NAMES.items()},
-    "other": 1,
-    "low vegetation": 3,
-    "medium vegetation": 4,
-    "vegetation": 5,
-    "tree": 5,
-    "trees": 5,
-    "buildings": 6,
-    "roof": 6,
-    "facade": 6,
-    "noise": 7,
-    "road": 11,
-    "wire": 14,
-    "wires": 14,
-    "power line": 14,
-    "pole": 15,
-    "tower": 15,
-    "bridge": 17,
+    **{"other": 1, "low vegetation": 3, "medium vegetation": 4, "vegetation": 5, "tree": 5, "trees": 5},
+    **{"buildings": 6, "roof": 6, "facade": 6, "noise": 7, "road": 11, "wire": 14, "wires": 14},
+    **{"power line": 14, "pole": 15, "tower": 15, "bridge": 17},
 }
 _CURE = (
     "Write classes as a list of codes, [2, 5, 6], or as labels and what they become: "
@@ -69,7 +56,10 @@ class ClassMap:
             Labels in the training clouds, for None.
         """
         if isinstance(spec, str):
-            spec = _from_text(spec)
+            try:
+                spec = json.loads(spec) if spec.strip()[:1] in ("{", "[") else _labels(spec)
+            except ValueError as error:
+                raise OptionError("'classes' is not valid JSON", found=str(error), cure=_CURE) from None
         if spec is None:
             spec = [label for label in sorted(set(map(int, found))) if label not in UNINFORMATIVE]
             if any(label > MAX_CODE for label in spec):
@@ -86,18 +76,15 @@ class ClassMap:
             raise OptionError("'classes' must be a list or a mapping", found=repr(spec), cure=_CURE)
         names: dict[int, str | None] = {}
         members: dict[int, list[int]] = {}
-        taken: set[int] = set()
         for labels, value in pairs:
-            repeated = taken & set(labels)
-            if repeated:
-                raise OptionError("'classes' names a label twice", found=min(repeated), cure=_CURE)
-            taken |= set(labels)
             target = _target(value, labels)
-            if target is None:
-                continue
-            code, name = target
-            names[code] = names.get(code) or name
-            members.setdefault(code, []).extend(labels)
+            if target is not None:
+                names[target[0]] = names.get(target[0]) or target[1]
+                members.setdefault(target[0], []).extend(labels)
+        every = [label for labels, _ in pairs for label in labels]
+        if len(every) > len(set(every)):
+            twice = next(label for label in sorted(every) if every.count(label) > 1)
+            raise OptionError("'classes' names a label twice", found=twice, cure=_CURE)
         codes = tuple(sorted(members))
         named = tuple(names[code] or class_name(code) for code in codes)
         return cls(codes, named, tuple(tuple(sorted(members[code])) for code in codes))
@@ -147,16 +134,6 @@ def as_labels(labels: npt.ArrayLike, where: str) -> npt.NDArray[Any]:
     return array.astype(np.uint16)
 
 
-def _from_text(text: str) -> Any:
-    text = text.strip()
-    if text[:1] in ("{", "["):
-        try:
-            return json.loads(text)
-        except ValueError as error:
-            raise OptionError("'classes' is not valid JSON", found=str(error), cure=_CURE) from None
-    return _labels(text)
-
-
 def _labels(text: Any) -> tuple[int, ...]:
     """``"3,4,5"``, ``"3-5"`` or 3 as labels."""
     if not isinstance(text, str):
@@ -176,31 +153,28 @@ def _labels(text: Any) -> tuple[int, ...]:
 
 
 def _code(value: Any, what: str) -> int:
-    limit = MAX_CODE if what == "code" else MAX_LABEL
     if isinstance(value, str) and value.strip().isdecimal():
         value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= limit:
-        raise OptionError(
-            f"a class {what} must be a whole number from 0 to {limit}", found=repr(value), cure=_CURE
-        )
-    return int(value)
+    try:
+        return checks.whole(f"a class {what}", value, 0, MAX_CODE if what == "code" else MAX_LABEL)
+    except OptionError as error:
+        error.cure = _CURE
+        raise
 
 
 def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | None:
     """(code, name) that a mapping's value means; None for dropped."""
-    if value is None or (isinstance(value, str) and value.strip().lower() in ("drop", "")):
-        return None
     if isinstance(value, Mapping):
-        unknown = set(value) - {"code", "name"}
-        if unknown or "code" not in value:
+        if "code" not in value or set(value) - {"code", "name"}:
             raise OptionError("a class is written with 'code' and 'name'", found=dict(value), cure=_CURE)
         return _code(value["code"], "code"), str(value["name"]) if value.get("name") else None
-    if not isinstance(value, str):
+    if value is not None and not isinstance(value, str):
         return _code(value, "code"), None
-    match = re.fullmatch(r"\s*(\d{1,5})\s*[:=]?\s*(.*?)\s*", value)
-    if match:
+    word = " ".join((value or "drop").split())
+    if word.lower() in ("drop", ""):
+        return None
+    if match := re.fullmatch(r"(\d{1,5})\s*[:=]?\s*(.*)", word):
         return _code(match[1], "code"), match[2] or None
-    word = " ".join(value.split())
     if word.lower() in _WORDS:
         return _WORDS[word.lower()], word
     if len(labels) == 1 and labels[0] <= MAX_CODE:

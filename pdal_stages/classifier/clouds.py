@@ -121,7 +121,13 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     named: set[int] = set()
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
-    labels = _checked_labels(cloud)
+    labels = as_labels(cloud.labels, cloud.name)
+    if len(labels) != len(cloud):
+        found = f"{len(labels)} and {len(cloud)}"
+        raise OptionError("labels and points differ in number", where=cloud.name, found=found)
+    mask = None if cloud.mask is None else np.asarray(cloud.mask)
+    if mask is not None and (mask.shape != labels.shape or mask.dtype != np.bool_):
+        raise OptionError("the mask must be one true or false per point", where=cloud.name)
     ignored = [label for label in options.ignore if label not in named]
     if ignored and (gone := np.isin(labels, ignored)).any():
         cloud, labels = cloud.part(np.flatnonzero(~gone)), labels[~gone]
@@ -147,7 +153,7 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
 
 
 def spooled(clouds: Iterable[TrainingCloud], folder: Path) -> list[TrainingCloud]:
-    """The clouds with their arrays in files of `folder`, mapped when looked at: one cloud at a time is in memory."""
+    """The clouds with their arrays in files of `folder`: one cloud at a time is in memory."""
     return [_mapped(one, folder, number) for number, one in enumerate(clouds)]
 
 
@@ -293,15 +299,11 @@ def label_classes(
 
 def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
     """Names and numbers of points of clouds, the tiles of one as one, for a manifest."""
-    rows: list[dict[str, Any]] = []
-    for cloud in clouds:
-        name, points = os.path.basename(cloud.name), cloud.points
-        before = next((row for row in rows if cloud.own is not None and row["name"] == name), None)
-        if before is None:
-            rows.append({"name": name, "points": points})
-        else:
-            before["points"] += points
-    return rows
+    rows: dict[tuple[str, int], int] = {}
+    for number, cloud in enumerate(clouds):
+        key = os.path.basename(cloud.name), number if cloud.own is None else -1
+        rows[key] = rows.get(key, 0) + cloud.points
+    return [{"name": name, "points": points} for (name, _), points in rows.items()]
 
 
 def density(xyz: npt.NDArray[np.float64]) -> float:
@@ -318,29 +320,6 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
 
 
 def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
-    """Smallest and largest density of some clouds, as a manifest has it; of tiles the median by their points."""
-    found: dict[object, list[tuple[float, int]]] = {}
-    for number, cloud in enumerate(clouds):
-        key = number if cloud.own is None else (cloud.name, cloud.flight, cloud.copy)
-        found.setdefault(key, []).append((density(cloud.xyz), cloud.points))
-    medians = []
-    for tiles in found.values():
-        value, points = (np.array(column) for column in zip(*sorted(tiles), strict=True))
-        medians.append(float(value[np.searchsorted(np.cumsum(points), points.sum() / 2)]))
-    there = [one for one in medians if one]  # empty clouds do not count
+    """Smallest and largest density of some clouds or tiles, as a manifest has it."""
+    there = [one for cloud in clouds if (one := density(cloud.xyz))]  # empty clouds do not count
     return {"low": min(there, default=0.0), "high": max(there, default=0.0)}
-
-
-def _checked_labels(cloud: TrainingCloud) -> npt.NDArray[Any]:
-    labels = as_labels(cloud.labels, cloud.name)
-    if len(labels) != len(cloud.xyz):
-        raise OptionError(
-            "labels and points differ in number",
-            where=cloud.name,
-            found=f"{len(labels)} and {len(cloud.xyz)}",
-        )
-    if cloud.mask is not None:
-        mask = np.asarray(cloud.mask)
-        if mask.shape != labels.shape or mask.dtype != np.bool_:
-            raise OptionError("the mask must be one true or false per point", where=cloud.name)
-    return labels

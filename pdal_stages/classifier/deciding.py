@@ -18,30 +18,18 @@ UNCLASSIFIED = 1
 
 @dataclass(frozen=True)
 class PredictionOptions:
-    """How a cloud is classified.
-
-    Attributes
-    ----------
-    threads, memory_mb
-        Cores to use, and memory for the blocks of features under way.
-    probabilities, margin, variance : bool
-        Whether to return them; the last only a network has.
-    reject_below : float, optional
-        Points less reliable than this are not given the winning class, and are counted.
-    rejected_code : int, optional
-        Class of rejected points, instead of their old one.
-    limits : mapping of int to float, optional
-        The same as `reject_below`, for points of each class; the larger one counts.
-    """
+    """How a cloud is classified."""
 
     threads: int | None = None
-    memory_mb: float = 256.0
-    probabilities: bool = False
+    memory_mb: float = 256.0  #: for the blocks of features under way
+    probabilities: bool = False  #: whether to return them
     margin: bool = False
-    variance: bool = False
-    reject_below: float | None = None
-    rejected_code: int | None = None
-    limits: Mapping[int, float] | None = None
+    variance: bool = False  #: only a network has it
+    reject_below: float | None = None  #: points less reliable do not get the winning class, and are counted
+    rejected_code: int | None = None  #: class of rejected points, instead of their old one
+    limits: Mapping[int, float] | None = (
+        None  #: as `reject_below`, for points of each class; the larger one counts
+    )
 
     def __post_init__(self) -> None:
         checks.number("'memory_mb'", self.memory_mb, 1, unit="MB")
@@ -53,34 +41,17 @@ class PredictionOptions:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Classes given to a cloud's points, in its order.
+    """Classes given to a cloud's points, in its order; numbers are 0 for points that were not classified."""
 
-    Attributes
-    ----------
-    classification : (n,) uint8
-        ASPRS codes.
-    reliability : (n,) float32
-        Probability of the winning class, 0 to 1; 0 for points that were not classified (outside `where`).
-    margin : (n,) float32 or None
-        Winning minus second probability; 0 outside `where`.
-    probabilities : (n, classes) float32 or None
-        In the order of ``Model.classes``; 0 outside `where`.
-    variance : (n,) float32 or None
-        Variance of a class's probability over a network's batches, mean over the classes; 0 outside `where`.
-    classified, rejected : int
-        Points looked at, and those of them whose reliability was below `reject_below`.
-    report : Report
-        Counts, notes and warnings for the metadata.
-    """
-
-    classification: npt.NDArray[np.uint8]
-    reliability: npt.NDArray[np.float32]
-    margin: npt.NDArray[np.float32] | None
-    probabilities: npt.NDArray[np.float32] | None
+    classification: npt.NDArray[np.uint8]  #: (n,) ASPRS codes
+    reliability: npt.NDArray[np.float32]  #: (n,) probability of the winning class
+    margin: npt.NDArray[np.float32] | None  #: (n,) winning minus second probability
+    probabilities: npt.NDArray[np.float32] | None  #: (n, classes) in the order of ``Model.classes``
+    #: (n,) variance of a class's probability over a network's batches, mean over the classes
     variance: npt.NDArray[np.float32] | None
-    classified: int
-    rejected: int
-    report: Report
+    classified: int  #: points looked at
+    rejected: int  #: those of them that were not reliable enough
+    report: Report  #: counts, notes and warnings for the metadata
 
 
 def decide(

@@ -70,10 +70,11 @@ class Forest:
 
     def __post_init__(self) -> None:
         sizes, count = self.tree_sizes, len(self.feature)
+        shapes = ", ".join(f"{name} {getattr(self, name).shape}" for name in self.rules)
         if not len(sizes) or not count or len(self.threshold) != count or self.leaf_counts.ndim != 2:
-            raise ModelError("the forest's arrays do not fit each other", found=self._shapes())
+            raise ModelError("the forest's arrays do not fit each other", found=shapes)
         if int(sizes.min()) < 1 or int(sizes.sum(dtype=np.int64)) != count:
-            raise ModelError("the trees' sizes do not add up to the nodes", found=self._shapes())
+            raise ModelError("the trees' sizes do not add up to the nodes", found=shapes)
         left, depths = _laid_out(sizes, self.feature, self.threshold, self.n_features)
         leaves = int(np.count_nonzero(self.feature < 0))
         if leaves != len(self.leaf_counts):
@@ -94,10 +95,6 @@ class Forest:
         object.__setattr__(self, "_nodes", nodes)
         object.__setattr__(self, "_shares", self.leaf_counts / totals[:, None].astype(np.float64))
 
-    def _shapes(self) -> str:
-        names = ("tree_sizes", "feature", "threshold", "leaf_counts")
-        return ", ".join(f"{name} {getattr(self, name).shape}" for name in names)
-
     @property
     def n_classes(self) -> int:
         return self.leaf_counts.shape[1]
@@ -106,17 +103,12 @@ class Forest:
     def n_trees(self) -> int:
         return len(self.tree_sizes)
 
-    # ---- making one --------------------------------------------------------------------------------------
-
     @classmethod
     def from_sklearn(cls, trees: Sequence[Any], n_features: int) -> Forest:
         """Convert fitted scikit-learn trees.
 
-        Parameters
-        ----------
-        trees : sequence of DecisionTreeClassifier (``forest.estimators_``) or of their ``tree_``
-            Trained on float32 features with whole-number sample weights (bootstrap counts), one output.
-        n_features : int
+        `trees` are DecisionTreeClassifiers or their ``tree_``, trained on float32 features with whole-number sample
+        weights (bootstrap counts) and one output.
         """
         parts = [_level_order(getattr(tree, "tree_", tree)) for tree in trees]
         kind = np.int16 if n_features <= np.iinfo(np.int16).max else np.int32
@@ -129,12 +121,7 @@ class Forest:
         )
 
     @classmethod
-    def from_arrays(
-        cls,
-        arrays: Mapping[str, npt.NDArray[Any]],
-        n_features: int,
-        n_classes: int,
-    ) -> Forest:
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], n_features: int, n_classes: int) -> Forest:
         """A forest from a model file's arrays; everything about them is checked."""
         if arrays["leaf_counts"].shape[1] != n_classes:
             raise ModelError(
@@ -157,21 +144,8 @@ class Forest:
             "deepest": int(self.depths.max()),
         }
 
-    # ---- applying it -------------------------------------------------------------------------------------
-
     def predict_proba(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Class probabilities of rows of features; equal to scikit-learn's, bit for bit.
-
-        Thread-safe; holds no lock while it runs.
-
-        Parameters
-        ----------
-        values : (n, features) float32
-
-        Returns
-        -------
-        (n, classes) float64
-        """
+        """Class probabilities (n, classes) of rows of features (n, features); equal to scikit-learn's, bit for bit."""
         values = np.ascontiguousarray(values, dtype=np.float32)
         if values.ndim != 2 or values.shape[1] != self.n_features:
             raise ModelError(

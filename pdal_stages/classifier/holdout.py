@@ -52,15 +52,8 @@ class Folds:
         folds: int,
         side: float,
     ) -> Folds:
-        """Blocks dealt out so that every fold has its share of each class.
-
-        Parameters
-        ----------
-        xy : (n, 2) float64
-            Of the samples, meters.
-        label, weight : (n,) int
-            Class position of each sample and how often it counts.
-        """
+        """Blocks dealt out so that every fold has its share of each class of the samples, (n, 2) meters; `label` is their
+        class positions, `weight` how often they count."""
         blocks, block = np.unique(_numbers(xy, side), return_inverse=True)
         if len(blocks) < folds:
             raise OptionError(
@@ -93,16 +86,15 @@ class Folds:
             folds = min(2 * folds, len(names))
             return cls(folds, {name: number % folds for number, name in enumerate(names)})
         side = BLOCK
-        while True:
+        while side >= SMALLEST:
             try:
                 return cls.of_blocks(xy, label, weight, folds, side)
             except OptionError:
                 side /= 2.0
-                if side < SMALLEST:
-                    raise OptionError(
-                        f"the labeled ground is too small to be cut into {folds} parts",
-                        cure="Give more training data, or set passes to 1",
-                    ) from None
+        raise OptionError(
+            f"the labeled ground is too small to be cut into {folds} parts",
+            cure="Give more training data, or set passes to 1",
+        )
 
     def points(self, xyz: npt.NDArray[np.float64], survey: str = "") -> npt.NDArray[np.int16]:
         """The fold of each point of a cloud."""
