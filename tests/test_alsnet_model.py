@@ -277,4 +277,4 @@ def test_options_are_checked(values, text):
     from pdal_stages.classifier import TrainingOptions
 
     with pytest.raises(OptionError, match=text):
-        TrainingOptions.from_dict(values)
+        TrainingOptions(**values)

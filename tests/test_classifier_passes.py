@@ -95,9 +95,8 @@ def test_equals_passes_by_hand(two, other):
     assert np.array_equal(everything(two, xyz, dimensions).probabilities[rows], p.astype(np.float32))
 
 
-@pytest.mark.parametrize("name", ["two", "three"])
-def test_blocks_threads_memory_and_order_change_nothing(name, other, request):
-    model = request.getfixturevalue(name)
+def test_blocks_threads_memory_and_order_change_nothing(two, other):
+    model = two
     xyz, _, dimensions = other
     whole = everything(model, xyz, dimensions, threads=1, memory_mb=2000)
     same(whole, everything(model, xyz, dimensions, threads=3, memory_mb=32))
@@ -106,9 +105,8 @@ def test_blocks_threads_memory_and_order_change_nothing(name, other, request):
     same(whole, shuffled, p)
 
 
-@pytest.mark.parametrize("name", ["two", "three"])
-def test_where_and_tiles_change_nothing(name, other, request):
-    model = request.getfixturevalue(name)
+def test_where_and_tiles_change_nothing(three, other):
+    model = three
     xyz, _, dimensions = other
     whole = everything(model, xyz, dimensions)
     inner = (np.abs(xyz[:, :2] - 30) < 8).all(axis=1)

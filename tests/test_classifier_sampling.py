@@ -85,13 +85,6 @@ def test_spread_is_exact(n, count, seed):
     assert weight.max() - weight.min() <= 1
 
 
-def test_hash_is_of_the_coordinates_alone():
-    xyz = np.array([[1.0, 2.0, 3.0], [2.0, 1.0, 3.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [-0.0, 0.0, 0.0]])
-    h = coordinate_hash(xyz, 1)
-    assert h[0] == h[2] and h[0] != h[1] and h[3] == h[4]
-    assert (h != coordinate_hash(xyz, 2)).all()
-
-
 def test_a_class_without_points_is_an_error(random_cloud):
     with pytest.raises(OptionError, match="no samples"):
         draw_samples([(random_cloud(10), np.zeros(10, np.int16))], 2, 5, 0)

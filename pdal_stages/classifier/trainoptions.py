@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # ruff: noqa: RUF009  options are declared, nothing is shared
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..base import checks
 from ..base.asprs import NOISE
-from ..base.errors import OptionError, suggest
+from ..base.errors import OptionError
 from ..base.resources import resolve_threads
 from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
@@ -32,12 +32,14 @@ DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
-def setting(default: Any, kind: str, help: str, more: str = "", **rule: Any) -> Any:
-    """Declare an option: what it is in a sentence, for help texts too, and `more` for who reads the documentation.
+def setting(default: Any, kind: str, help: str, *bounds: float, **rule: Any) -> Any:
+    """Declare an option: what it is in a sentence, for help texts too, and the `bounds` of a number.
 
-    `kind` and `rule` (``minimum``, ``maximum``, ``exclusive``, ``unit``, ``choices``) are those of an option of a stage.
+    `kind` and `rule` (``exclusive``, ``unit``, ``choices``) are those of an option of a stage.
     """
-    return field(default=default, metadata={"kind": kind, "help": help, "more": more, **rule})
+    if bounds:
+        rule |= {"minimum": bounds[0], "maximum": bounds[1]}
+    return field(default=default, metadata={"kind": kind, "help": help, **rule})
 
 
 @dataclass(frozen=True)
@@ -53,23 +55,18 @@ class TrainingOptions:
         ("covariance", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest"),
         "list",
         "Groups (covariance, geometric, shapes, surfaces, all) or single features. 'all' is the papers' set",
-        "The default adds the height above the lowest point of each neighborhood [HWS16], which tells low vegetation from "
-        "sloping ground.",
     )
     dimensions: Sequence[str] = setting(
         ("HeightAboveGround",),
         "list",
         "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, ReturnRatio, or returns "
         "for all return features",
-        "Intensity and return numbers depend on the flight, so a model that uses them seldom fits another. ``ReturnRatio`` "
-        "is ReturnNumber / NumberOfReturns.",
     )
     classes: Any = setting(
         None,
         "mapping",
         'Labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}, or a list of codes; '
         "default: every label met except 0, 1, 7, 12 and 18",
-        "See ``ClassMap.parse``.",
     )
     strategy: str = setting(
         "multiclass",
@@ -77,36 +74,21 @@ class TrainingOptions:
         "All classes at once, or 'target' against all the others",
         choices=("multiclass", "binary"),
     )
-    target: int | None = setting(
-        None, "integer", "Class to find with the binary strategy", minimum=0, maximum=255
-    )
+    target: int | None = setting(None, "integer", "Class to find with the binary strategy", 0, 255)
     background: int = setting(
-        1, "integer", "Code given to all other classes with the binary strategy", minimum=0, maximum=255
+        1, "integer", "Code given to all other classes with the binary strategy", 0, 255
     )
     count: int = setting(
-        40_000,
-        "integer",
-        "Samples per class; smaller classes are filled up with duplicates",
-        minimum=1,
-        maximum=10**8,
+        40_000, "integer", "Samples per class; smaller classes are filled up with duplicates", 1, 10**8
     )
-    seed: int = setting(
-        0,
-        "integer",
-        "Seed for sampling, trees and shape distributions",
-        minimum=0,
-        maximum=2**31 - 1,
-    )
-    trees: int = setting(50, "integer", "Number of trees", minimum=1, maximum=10_000)
-    min_samples_leaf: int = setting(
-        3, "integer", "Minimum number of samples in a leaf", minimum=1, maximum=10**6
-    )
+    seed: int = setting(0, "integer", "Seed for sampling, trees and shape distributions", 0, 2**31 - 1)
+    trees: int = setting(50, "integer", "Number of trees", 1, 10_000)
+    min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", 1, 10**6)
     max_samples: float | None = setting(
         None,
         "number",
         f"Share of the samples a tree draws; default: a third, on average {LEAST_PER_TREE:,} to {PER_TREE:,} of each class",
-        minimum=0,
-        maximum=1,
+        *(0, 1),
         exclusive=True,
     )
     max_features: str | int | float = setting(
@@ -118,23 +100,18 @@ class TrainingOptions:
         0.2,
         "number",
         "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
-        "Each class's probability is multiplied by its frequency to this power.",
-        minimum=0,
-        maximum=1,
+        *(0, 1),
     )
     thin: Sequence[float] = setting(
         (),
         "list",
         "Points per square meter of sparser copies to train on as well, so that the model bears sparse clouds",
-        "Features are computed on the copies; dimensions keep the values they have in the whole cloud.",
     )
     voxel: float = setting(
         0.125,
         "number",
         "Side of voxels: in training and in classifying one point represents each, and the others get its class; 0 for none",
-        "Bounds the cost of a point in a drone's cloud, and keeps a model near the densities it knows.",
-        minimum=0,
-        maximum=LARGEST,
+        *(0, LARGEST),
         unit="m",
     )
     ignore: Sequence[int] = setting(
@@ -144,60 +121,49 @@ class TrainingOptions:
         None,
         "integer",
         "Folds of cross-validation by group, survey or block of ground; 0 for none; default: 5, with a quarter of the trees",
-        minimum=0,
-        maximum=1000,
+        *(0, 1000),
     )
     groups: str = setting(
         "",
         "string",
         "Dimension whose points of one value are held out together, such as the number of a tile or flight, so that the "
         "score is of tiles or flights that the model has not seen",
-        "Where that takes all samples of a class away, blocks of ground are held out instead. It changes the score alone.",
     )
     passes: Any = setting(
         None,
         "integer",
         "Forests one after the other, each reading what the one before says of a point's surroundings; default 2, on top of "
         "a base 1, for few labels: a labeled survey gains by 2",
-        "Each is trained on what the one before says of ground it has not seen. Of several on top of a base the first reads "
-        "what the base says of the point itself.",
-        minimum=1,
-        maximum=MOST_PASSES,
+        *(1, MOST_PASSES),
     )
     context: Any = setting(
         None,
         "list",
         "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5); default: "
         f"{','.join(DEFAULT_CONTEXT)}, of one pass on top of a base {','.join(CONTEXT_OF_BASE)}, of several own besides",
-        "See :class:`pdal_stages.classifier.context.Context`.",
     )
     base: Any = setting(
         None,
         "model",
         "A model to build on: what it says all around a point is read by a forest on top, which few labels train; classes "
         "that the labels lack keep its answer",
-        "A ``Model``; voxels and preparation are its own. Beside few labels it is believed, beside many the labels are.",
     )
     algorithm: str = setting(
         "random_forest",
         "string",
         "A forest on computed features, or a network on the points themselves (needs PyTorch)",
-        "A network [WM19] uses `dimensions`, `classes`, `strategy`, `seed` and `threads` of these options and "
-        "all of its own.",
     )
     alsnet: Any = setting(
         None,
         "mapping",
         'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
-        "See :class:`pdal_stages.alsnet.NetworkOptions`.",
     )
     threads: int | None = setting(None, "integer", "Threads to use; by default every available core")
     memory_mb: float = setting(
         512.0,
         "number",
         "Memory for blocks of points, in addition to the samples",
-        minimum=0,
-        maximum=10**9,
+        *(0, 10**9),
         exclusive=True,
         unit="MB",
     )
@@ -231,7 +197,16 @@ class TrainingOptions:
             several = DEFAULT_CONTEXT if base is None else (OWN, *DEFAULT_CONTEXT)
             put("context", lambda *_: CONTEXT_OF_BASE if base and self.passes == 1 else several)
         if base is not None:
-            check_base(base)
+            if (passes := getattr(base, "passes", None)) is None:
+                raise OptionError(
+                    "'base' must be a model", found=type(base).__name__, cure="Load it with load_model"
+                )
+            if len(passes) > MOST_PASSES:
+                raise OptionError(
+                    f"a base may have {MOST_PASSES} passes",
+                    found=len(passes),
+                    cure="Start from the model that it was built on, with all labels together",
+                )
             if self.algorithm != "random_forest":
                 raise OptionError(
                     "only a forest is built on a 'base'", found=self.algorithm, cure="Leave 'algorithm' out"
@@ -280,28 +255,6 @@ class TrainingOptions:
         """Dimensions of the points that the classifier will use, X, Y and Z among them."""
         return trainer(self.algorithm).inputs(self)
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> TrainingOptions:
-        """Options by name; an unknown name is an error."""
-        known = [f.name for f in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise OptionError(f"unknown training option '{name}'", cure=suggest(name, known))
-        return cls(**values)
-
-
-def check_base(base: Any) -> None:
-    """Refuse what cannot be built on."""
-    passes = getattr(base, "passes", None)
-    if passes is None:
-        raise OptionError("'base' must be a model", found=type(base).__name__, cure="Load it with load_model")
-    if len(passes) > MOST_PASSES:
-        raise OptionError(
-            f"a base may have {MOST_PASSES} passes",
-            found=len(passes),
-            cure="Start from the model that it was built on, with all labels together",
-        )
-
 
 def feature_plan(options: TrainingOptions) -> FeaturePlan:
     """The features that options ask for."""
@@ -313,9 +266,9 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
 def _documented() -> str:
     lines = ["How a model is trained.", "", "Attributes", "----------"]
     for one in fields(TrainingOptions):
-        what = f"{one.metadata['help']}. {one.metadata['more']}".strip()
         unit = f", {one.metadata['unit']}" if one.metadata.get("unit") else ""
-        lines += [f"{one.name} : {one.type}{unit}", textwrap.indent(textwrap.fill(what, 110), "    ")]
+        what = textwrap.fill(f"{one.metadata['help']}.", 110)
+        lines += [f"{one.name} : {one.type}{unit}", textwrap.indent(what, "    ")]
     return "\n".join([*lines, ""])
 
 

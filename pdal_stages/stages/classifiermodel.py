@@ -43,7 +43,7 @@ AUTO = "auto"
 def trained(name: str, /, **other: Any) -> Any:
     """An option of training, as it is declared there; `other` is what is different here, as for :class:`Option`."""
     field = _TRAINING[name]
-    rule = {key: value for key, value in field.metadata.items() if key != "more"}
+    rule = field.metadata
     default: Any = field.default
     if rule["kind"] == "list" and default is not None and not isinstance(default, tuple):
         default = (default,)
@@ -137,12 +137,10 @@ classes.
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
         given = dict(given)
         classes, share = given.get("classes"), given.get("max_features")
-        if isinstance(classes, list | str) and not str(classes).lstrip().startswith("{"):
-            # A list of codes is as good as a mapping.
-            codes = (
-                classes if isinstance(classes, list) else [c.strip() for c in classes.split(",") if c.strip()]
-            )
-            given["classes"] = {str(c): _number(c) for c in codes}
+        if isinstance(classes, str) and not classes.lstrip().startswith("{"):
+            classes = [code.strip() for code in classes.split(",") if code.strip()]
+        if isinstance(classes, list):  # of codes: as good as a mapping
+            given["classes"] = {str(code): _number(code) for code in classes}
         if isinstance(share, int | float) and not isinstance(share, bool):
             given["max_features"] = str(share)
         self._preparation: list[dict[str, Any]] = []
@@ -197,7 +195,6 @@ classes.
         """The trainer's options, with the dimensions that the points have."""
         if not self.automatic:
             return self.training
-
         optional = self._trainer.optional_inputs
         there = [name for name, needs in optional.items() if all(one in points.arrays for one in needs)]
         return replace(self.training, dimensions=(*ALWAYS, *there))
@@ -233,31 +230,21 @@ classes.
         self.finish(train(clouds, training), points.report)
         return {}
 
-    def cloud_of(self, points: Points, training: TrainingOptions) -> TrainingCloud:
-        """The points as a cloud to train on, all of one survey."""
-        return self.cloud_drawn(points, training, self._mask(points))
-
-    def cloud_drawn(
-        self,
-        points: Points,
-        training: TrainingOptions,
-        mask: NDArray[np.bool_] | None,
-        more: Mapping[str, NDArray] | None = None,
+    def cloud_of(
+        self, points: Points, training: TrainingOptions, marks: Mapping[str, NDArray] | None = None
     ) -> TrainingCloud:
-        """The same, where samples are drawn from the points of a mask; with `more` dimensions."""
+        """The points as a cloud to train on, all of one survey; with `marks` as more dimensions, from which follows later
+        what samples are drawn from."""
+        needed = required((*training.inputs, *filter(None, [self.groups])))
+        dimensions = {name: points.dimension(name) for name in needed}
+        dimensions |= {n: points.arrays[n] for n in welcome(training.inputs) if n in points.arrays}
+        names = [Path(name).name for name in self.files]
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
-            dimensions={
-                name: points.dimension(name)
-                for name in required((*training.inputs, *filter(None, [self.groups])))
-            }
-            | {name: points.arrays[name] for name in welcome(training.inputs) if name in points.arrays}
-            | dict(more or {}),
-            name=", ".join(Path(name).name for name in self.files[:_NAMED])
-            + ", ..." * (len(self.files) > _NAMED)
-            or "the points",
-            mask=mask,
+            dimensions=dimensions | dict(marks or {}),
+            name=", ".join([*names[:_NAMED], *["..."] * (len(names) > _NAMED)]) or "the points",
+            mask=self._mask(points) if marks is None else points.mask,
         )
         gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
         return cloud.part(np.flatnonzero(~gone)) if gone.any() else cloud

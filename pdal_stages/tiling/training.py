@@ -334,7 +334,7 @@ class Taking:
             found, looked = stage.looked(points)
             marks = {_WANTED: found.wanted, _SURE: found.sure}
         clouds = []
-        whole = stage.cloud_drawn(points, training, points.mask, marks)
+        whole = stage.cloud_of(points, training, marks)
         for number, (value, cloud) in enumerate(stage.surveys(whole, points)):
             arrays |= {f"{number}/xyz": cloud.xyz, f"{number}/labels": np.asarray(cloud.labels)}
             if cloud.mask is not None:
