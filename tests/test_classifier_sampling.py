@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.base.arrays import coordinate_hash
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.sampling import draw_samples, spread
 
