@@ -270,7 +270,7 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
         ({"algorithm": "alsnet", "alsnet": {"epochs": 0}}, "epochs"),
         ({"algorithm": "alsnet", "alsnet": {"configuration": "tinny"}}, "tiny"),
         ({"algorithm": "alsnet", "alsnet": [1]}, "mapping"),
-        ({"algorithm": "alsnet", "alsnet": {"rotate": 1}}, "rotate"),
+        ({"algorithm": "alsnet", "alsnet": {"augment": 1}}, "augment"),
     ],
 )
 def test_options_are_checked(values, text):

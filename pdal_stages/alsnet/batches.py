@@ -12,7 +12,6 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from ..classifier.holdout import Folds
 from .circles import REACH, Circles
-from .configuration import NetworkOptions
 
 
 def side_by_side(clouds: Sequence[npt.NDArray[np.float64]], spacing: float) -> npt.NDArray[np.float64]:
@@ -95,24 +94,18 @@ def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]
     return weight / (weight * share).sum()
 
 
-#: Fewest points thinning leaves.
-LEAST = 16
+#: Augmentation: most that a batch's center moves, in spacings; standard deviation of noise on coordinates, meters, cut at
+#: three times that; most points a batch loses, and fewest that are left.
+SHIFT, JITTER, THIN, LEAST = 0.5, 0.01, 0.4, 16
 
 
 def augmented(
-    xyz: npt.NDArray[np.float64], options: NetworkOptions, random: np.random.Generator
+    xyz: npt.NDArray[np.float64], random: np.random.Generator
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
     """A batch turned about z, shaken and thinned: from coordinates (n, 3) around its center to (m, 3), and the rows kept."""
-    kept = np.arange(len(xyz))
-    if options.thin > 0.0:
-        share = 1.0 - random.uniform(0.0, options.thin)
-        kept = np.sort(random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))])
-    out = xyz[kept]
-    if options.rotate:
-        angle = random.uniform(0.0, 2.0 * math.pi)
-        c, s = math.cos(angle), math.sin(angle)
-        out = out @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    if options.jitter > 0.0:
-        noise = random.normal(0.0, options.jitter, out.shape)
-        out = out + np.clip(noise, -3.0 * options.jitter, 3.0 * options.jitter)
-    return out, kept
+    share = 1.0 - random.uniform(0.0, THIN)
+    kept = np.sort(random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))])
+    angle = random.uniform(0.0, 2.0 * math.pi)
+    c, s = math.cos(angle), math.sin(angle)
+    out = xyz[kept] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return out + np.clip(random.normal(0.0, JITTER, out.shape), -3.0 * JITTER, 3.0 * JITTER), kept

@@ -8,8 +8,8 @@ perceptron that describes the ball, and the widths of the one that carries featu
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 from ..base import checks
@@ -19,46 +19,66 @@ from ..base.errors import OptionError, suggest
 MAX_LAYERS = 60
 
 
-@dataclass(frozen=True)
-class Level:
-    """One level of set abstraction and the feature propagation back from it."""
+def _checked(check: Callable[[str, Any], Any], **more: Any) -> Any:
+    """A field whose value is what `check`, given its name in quotes and the value, makes of it."""
+    return field(metadata={"check": check}, **more)
 
-    centers: int  #: points kept, by farthest point sampling; all where there are fewer
-    radius: float  #: of the ball around each center, meters
-    samples: int  #: points taken from a ball
-    #: widths of the shared perceptron over a ball's points; the maximum over the points follows
-    mlp: tuple[int, ...]
-    up: tuple[int, ...]  #: widths of the shared perceptron after interpolation to the level above
+
+def _whole(low: int, high: int, **more: Any) -> Any:
+    return _checked(lambda what, value: checks.whole(what, value, low, high), **more)
+
+
+def _number(low: float, high: float, **more: Any) -> Any:
+    return _checked(lambda what, value: checks.number(what, value, low, high), **more)
+
+
+def _widths(what: str, value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list | tuple) or not 1 <= len(value) <= 8:
+        raise OptionError(f"{what} must be a list of 1 to 8 widths", found=repr(value)[:60])
+    return tuple(checks.whole(what, width, 1, 4096) for width in value)
+
+
+class _Checked:
+    """Dataclasses whose fields check themselves; OptionError where one does not fit."""
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        set_(self, "centers", checks.whole("'centers'", self.centers, 1, 10**7))
-        set_(self, "radius", checks.number("'radius'", self.radius, 1e-3, 1e4))
-        set_(self, "samples", checks.whole("'samples'", self.samples, 1, 1024))
-        set_(self, "mlp", _widths("mlp", self.mlp))
-        set_(self, "up", _widths("up", self.up))
+        for one in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, one.name)
+            if "check" in one.metadata and not (value is None and one.default is None):
+                object.__setattr__(self, one.name, one.metadata["check"](f"'{one.name}'", value))
 
 
 @dataclass(frozen=True)
-class Configuration:
+class Level(_Checked):
+    """One level of set abstraction and the feature propagation back from it."""
+
+    centers: int = _whole(1, 10**7)  #: points kept, by farthest point sampling; all where there are fewer
+    radius: float = _number(1e-3, 1e4)  #: of the ball around each center, meters
+    samples: int = _whole(1, 1024)  #: points taken from a ball
+    #: widths of the shared perceptron over a ball's points; the maximum over the points follows
+    mlp: tuple[int, ...] = _checked(_widths)
+    up: tuple[int, ...] = _checked(
+        _widths
+    )  #: of the shared perceptron after interpolation to the level above
+
+
+@dataclass(frozen=True)
+class Configuration(_Checked):
     """A whole network, but for the number of inputs and classes."""
 
     name: str
-    points: int  #: of a batch: the nearest around a grid point
-    levels: tuple[Level, ...]
+    points: int = _whole(16, 10**7)  #: of a batch: the nearest around a grid point
+    levels: tuple[Level, ...] = ()
     #: widths after the last propagation; dropout follows, then one linear layer to the classes
-    head: tuple[int, ...] = (128,)
-    dropout: float = 0.5  #: share of the head's outputs left out in training
+    head: tuple[int, ...] = _checked(_widths, default=(128,))
+    dropout: float = _number(0.0, 0.95, default=0.5)  #: share of the head's outputs left out in training
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
+        super().__post_init__()
         if not isinstance(self.name, str) or not 1 <= len(self.name) <= 60:
             raise OptionError("a configuration's name must be text", found=repr(self.name)[:60])
-        set_(self, "points", checks.whole("'points'", self.points, 16, 10**7))
         if not 1 <= len(self.levels) <= 8:
             raise OptionError("a network must have 1 to 8 levels", found=len(self.levels))
-        set_(self, "head", _widths("head", self.head))
-        set_(self, "dropout", checks.number("'dropout'", self.dropout, 0.0, 0.95))
         if (layers := len(self.shapes(1, 1))) > MAX_LAYERS:
             raise OptionError(f"a network may have {MAX_LAYERS} layers", found=layers)
 
@@ -134,33 +154,30 @@ def parse_configuration(
 
 
 def _from_mapping(given: Mapping[str, Any]) -> Configuration:
-    known = {field.name for field in fields(Configuration)}
-    _only(given, known, {"points", "levels"}, "a network configuration")
+    _only(given, Configuration, "a network configuration", ("points", "levels"))
     if not isinstance(given["levels"], list | tuple):
         raise OptionError("'levels' must be a list", found=repr(given["levels"])[:60])
     levels = []
-    keys = {field.name for field in fields(Level)}
     for level in given["levels"][:9]:
-        if not isinstance(level, Mapping):
-            raise OptionError("a level must be a mapping", found=repr(level)[:60])
-        _only(level, keys, keys, "a level")
+        _only(level, Level, "a level", [one.name for one in fields(Level)])
         levels.append(Level(**level))
     return Configuration(**{"name": "own", **given, "levels": tuple(levels)})
 
 
-def _only(given: Mapping[str, Any], known: set[str], needed: set[str], what: str) -> None:
-    odd = [str(key) for key in given if key not in known]
-    if odd:
-        raise OptionError(f"{what} has no '{odd[0][:40]}'", cure=suggest(odd[0], known) or None)
-    lost = sorted(needed - set(given))
-    if lost:
-        raise OptionError(f"{what} needs '{lost[0]}'")
-
-
-def _widths(name: str, value: Any) -> tuple[int, ...]:
-    if not isinstance(value, list | tuple) or not 1 <= len(value) <= 8:
-        raise OptionError(f"'{name}' must be a list of 1 to 8 widths", found=repr(value)[:60])
-    return tuple(checks.whole(f"'{name}'", width, 1, 4096) for width in value)
+def _only(given: Any, kind: type, what: str, needed: Sequence[str] = ()) -> None:
+    """Refuse what is not a mapping with the names of a dataclass's fields, with all that are needed."""
+    if not isinstance(given, Mapping):
+        raise OptionError(f"{what} must be a mapping", found=repr(given)[:60])
+    known = [one.name for one in fields(kind)]
+    for name in given:
+        if name not in known:
+            raise OptionError(
+                f"{what} has no '{str(name)[:40]}'",
+                cure=f"{suggest(str(name), known)}It may have: {', '.join(known)}",
+            )
+    for name in needed:
+        if name not in given:
+            raise OptionError(f"{what} needs '{name}'")
 
 
 #: The named ones. ``alsnet4`` and ``alsnet3`` are those of [WM19]'s program; the others are ours, for CPUs.
@@ -194,69 +211,54 @@ CONFIGURATIONS = {
 }  # fmt: skip
 
 
+def _choice(*choices: str, default: str) -> Any:
+    return _checked(lambda what, value: checks.one_of(what, value, choices), default=default)
+
+
+def _file(what: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise OptionError(f"{what} must be a file name", found=repr(value))
+    return value
+
+
 @dataclass(frozen=True)
-class NetworkOptions:
+class NetworkOptions(_Checked):
     """How a network is trained; docs/alsnet.md says more of each."""
 
     configuration: Any = "small"  #: the name of one of :data:`CONFIGURATIONS`, or one of your own
     points: int | None = None  #: of a batch, instead of the configuration's
-    spacing: float | None = None  #: of the batches' grid in meters; None: for four batches a point
-    coordinates: str = "Z"  #: of X, Y and Z from the batch's center, which are inputs: "Z", "XYZ" or ""
-    epochs: int = 60  #: at most; each sees every chosen batch once
-    batches_per_step: int = 2  #: batches whose gradients make one step
-    learning_rate: float = 0.002  #: at the start; it falls to 1 % of that along a cosine
+    #: of the batches' grid in meters; None: for four batches a point
+    spacing: float | None = _number(0.01, 1e5, default=None)
+    coordinates: str = _choice("", "Z", "XYZ", default="Z")  #: from the batch's center, which are inputs
+    epochs: int = _whole(1, 100_000, default=60)  #: at most; each sees every chosen batch once
+    batches_per_step: int = _whole(1, 1024, default=2)  #: batches whose gradients make one step
+    #: at the start; it falls to 1 % of that along a cosine
+    learning_rate: float = _number(1e-8, 10.0, default=0.002)
     #: weight of a class in the loss: 1 / sqrt(share), 1 ("none") [WM19], or 1 / share ("balanced")
-    class_weights: str = "sqrt"
+    class_weights: str = _choice("none", "sqrt", "balanced", default="sqrt")
     #: batches whose class shares have a standard deviation of this or more (per cent) are not trained on: they hold next
     #: to nothing but one class [WM19: 20 %]; 100: all are used
-    histogram_threshold: float = 20.0
-    rotate: bool = True  #: turn each batch about its center by a random angle
-    shift: float = 0.5  #: move batch centers by up to this share of the spacing, anew in each epoch
-    jitter: float = 0.01  #: standard deviation of noise on coordinates, meters; cut at three times that
-    thin: float = 0.4  #: most points a batch may lose; the share is drawn anew for each
+    histogram_threshold: float = _number(0.0, 100.0, default=20.0)
+    augment: bool = _checked(
+        checks.flag, default=True
+    )  #: turn, move, shake and thin each batch, anew in each epoch
     #: share of the ground held out, in whole blocks, to choose the best epoch; 0: none
-    validation: float = 0.2
-    block_size: float = 25.0  #: side of those blocks, meters
+    validation: float = _number(0.0, 0.5, default=0.2)
+    block_size: float = _number(0.1, 1e6, default=25.0)  #: side of those blocks, meters
     #: epochs without a better mean F1 on the held out blocks after which training ends; 0: never
-    patience: int = 20
+    patience: int = _whole(0, 100_000, default=20)
     #: file written after every epoch; where it exists, training goes on from it
-    checkpoint: str | None = None
+    checkpoint: str | None = _checked(_file, default=None)
     #: model file whose weights training starts from; classes it shares keep theirs, others start afresh
-    start_from: str | None = None
-    device: str = "auto"  #: or "cpu", "cuda"
+    start_from: str | None = _checked(_file, default=None)
+    device: str = _choice("auto", "cpu", "cuda", default="auto")
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        set_(self, "configuration", parse_configuration(self.configuration, self.points))
-        set_(self, "epochs", checks.whole("'epochs'", self.epochs, 1, 100_000))
-        set_(self, "batches_per_step", checks.whole("'batches_per_step'", self.batches_per_step, 1, 1024))
-        set_(self, "patience", checks.whole("'patience'", self.patience, 0, 100_000))
-        limits = {
-            "learning_rate": (1e-8, 10.0), "histogram_threshold": (0.0, 100.0), "shift": (0.0, 0.5),
-            "jitter": (0.0, 10.0), "thin": (0.0, 0.95), "validation": (0.0, 0.5), "block_size": (0.1, 1e6),
-        }  # fmt: skip
-        for name, (low, high) in limits.items():
-            set_(self, name, checks.number(f"'{name}'", getattr(self, name), low, high))
-        if self.spacing is not None:
-            set_(self, "spacing", checks.number("'spacing'", self.spacing, 0.01, 1e5))
-        checks.flag("'rotate'", self.rotate)
-        checks.one_of("'class_weights'", self.class_weights, ("none", "sqrt", "balanced"))
-        checks.one_of("'device'", self.device, ("auto", "cpu", "cuda"))
-        checks.one_of("'coordinates'", self.coordinates, ("", "Z", "XYZ"))
-        for name in ("checkpoint", "start_from"):
-            if getattr(self, name) is not None and not isinstance(getattr(self, name), str):
-                raise OptionError(f"'{name}' must be a file name", found=repr(getattr(self, name)))
+        super().__post_init__()
+        object.__setattr__(self, "configuration", parse_configuration(self.configuration, self.points))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> NetworkOptions:
         """Options by name; an unknown name is an error."""
-        if not isinstance(values, Mapping):
-            raise OptionError("'alsnet' must be a mapping of options", found=repr(values)[:60])
-        known = [f.name for f in fields(cls)]
-        for name in values:
-            if name not in known:
-                raise OptionError(
-                    f"unknown alsNet option '{name}'",
-                    cure=f"{suggest(str(name), known)}Options: {', '.join(known)}",
-                )
+        _only(values, cls, "'alsnet'")
         return cls(**values)

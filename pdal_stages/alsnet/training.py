@@ -260,15 +260,14 @@ class _Session:
     def _augmented(self, number: int, epoch: int):
         """(pyramid, labels) of a batch, changed as the options say."""
         random = np.random.default_rng([self.seed, epoch, 2, number])
-        center = (
-            self.circles.centers[number] + random.uniform(-1.0, 1.0, 2) * self.options.shift * self.spacing
-        )
-        members = self.circles.around(float(center[0]), float(center[1]))
-        if not len(members):  # moved off the cloud's edge
-            center, members = self.circles.centers[number], self.circles.members(number)
-        order, pyramid = self._pyramid(
-            members, center, lambda xyz: batches.augmented(xyz, self.options, random)
-        )
+        center, members, change = self.circles.centers[number], self.circles.members(number), None
+        if self.options.augment:
+            moved = center + random.uniform(-1.0, 1.0, 2) * batches.SHIFT * self.spacing
+            around = self.circles.around(float(moved[0]), float(moved[1]))
+            if len(around):  # not moved off the cloud's edge
+                center, members = moved, around
+            change = lambda xyz: batches.augmented(xyz, random)  # noqa: E731
+        order, pyramid = self._pyramid(members, center, change)
         return pyramid, self.train_labels[members[order]]
 
     def _pyramid(self, members, center, change: Any = None):
