@@ -15,7 +15,6 @@ import pytest
 
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.inputs_outputs import overlooked
 
 pytestmark = pytest.mark.pdal
 
@@ -57,6 +56,7 @@ def folder(tmp_path_factory, write_las):
 @pytest.fixture()
 def classify(folder, capsys):
     def go(*words):
+        words = words if "--workers" in words else (*words, "--workers", 0)
         code = main([str(w) for w in ("classify", *words, "--model", folder / "m.model", "--no-progress")])
         return code, *capsys.readouterr()
 
@@ -70,9 +70,8 @@ def files_in(folder, pattern="*"):
 @pytest.mark.parametrize(
     ("given", "output", "workers", "names"),
     [
-        ("in", "out", 1, ["t0.laz", "t1.laz", "t2.laz"]),
+        ("in", "out", 0, ["t0.laz", "t1.laz", "t2.laz"]),
         ("in/t[12].laz", "out/c_#.las", 2, ["c_t1.las", "c_t2.las"]),
-        ("in/t0.laz", "out", 1, ["t0.laz"]),
     ],
 )
 def test_an_output_for_each_input(folder, classify, tmp_path, given, output, workers, names):
@@ -92,7 +91,7 @@ def test_several_inputs_are_not_merged_into_one(folder, classify, tmp_path):
     assert code == 1 and "#" in err and not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("given", "output"), [("in", "a/b"), ("in", "new.d/"), ("in/t0.laz", "one/")])
+@pytest.mark.parametrize(("given", "output"), [("in/t[01].laz", "a/b"), ("in/t0.laz", "new.d/")])
 def test_the_output_folder_is_made(folder, classify, tmp_path, given, output):
     code, _, err = classify(folder / given, f"{tmp_path}/{output}")
     assert code == 0, err
@@ -154,7 +153,16 @@ def test_an_interrupt_says_what_is_finished(folder, tmp_path, write_las):
     x, y = rng.uniform(0, 400, (2, 300_000))
     far = {"X": x + 5000, "Y": y + 5000, "Z": rng.normal(0, 0.1, len(x))}
     slow = write_las(tmp_path / "z_slow.laz", far, point_format=1)
-    words = ["classify", folder / "in", slow, tmp_path / "out_#.laz", "--model", "standard", "--tile", 500]
+    words = [
+        "classify",
+        folder / "in",
+        slow,
+        tmp_path / "out_#.laz",
+        "--model",
+        folder / "m.model",
+        "--tile",
+        500,
+    ]
     command = [sys.executable, "-m", "pdal_stages.cli", *map(str, words), "--workers", "1"]
     command += ["--log", str(tmp_path / "log"), "--metadata", str(tmp_path / "m.json")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
@@ -248,26 +256,11 @@ def test_dimensions_are_chosen(folder, classify, tmp_path, words, made):
     assert sorted(d.name for d in extra) == made and all(d.dtype == np.float32 for d in extra)
 
 
-@pytest.mark.parametrize("suffix", ["txt", "ply"])
-@pytest.mark.parametrize(("words", "made"), [("none", []), (None, ["reliability"])])
-def test_dimensions_are_chosen_for_text_and_ply(folder, classify, tmp_path, suffix, words, made):
-    out = tmp_path / f"o.{suffix}"
-    code, _, err = classify(folder / "in" / "t0.laz", out, *(("--dimensions", words) if words else ()))
-    assert code == 0, err
-    text = out.read_bytes().decode("ascii", "replace").lower()
-    names = (
-        [name.strip('"') for name in text.splitlines()[0].split(",")]
-        if suffix == "txt"
-        else re.findall(r"^property \w+ (\w+)", text, re.MULTILINE)
-    )
-    assert {"x", "y", "z", "classification", "gpstime", "amplitude"} <= set(names)
-    extra = {"margin", "reliability", "heightaboveground", "heightaboveopening_5", "ground"} & set(names)
-    assert extra == set(made) if words else set(made) <= extra
-
-
 def test_a_dimension_that_is_not_made(folder, classify, tmp_path):
     code, _, err = classify(folder / "in" / "t0.laz", tmp_path / "o.laz", "--dimensions", "Reliabilty")
     assert code == 1 and "Did you mean 'Reliability'" in err
+    code, _, err = classify(folder / "in" / "t0.laz", tmp_path / "o.ply", "--dimensions", "none")
+    assert code == 1 and "--dimensions is for LAS" in err
 
 
 def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
@@ -283,18 +276,3 @@ def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
     (tmp_path / "job.json").write_text(plain)
     assert main(["pipeline", str(tmp_path / "job.json")]) == 1
     assert "writers.copc" in capsys.readouterr().err
-
-
-def test_files_in_folders_below_are_said(tmp_path):
-    """Of a folder its own files are read; what lies below, other than the output, is not passed over in silence."""
-    survey = tmp_path / "survey"
-    for name in ("a.laz", "strip 2/b.LAZ", "strip 2/deeper/c.laz", "out/a.laz", ".hidden/d.laz"):
-        (survey / name).parent.mkdir(parents=True, exist_ok=True)
-        (survey / name).touch()
-    (said,) = overlooked([str(survey), "https://example.org/ept.json", "a.laz"], str(survey / "out"))
-    assert said.startswith(f"{survey}: 2 LAS or LAZ files in folders below are not read; '{survey}/**/*.")
-    assert not overlooked([str(survey / "out"), str(survey / "strip 2/*.LAZ")])
-    (survey / "out/ept.json").touch()
-    (survey / "out/ept-data").mkdir()
-    (survey / "out/ept-data/0-0-0-0.laz").touch()
-    assert not overlooked([str(survey / "out")])

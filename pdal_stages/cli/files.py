@@ -159,7 +159,6 @@ def add_commands(parser: Parser) -> None:
 
 def _classify(options: argparse.Namespace) -> int:
     from ..pipeline.classify_request import WRITTEN, ClassifyRequest
-    from ..pipeline.inputs_outputs import overlooked
     from ..tiling.classify import ClassifyTask
     from ..tiling.command import classify, options_of
 
@@ -185,7 +184,7 @@ def _classify(options: argparse.Namespace) -> int:
         vegetation_heights=options.vegetation_heights,
         keep_sure=options.keep_sure,
     )
-    print_messages(*request.cost, *overlooked(options.inputs, options.output))
+    print_messages(*request.cost)
     task = ClassifyTask(
         tuple(options.inputs),
         options.output,
@@ -210,13 +209,11 @@ def _objects(options: argparse.Namespace) -> int:
 
 
 def _review(options: argparse.Namespace) -> None:
-    from ..pipeline.inputs_outputs import overlooked
     from ..pipeline.reviewing import write_review
     from ..reports.reviewpage import lines
 
     html = str(Path(options.output).with_suffix(".html")) if options.html is None else options.html
     how = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
-    print_messages(*overlooked(options.inputs))
     found = write_review(options.inputs, options.output, html, options.json or "", **how)
     print("\n".join(lines(found.to_dict())))
     print(f"written to {', '.join(name for name in (options.output, html, options.json) if name)}")

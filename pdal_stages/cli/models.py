@@ -113,7 +113,7 @@ def _models(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from ..pipeline.inputs_outputs import input_files, overlooked
+    from ..pipeline.inputs_outputs import input_files
     from ..pipeline.training import surveys_of
     from ..stages.loading import load_model
     from ..tiling.command import interruptible, options_of
@@ -122,7 +122,6 @@ def _train(options: argparse.Namespace) -> None:
     named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base", "passes")
     extra = {name: value for name in named if (value := getattr(options, name)) is not None}
     files, surveys = input_files(options.inputs), {}
-    print_messages(*overlooked(options.inputs))
     if options.surveys is not None:
         surveys = surveys_of(files, options.surveys)
     task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
@@ -137,12 +136,10 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _adapt(options: argparse.Namespace) -> None:
-    from ..pipeline.inputs_outputs import overlooked
     from ..stages.loading import load_model
     from ..tiling.adapting import AdaptTask
     from ..tiling.command import interruptible, options_of
 
-    print_messages(*overlooked(options.inputs))
     task = AdaptTask(options.inputs, options.model, options.teacher, options.sure, options_of(options))
     with interruptible():
         print_messages(*task.run())
@@ -152,7 +149,6 @@ def _adapt(options: argparse.Namespace) -> None:
 
 def _accuracy(options: argparse.Namespace) -> None:
     from ..pipeline.accuracy_files import compare_files
-    from ..pipeline.inputs_outputs import overlooked
 
     if options.objects:
         _compare_objects(options)
@@ -163,7 +159,6 @@ def _accuracy(options: argparse.Namespace) -> None:
         raise StageError("--reference and --model exclude each other", found=options.model)
     other = "Classification" if options.reference or options.model else "Reference"
     outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
-    print_messages(*overlooked(options.inputs))
     print_messages(
         *compare_files(
             options.inputs,

@@ -11,7 +11,6 @@ from ..base.errors import ModelError, OptionError, suggest
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation, registry
 from ..stages.loading import loaded_model
-from . import pdal as pdal_env
 from .filenames import LAS_WRITERS
 from .inputs_outputs import overridden, reader_of, writer_of
 from .las_output import extra_dims_option
@@ -214,27 +213,9 @@ class ClassifyRequest:
             listed = extra_dims_option([source], self.beside)
             writer |= {"extra_dims": listed} if listed else {}
         elif self.dimensions != WRITTEN and "all" not in self.dimensions:
-            writer = self._writer_of_some(writer, source)
-        return Pipeline([reader_of(source, "input"), *self.stages, writer], self.overrides)
-
-    def _writer_of_some(self, writer: dict[str, Any], source: str) -> dict[str, Any]:
-        """A writer of text or PLY that writes the input's own dimensions and :attr:`beside` alone."""
-        kind = writer.get("type") or pdal_env.writer_type(str(writer["filename"]))
-        options = {"writers.text": {"keep_unspecified": False}, "writers.ply": {}}
-        if kind in ("writers.gdal", "writers.ogr"):
-            return writer
-        if kind not in options:
             raise OptionError(
-                f"--dimensions is for LAS, LAZ, text and PLY; {kind or 'this format'} takes all there are",
-                found=str(writer["filename"]),
+                "--dimensions is for LAS and LAZ; other formats take all there are",
+                found=target,
                 cure="Leave it out, or write a pipeline",
             )
-        arrays = pdal_env.execute([{**reader_of(source, "input"), "count": 1}]).arrays
-        own = list(arrays[0].dtype.names or ()) if arrays else []
-        listed = ",".join(dict.fromkeys([*own, *self.beside]))
-        return {
-            **writer,
-            "type": kind,
-            "order" if kind == "writers.text" else "dims": listed,
-            **options[kind],
-        }
+        return Pipeline([reader_of(source, "input"), *self.stages, writer], self.overrides)

@@ -98,30 +98,6 @@ def locations(path: str, column: str = "location") -> list[str]:
     return [str(file if file.exists() else Path(name).absolute()) for name, file in there.items()]
 
 
-def overlooked(names: Sequence[str], but: str = "") -> list[str]:
-    """A message for each input that is a folder with LAS or LAZ files further down, which are not read.
-
-    `but`: an output, whose folder is not looked into; nor are hidden ones.
-    """
-    found = []
-    for folder in [Path(name) for name in names if "://" not in name]:
-        if not folder.is_dir() or (folder / EPT).is_file():
-            continue
-        deeper = [
-            path
-            for path in folder.glob("*/**/*.[lL][aA][sSzZ]")
-            if not path.resolve().is_relative_to(Path(but or os.devnull).resolve())
-        ]
-        suffixes = [
-            p.suffix for p in deeper if not any(part[0] == "." for part in p.relative_to(folder).parts)
-        ]
-        if suffixes:
-            every = folder / "**" / f"*{max(suffixes, key=suffixes.count)}"
-            what = "file in folders below is" if len(suffixes) == 1 else "files in folders below are"
-            found.append(f"{folder}: {len(suffixes):,} LAS or LAZ {what} not read; '{every}' names them, too")
-    return found
-
-
 def is_ept(name: str) -> bool:
     """Whether an input is an EPT source."""
     return name.startswith("ept://") or Path(name).name == EPT

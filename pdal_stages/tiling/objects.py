@@ -24,7 +24,7 @@ from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import refuse_unclassified
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import input_files, outputs_of, overlooked
+from ..pipeline.inputs_outputs import input_files, outputs_of
 from ..pipeline.overrides import Override
 from ..pipeline.parts import las_chunks, reads_in_parts, reference_and_wkt
 from ..pipeline.references import check_one_reference, without_reference
@@ -64,7 +64,6 @@ def run_command(options: argparse.Namespace) -> int:
     stage = writer(options.output, options.overrides, **given)
     check_target(options.output)
     inputs = input_files(options.inputs)
-    print_messages(*overlooked(options.inputs))
     more = [Output(options.metadata, "metadata", JSON)] if options.metadata else []
     check_outputs(
         [*(Output(str(file), "objects") for file in target_files(options.output)), *more],
