@@ -52,13 +52,28 @@ def survey(tmp_path_factory, write_las):
     return base
 
 
+def run(survey, *words):
+    model = ("--model", str(survey / "m.model"), "--workers", "0")
+    return main(["classify", *map(str, words), *model, *OPTIONS])
+
+
 @pytest.fixture()
 def classify(survey, capsys):
-    def go(*words):
-        code = main(["classify", *map(str, words), "--model", str(survey / "m.model"), *OPTIONS])
-        return code, *capsys.readouterr()
+    return lambda *words: (run(survey, *words), *capsys.readouterr())
 
-    return go
+
+@pytest.fixture(scope="module")
+def whole(survey):
+    """The town in one piece."""
+    assert run(survey, survey / "town.laz", survey / "whole.laz") == 0
+    return survey / "whole.laz"
+
+
+@pytest.fixture(scope="module")
+def fresh(survey):
+    """The four files in tiles, undisturbed."""
+    assert run(survey, survey / "in", survey / "fresh/", "--tile", 45) == 0
+    return contents(survey / "fresh")
 
 
 def values(*paths: Path) -> dict[str, np.ndarray]:
@@ -74,16 +89,12 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.glob("*.la?"))}
 
 
-def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, classify, tmp_path):
-    code, out, err = classify(survey / "town.laz", tmp_path / "whole.laz")
-    assert code == 0, err
+def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, classify, whole, tmp_path):
     target = tmp_path / "made" / "classified"
-    code, out, err = classify(
-        survey / "in", target, "--tile", 30, "--workers", 0, "--metadata", tmp_path / "m.json"
-    )
+    code, out, err = classify(survey / "in", target, "--tile", 30, "--metadata", tmp_path / "m.json")
     assert code == 0, err
     assert sorted(path.name for path in target.glob("t*")) == ["t0.laz", "t1.las", "t2.laz", "t3.laz"]
-    one = values(tmp_path / "whole.laz")
+    one = values(whole)
     other = values(*target.glob("t*"))
     for name in one:
         assert np.array_equal(one[name], other[name]), name
@@ -115,27 +126,24 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, cla
 
     before = contents(target)
     (target / "t2.laz").unlink()
-    code, out, err = classify(
-        survey / "in", target, "--workers", 0, "--resume"
-    )  # the tiles stay those of the first run
+    code, out, err = classify(survey / "in", target, "--resume")  # the tiles stay those of the first run
     assert code == 0 and "1 file written, 3 kept from an earlier run" in out, out + err
     assert contents(target) == before
 
 
-def test_a_damaged_file_is_named_and_done_once_it_is_repaired(survey, classify, tmp_path):
+def test_a_damaged_file_is_named_and_done_once_it_is_repaired(survey, classify, fresh, tmp_path):
     (tmp_path / "in").mkdir()
     for path in (survey / "in").iterdir():
         (tmp_path / "in" / path.name).write_bytes(path.read_bytes())
     whole = (tmp_path / "in" / "t3.laz").read_bytes()
     (tmp_path / "in" / "t3.laz").write_bytes(whole[:1000])
-    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 20, "--workers", 0)
+    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 45)
     assert code == 1 and "t3.laz" in err and "failed" in out
     assert not (tmp_path / "out" / "t3.laz").exists()
     (tmp_path / "in" / "t3.laz").write_bytes(whole)
-    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 20, "--workers", 0, "--resume")
+    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 45, "--resume")
     assert code == 0, err
-    classify(survey / "in", tmp_path / "fresh/", "--tile", 20, "--workers", 0)
-    assert contents(tmp_path / "out") == contents(tmp_path / "fresh")
+    assert contents(tmp_path / "out") == fresh
 
 
 def test_a_dry_run_writes_nothing_and_finds_what_is_wrong(survey, classify, tmp_path):
@@ -148,70 +156,53 @@ def test_a_dry_run_writes_nothing_and_finds_what_is_wrong(survey, classify, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_one_output_for_each_tile(survey, classify, tmp_path):
-    code, _, err = classify(survey / "in", tmp_path / "out/", "--tile", 45, "--per", "tile", "--workers", 0)
+def test_one_output_for_each_tile(survey, classify, whole, tmp_path):
+    code, _, err = classify(survey / "in", tmp_path / "out/", "--tile", 45, "--per", "tile")
     assert code == 0, err
     made = list((tmp_path / "out").glob("*.laz"))
     assert len(made) == 6 and all(re.fullmatch(r"\d+_\d+\.laz", path.name) for path in made)
-    classify(survey / "town.laz", tmp_path / "whole.laz")
-    for name, array in values(tmp_path / "whole.laz").items():
+    for name, array in values(whole).items():
         assert np.array_equal(array, values(*made)[name]), name
 
 
-def test_a_cloud_beyond_the_memory_is_cut(survey, classify, tmp_path):
-    code, out, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "1.3GB", "--tile", 30)
+def test_a_cloud_beyond_the_memory_is_cut(survey, classify, whole, tmp_path):
+    code, out, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "1.3GB", "--tile", 60)
     assert code == 0 and "tiles done" in out, err
-    classify(survey / "town.laz", tmp_path / "whole.laz")
-    clouds.same_points(tmp_path / "cut.laz", tmp_path / "whole.laz")
+    clouds.same_points(tmp_path / "cut.laz", whole)
     code, _, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "0.2GB")
     assert code == 1 and "the memory does not suffice" in err and "--memory" in err
 
 
-def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, tmp_path, monkeypatch):
+def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, fresh, tmp_path, monkeypatch):
     from pdal_stages.tiling.tile import TileTask
 
     run, calls = TileTask.run, []
 
     def some(self):
         calls.append(self.tile)
-        if len(calls) == 5:
+        if len(calls) == 4:
             raise KeyboardInterrupt
         return run(self)
 
     monkeypatch.setattr(TileTask, "run", some)
-    code, out, err = classify(survey / "in", tmp_path / "out/", "--tile", 30, "--workers", 0)
-    assert (
-        code == 130 and "4 of 11 tiles done" in err and "--resume" in err and "pdal-stages classify" in err
-    ), err
+    code, out, err = classify(survey / "in", tmp_path / "out/", "--tile", 45)
+    assert code == 130 and "3 of 6 tiles done" in err and "--resume" in err and "pdal-stages" in err, err
     assert re.search(r"\d of 4 files written", err)
     monkeypatch.undo()
-    code, out, err = classify(survey / "in", tmp_path / "out/", "--workers", 0, "--resume")
-    assert code == 0 and "4 kept from an earlier run" in out, out + err
-    classify(survey / "in", tmp_path / "fresh/", "--tile", 30, "--workers", 0)
-    assert contents(tmp_path / "out") == contents(tmp_path / "fresh")
+    code, out, err = classify(survey / "in", tmp_path / "out/", "--resume")
+    assert code == 0 and "3 kept from an earlier run" in out, out + err
+    assert contents(tmp_path / "out") == fresh
 
 
 # ---- memory, and time left -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("text", "size"),
-    [
-        ("4GB", 4 * 10**9),
-        ("4 GiB", 4 * 2**30),
-        ("1.5g", 15 * 10**8),
-        ("500M", 5 * 10**8),
-        ("77000000", 77 * 10**6),
-    ],
-)
-def test_amounts_of_memory(text, size):
-    assert parse_size(text) == size
-
-
-@pytest.mark.parametrize("text", ["", "GB", "-1GB", "0", "4", "4 apples", "1e9"])
-def test_what_is_no_amount_of_memory(text):
-    with pytest.raises(OptionError, match="a number and a unit"):
-        parse_size(text)
+def test_amounts_of_memory():
+    for text, size in {"4GB": 4e9, "4 GiB": 4 * 2**30, "1.5g": 15e8, "500M": 5e8, "77000000": 77e6}.items():
+        assert parse_size(text) == size
+    for text in ("", "GB", "-1GB", "0", "4", "4 apples", "1e9"):
+        with pytest.raises(OptionError, match="a number and a unit"):
+            parse_size(text)
 
 
 def test_there_is_memory():
