@@ -15,7 +15,6 @@ import numpy as np
 
 from ..base.arrays import begins_run
 from ..base.errors import StageError
-from ..base.jit import device, njit
 
 #: Coordinates beyond this many meters are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
@@ -129,7 +128,7 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
     """
     n = len(xyz)
     key, width, x0, y0, ranks = _keys(xyz, cell)
-    order = np.argsort(key)
+    order = np.lexsort((xyz[:, 2], xyz[:, 1], xyz[:, 0], key))
     if n < 2**31:
         order = order.astype(np.int32)
     key = key[order]
@@ -145,9 +144,7 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
     for k in range(3):
         np.take(xyz[:, k], order, out=spare[k, :n], mode="clip")  # "raise" would make a copy
     spare += 0.0  # -0.0 becomes 0.0: equal coordinates are equal bits
-    x, y, z = spare[:, :n]
     cell_start = np.concatenate((starts, [n])).astype(np.int64)
-    sort_cells(x, y, z, order, cell_start)
     rows = np.flatnonzero(begins_run(iy))
     return CellGrid(
         cell=float(cell),
@@ -177,27 +174,3 @@ def _keys(xyz: np.ndarray, cell: float):
     iy += ix
     iy -= x0
     return iy.view(np.uint64), np.uint64(width), x0, y0, ranks
-
-
-@device(forceinline=True)
-def _before(ax, ay, az, bx, by, bz):
-    return ax < bx or (ax == bx and (ay < by or (ay == by and az < bz)))
-
-
-@njit
-def sort_cells(x, y, z, order, cell_start):
-    """Sort the points of every cell by x, then y, then z, in place (Shell 1959, Knuth's gaps)."""
-    for cell in range(len(cell_start) - 1):
-        first, last = cell_start[cell], cell_start[cell + 1]
-        gap = 1
-        while 9 * gap < last - first:
-            gap = 3 * gap + 1
-        while gap > 0:
-            for i in range(first + gap, last):
-                px, py, pz, po = x[i], y[i], z[i], order[i]
-                j = i - gap
-                while j >= first and _before(px, py, pz, x[j], y[j], z[j]):
-                    x[j + gap], y[j + gap], z[j + gap], order[j + gap] = x[j], y[j], z[j], order[j]
-                    j -= gap
-                x[j + gap], y[j + gap], z[j + gap], order[j + gap] = px, py, pz, po
-            gap //= 3
