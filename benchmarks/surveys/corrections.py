@@ -24,7 +24,7 @@ from clouds import SURVEYS, slug, true_classes
 
 from pdal_stages import cli
 from pdal_stages.objects.overlay import points_inside
-from pdal_stages.pipeline.parts import reference_and_wkt
+from pdal_stages.pipeline.references import reference_of_file
 from pdal_stages.pipeline.reviewing import review_files, review_layers
 from pdal_stages.reports.objectlayers import Layer, write_layers
 
@@ -79,7 +79,7 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
         touched |= mine
         corrected(checked_file, folder / "after.laz", truth, mine)
         area = folder / f"area{number}.gpkg"
-        write_area(area, [shapes[k] for k in chosen], reference_and_wkt(str(before))[1])
+        write_area(area, [shapes[k] for k in chosen], reference_of_file(str(before)).wkt)
         checked = folder / f"checked{number}.laz"
         run(
             "corrections", checked_file, folder / "after.laz", "--area", area, "--around", 0, "--out", checked

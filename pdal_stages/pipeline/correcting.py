@@ -19,7 +19,8 @@ from ..base.outputs import Output, check_outputs
 from ..classifier.dimensions import CHECKED
 from ..objects.outlines import vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
-from .parts import las_chunks, reads_in_parts, reference_and_wkt
+from .parts import las_chunks, reads_in_parts
+from .references import reference_of_file
 
 #: Points without a partner beyond this share: the files are of other points.
 _MOST_LOST = 0.1
@@ -72,7 +73,7 @@ def write_corrections(
     if output.lower().endswith(".copc.laz"):
         raise OptionError("corrections are written as LAS or LAZ", found=output, cure="Name it .laz")
     check_outputs([Output(output, "output")], [*filter(None, (before, after)), *areas])
-    reference, wkt = reference_and_wkt(before)
+    reference = reference_of_file(before)
     units = reference.units
     las = _read(before)
     xyz = np.column_stack([las.x, las.y, las.z])
@@ -82,7 +83,7 @@ def write_corrections(
     changed = new != codes
     checked = near_any(xyz * [units.horizontal, units.horizontal, units.vertical], changed, around)
     for area in areas:
-        checked |= _inside(area, xyz, wkt, notes)
+        checked |= _inside(area, xyz, reference.wkt, notes)
     if CHECKED in las.point_format.extra_dimension_names:
         checked |= np.asarray(las[CHECKED]) > 0
     elif CHECKED in las.point_format.dimension_names:

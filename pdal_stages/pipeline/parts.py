@@ -16,7 +16,6 @@ from ..base.las import read_header
 from ..stages.points import Points
 from . import pdal as pdal_env
 from .inputs_outputs import reader_of
-from .references import Reference, reference_of
 
 #: Points read at a time.
 PART = 1_000_000
@@ -71,19 +70,6 @@ class Part:
 def reads_in_parts(path: str) -> bool:
     """Whether parts of a file can be read: LAS, LAZ and COPC files."""
     return Path(path).suffix.lower() in (".las", ".laz") and read_header(path) is not None
-
-
-def reference_and_wkt(path: str, horizontal: str = "") -> tuple[Reference, str]:
-    """A file's reference, and its well-known text; `horizontal`: the unit that a stage was told, if any."""
-    reader: dict[str, Any] = {"filename": path}
-    if reads_in_parts(path):
-        reader |= {"type": "readers.las", "count": 1}
-    metadata = pdal_env.execute([reader], arrays=False).metadata.get("metadata", {})
-    name = next(key for key in metadata if key.startswith("readers."))
-    node = metadata[name]
-    srs = (node[0] if isinstance(node, list) else node).get("srs", {})
-    wkt = str(srs.get("horizontal") or srs.get("wkt") or "")
-    return reference_of({**reader, "type": name}, horizontal), wkt
 
 
 def parts_of(path: str, wkt: str) -> Iterator[Part]:

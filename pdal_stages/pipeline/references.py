@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,12 +45,13 @@ class Reference:
     plane: frozenset[str] = frozenset()  #: the projection's parameters; empty where they are not known
     height: str = ""  #: the authority's code of the heights' system, where it is known
     name: str = ""
+    wkt: str = ""  #: of the horizontal system, for other programs
 
 
 def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     """The reference of what a reader reads, as PDAL says; `horizontal`: the unit of x and y, where it is known better.
 
-    The reader has a type, and is restricted to as few points as it can be.
+    The reader is restricted to as few points as it can be.
 
     Raises
     ------
@@ -59,8 +60,8 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     StageError
         If its coordinates are degrees.
     """
-    metadata = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
-    node = metadata.get(reader["type"], {})
+    said = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
+    node: Any = next((node for kind, node in said.items() if kind.startswith("readers.")), {})
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
     wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
     try:
@@ -71,7 +72,14 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     plane = frozenset(w for w in words if w not in _ALIKE and not w.startswith(_ASIDE))
     root = parse_wkt(wkt)
     height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
-    return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt))
+    across = str(srs.get("horizontal") or srs.get("wkt") or "")
+    return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt), across)
+
+
+def reference_of_file(path: str, horizontal: str = "") -> Reference:
+    """The same of a file."""
+    las = read_header(path) is not None if path.lower().endswith((".las", ".laz")) else False
+    return reference_of({"filename": path} | ({"type": "readers.las", "count": 1} if las else {}), horizontal)
 
 
 def _place(path: str) -> tuple[float, float] | None:
@@ -84,9 +92,9 @@ def _place(path: str) -> tuple[float, float] | None:
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
-    """Refuse inputs of different units or reference systems; where one names none, only units are compared.
+    """Refuse inputs, by path, of different units or reference systems; where one names none, only units are compared.
 
-    `found` has one input of each kind, by path. Those are given back that name none while others do.
+    What is to be told is given back: which inputs have no reference, while others have one.
     """
     units: dict[object, str] = {}
     planes: dict[object, str] = {}
@@ -112,13 +120,8 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
                 cure="Give them one spatial reference first: pdal translate IN OUT reprojection "
                 "--filters.reprojection.out_srs=EPSG:CODE",
             )
-    without = [path for path, one in found.items() if not one.name]
-    return without if len(without) < len(found) else []
-
-
-def without_reference(paths: Sequence[str]) -> list[str]:
-    """What is said of inputs that have no spatial reference while others have one."""
-    if not paths:
+    paths = [path for path, one in found.items() if not one.name]
+    if not paths or len(paths) == len(found):
         return []
     named = ", ".join(paths[:3]) + (f" and {len(paths) - 3:,} more" if len(paths) > 3 else "")
     has, taken = ("has", "it is") if len(paths) == 1 else ("have", "they are")
@@ -129,19 +132,15 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
     """Refuse a pipeline whose LAS readers read different references, unless a stage moves points; what is to be told."""
     if any(stage.get("type") in MOVING for stage in stages):
         return []
-    alike: dict[str, list[str]] = {}
-    first: dict[str, dict[str, Any]] = {}
-    for stage in stages:
-        if is_writer(stage, stages):
-            continue
+    readers: dict[str, tuple[str, dict[str, Any]]] = {}
+    for stage in [stage for stage in stages if not is_writer(stage, stages)]:
         options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}
         options.setdefault("type", "readers.las")
         for path in readers_files([stage], las=True):
-            reader = {**options, "filename": path, "count": 1}
-            kind = f"{projection(path)} {options}"
-            first.setdefault(kind, reader)
-            alike.setdefault(kind, []).append(path)
-    if len(first) < 2:
+            readers[path] = f"{projection(path)} {options}", {**options, "filename": path, "count": 1}
+    kinds = dict(readers.values())
+    if len(kinds) < 2:
         return []
-    without = check_one_reference({r["filename"]: reference_of(r, horizontal) for r in first.values()})
-    return without_reference([path for paths in alike.values() if paths[0] in without for path in paths])
+    of_kind = {kind: reference_of(reader, horizontal) for kind, reader in kinds.items()}
+    found = {path: of_kind[kind] for path, (kind, _) in readers.items()}
+    return check_one_reference(found)

@@ -28,8 +28,8 @@ from ..reports.reviewpage import review_page, styles
 from ..stages.loading import loaded_model
 from ..stages.preparation import PREPARATION, made_of_coordinates
 from .inputs_outputs import input_files
-from .parts import Part, parts_of, reads_in_parts, reference_and_wkt
-from .references import check_one_reference, without_reference
+from .parts import Part, parts_of, reads_in_parts
+from .references import check_one_reference, reference_of_file
 from .workers import each_file
 
 #: What is written, in this order.
@@ -126,12 +126,11 @@ def review_files(
         checks.number("'--cell'", cell, 0.5, 100, unit="m")
     checks.number("'--share'", share, 0, 1, above=True)
     files = input_files(inputs)
-    references = {path: reference_and_wkt(path) for path in files}
-    without = check_one_reference({path: one for path, (one, _) in references.items()})
-    print_messages(*without_reference(without))
+    references = {path: reference_of_file(path) for path in files}
+    print_messages(*check_one_reference(references))
     side = cell or side_for(*_extent(files, references))
     found: list[ReviewCells] = []
-    work = [(path, references[path][1], model, side, number) for number, path in enumerate(files)]
+    work = [(path, references[path].wkt, model, side, number) for number, path in enumerate(files)]
     with Progress(len(work), "reading", "files") as line:
         for _, answer in each_file(cells_of, work, workers):
             if answer.reason:
@@ -177,7 +176,7 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
         if header is not None and header.count:
             west, south, east, north = header.box
             points += header.count
-            area += (east - west) * (north - south) * references[path][0].units.horizontal ** 2
+            area += (east - west) * (north - south) * references[path].units.horizontal ** 2
     return (points, area) if area > 0 else (1, 1e-9)
 
 
@@ -207,9 +206,9 @@ def write_review(
     outputs = [Output(path, what, kind) for what, (path, kind) in pages.items() if path]
     check_outputs([Output(output, "review"), *outputs], [*input_files(inputs), *inputs])
     found = review_files(inputs, **how)
-    reference, wkt = reference_and_wkt(found.files[0])
+    reference = reference_of_file(found.files[0])
     layers = review_layers(found, reference.units.horizontal)
-    write_layers(output, layers, wkt, styles(found.patches.errors))
+    write_layers(output, layers, reference.wkt, styles(found.patches.errors))
     if json_file:
         write_whole(json_file, (json.dumps(found.to_dict(), indent=1) + "\n").encode())
     if html:

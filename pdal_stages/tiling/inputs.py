@@ -20,7 +20,7 @@ from ..base.units import Units
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import LAS_READERS, named_files
 from ..pipeline.inputs_outputs import in_folders, locations
-from ..pipeline.references import Reference, check_one_reference, reference_of, without_reference
+from ..pipeline.references import Reference, check_one_reference, reference_of
 from .grid import Box, TileGrid, check_number, touching, union
 from .settings import Density, Extent, TilingOptions, block_bytes, settled
 from .store import fingerprint
@@ -279,11 +279,11 @@ class Survey:
             reasons = iter(self.unreadable.values())
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if needed:
-            without = set(check_one_reference(found))
-            alike = [[source.path for source in group] for group in groups.values()]
-            self.messages += without_reference(
-                [path for each in alike if without & set(each) for path in each]
-            )
+            readable = [
+                [one.path for one in group if one.path not in self.unreadable] for group in groups.values()
+            ]
+            of_all = {path: found[next(p for p in each if p in found)] for each in readable for path in each}
+            self.messages += check_one_reference(of_all)
         return next(iter(found.values())).units.horizontal
 
     def _reference_of(self, source: InputSource, horizontal: str) -> Reference:

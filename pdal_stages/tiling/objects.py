@@ -26,8 +26,8 @@ from ..objects.cells import refuse_unclassified
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import input_files, outputs_of
 from ..pipeline.overrides import Override
-from ..pipeline.parts import las_chunks, reads_in_parts, reference_and_wkt
-from ..pipeline.references import check_one_reference, without_reference
+from ..pipeline.parts import las_chunks, reads_in_parts
+from ..pipeline.references import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
@@ -147,10 +147,9 @@ def _objects_of_files(
     inputs: Sequence[str], stage: ObjectsWriter, workers: int
 ) -> tuple[Objects, Units, str]:
     """The objects of all files together; units of the coordinates and their reference (WKT)."""
-    references = {path: reference_and_wkt(path, stage.horizontal_unit) for path in inputs}
-    without = check_one_reference({path: one for path, (one, _) in references.items()})
-    print_messages(*without_reference(without))
-    units, wkt = references[inputs[0]][0].units, references[inputs[0]][1]
+    references = {path: reference_of_file(path, stage.horizontal_unit) for path in inputs}
+    print_messages(*check_one_reference(references))
+    units, wkt = references[inputs[0]].units, references[inputs[0]].wkt
     cells = _all_cells(inputs, stage, wkt, workers)
     size, thin = cells.size, cells.thin()
     while stage.widens and cells.thin() and cells.size < LARGEST:

@@ -11,8 +11,7 @@ import pytest
 from robustness_kit import HAG, job, las, scene
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.pipeline.parts import reference_and_wkt
-from pdal_stages.pipeline.references import reference_of
+from pdal_stages.pipeline.references import reference_of, reference_of_file
 
 pytestmark = pytest.mark.pdal
 
@@ -274,6 +273,6 @@ def test_cut_short_whoever_reads_it(tmp_path, write_las):
     """Newer PDAL crashes of such a file, so it is asked for nothing of it: not for a reference, nor for dimensions."""
     cut = damaged(write_las(tmp_path / "cut.laz", scene(5000)), lambda d: d[:-100])
     reader = {"type": "readers.las", "filename": str(cut), "count": 1}
-    for read in (lambda: reference_of(reader), lambda: reference_and_wkt(str(cut))):
+    for read in (lambda: reference_of(reader), lambda: reference_of_file(str(cut))):
         with pytest.raises(StageError, match=r"cut\.laz: the LAS file is damaged: it is cut short"):
             read()
