@@ -8,7 +8,7 @@ import pytest
 from test_terrain_morphological import town
 
 import pdal_stages as ps
-from pdal_stages.terrain import filtered_ground, groundblocks
+from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.decks import level_points
 from pdal_stages.terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
@@ -19,7 +19,7 @@ from pdal_stages.tiling.ground import FirstRoundTask
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
 MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")
-SIDE, TILE = 640, 200
+SIDE, TILE = 460, 160
 
 
 @pytest.mark.parametrize("cell", [1.0, 0.7, 3.0])
@@ -65,7 +65,7 @@ def of_files(folder, name):
 
 @pytest.mark.pdal
 @pytest.mark.parametrize(
-    "before", [[], [{"type": "filters.detachednoise"}], [{"type": "filters.range", "limits": "Z[60:]"}]]
+    "before", [[{"type": "filters.detachednoise"}], [{"type": "filters.range", "limits": "Z[60:]"}]]
 )
 def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
     run = in_tiles(survey, [*before, HEIGHTS], tmp_path / "out")
@@ -117,12 +117,12 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
     with monkeypatch.context() as patch:
         break_a_tile(patch)
         assert len(in_tiles(survey, [HEIGHTS], folder).failures) >= 1
-    assert len(made) == len(set(made)) == 16
+    assert len(made) == len(set(made)) == 9
     left = folder / ".pdal-stages" / "kept"
-    assert len(list(left.glob("*.first.npz"))) == 16
+    assert len(list(left.glob("*.first.npz"))) == 9
     (left / "0_0.first.npz").unlink()
-    np.savez(left / "-200_0.first.npz", around=np.array([[-1.0, 100.0, -500.0]]))
-    with open(left / "400_400.first.npz", "r+b") as file:
+    np.savez(left / "-160_0.first.npz", around=np.array([[-1.0, 100.0, -500.0]]))
+    with open(left / "320_320.first.npz", "r+b") as file:
         file.truncate(100)
     made.clear()
     assert not in_tiles(survey, [HEIGHTS], folder, resume=True).failures
@@ -146,8 +146,8 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_pat
     failed = {job.tile for job in run.tiles if job.state == "failed"}
     assert (0, 0) in failed and all("no luck" in job.reason for job in run.tiles if job.tile in failed)
     monkeypatch.setattr(FirstRoundTask, "run", lambda self: (_ for _ in ()).throw(ps.StageError("no luck")))
-    with pytest.raises(ps.StageError, match="all failed for one reason"):
-        in_tiles(survey, [small], tmp_path / "other")
+    run = in_tiles(survey, [small], tmp_path / "other")
+    assert all("no luck" in job.reason for job in run.tiles)
 
 
 def blocks_of(points, options, near):
@@ -168,10 +168,10 @@ def blocks_of(points, options, near):
 
 @pytest.mark.parametrize(
     ("origin", "cell", "window", "strays"),
-    [((770_500.0, 6_277_550.0), 1.0, 30.0, True), ((1000.0, 2000.0), 0.5, 5.0, False)],
+    [((770_500.0, 6_277_550.0), 1.0, 30.0, True), ((1000.0, 2000.0), 0.7, 5.0, False)],
 )
 def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, strays):
-    x, y, z, _ = town(4, side=900, density=0.5, origin=origin)
+    x, y, z, _ = town(4, side=900, density=0.2, origin=origin)
     if strays:  # far from all else, and a hole in the middle
         away = np.random.default_rng(1).uniform(0, 60, (2, 400))
         x, y, z = (
@@ -218,39 +218,21 @@ def test_points_by_block_are_by_the_cells_of_blocks(cell):
     assert by_block(*np.empty((3, 0)), use[:0], cell) == {}
 
 
-def test_decks_of_a_block_are_looked_for_in_one_piece(monkeypatch):
-    """In squares each would be looked at with as much around as the whole, four times the work."""
-    found = []
-
-    def levels(x, y, z, use, largest):
-        found.append((np.ptp(x) + 1, np.ptp(y) + 1, largest))
-        return np.empty((0, 5)), np.empty(0, np.int64)
-
-    monkeypatch.setattr(groundblocks, "levels_near_decks", levels)
-    options = FilterOptions(decks=True)
-    away = reach_of_block(options) + 40
-    axes = np.meshgrid(*[np.arange(-away, BLOCK_SIDE + away, 8) + 0.5] * 2)
-    cells_of_block(*(axis.ravel() for axis in axes), np.zeros(axes[0].size), (0, 0), options)
-    ((across, along, largest),) = found
-    assert BLOCK_SIDE < across * along <= largest
-
-
 def test_a_block_without_points_has_no_cells():
     none = cells_of_block(*np.empty((3, 0)), (3, -4), FilterOptions(openings=(5,)))
     assert none.column.size == 0 and none.opened.shape == (1, 0)
 
 
-@pytest.mark.parametrize("name", ["viaduct", "river"])
-def test_decks_of_blocks_are_those_of_the_whole(name):
+def test_decks_of_blocks_are_those_of_the_whole():
     from bridge_scenes import SCENES, scan
 
-    xyz, _ = scan(SCENES[name](), 3.0)
+    xyz, _ = scan(SCENES["river"](), 2.0)
     middle = np.array([xyz[:, 0].mean() - 1024.0, xyz[:, 1].mean() - 2048.0, 0.0])  # where four blocks meet
     x, y, z = (xyz - middle).T
     use = np.random.default_rng(0).random(len(x)) < 0.95
     options = {"decks": True, "openings": (5,)}
     whole = filtered_ground(x, y, z, mask=use, **options)
-    assert np.count_nonzero(whole["Deck"]) > 500
+    assert np.count_nonzero(whole["Deck"]) > 300
     left = np.union1d(lowest_of_cells(x, y, z, use, 1.0), level_points(x, y, z, use))
     made = FilterOptions(openings=(5,), decks=True)
     inside = by_block(x, y, z, use, 1.0)
