@@ -226,9 +226,15 @@ classes.
                 cure="Check the reader's file and the filters before this stage",
             )
         training = self.training_on(points)
-        clouds = [cloud for _, cloud in self.surveys(self.cloud_of(points, training), points)]
+        clouds = [cloud for _, cloud in self.surveys(self.cloud_of(points, training))]
         self.finish(train(clouds, training), points.report)
         return {}
+
+    @property
+    def named(self) -> str:
+        """The files, for the model file."""
+        names = [Path(name).name for name in self.files]
+        return ", ".join([*names[:_NAMED], *["..."] * (len(names) > _NAMED)]) or "the points"
 
     def cloud_of(
         self, points: Points, training: TrainingOptions, marks: Mapping[str, NDArray] | None = None
@@ -238,12 +244,13 @@ classes.
         needed = required((*training.inputs, *filter(None, [self.groups])))
         dimensions = {name: points.dimension(name) for name in needed}
         dimensions |= {n: points.arrays[n] for n in welcome(training.inputs) if n in points.arrays}
-        names = [Path(name).name for name in self.files]
+        if self.survey:
+            dimensions[self.survey] = points.dimension(self.survey)
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
             dimensions=dimensions | dict(marks or {}),
-            name=", ".join([*names[:_NAMED], *["..."] * (len(names) > _NAMED)]) or "the points",
+            name=self.named,
             mask=self._mask(points) if marks is None else points.mask,
         )
         gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
@@ -312,11 +319,11 @@ classes.
         choice.say(points.report)
         return choice.mask(looked, points.xyz)
 
-    def surveys(self, cloud: TrainingCloud, points: Points) -> list[tuple[float, TrainingCloud]]:
-        """The points as one cloud, or one for each value of the dimension `survey`, after that value."""
+    def surveys(self, cloud: TrainingCloud) -> list[tuple[float, TrainingCloud]]:
+        """The cloud as it is, or one for each value of the dimension `survey`, after that value."""
         if not self.survey:
             return [(0.0, cloud)]
-        value = points.dimension(self.survey)
+        value = np.asarray(cloud.dimensions[self.survey])
         parts = [(float(one), cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
         return [(one, replace(part, name=f"{self.survey} {one:g}", survey=None)) for one, part in parts]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -37,7 +37,7 @@ from ..stages.points import HOLDS_NOWHERE
 from .inputs import find_sources, read_extent
 from .outputs import NewValues, PieceResults, merged, of_own_points
 from .plan import TilePlan, make_plan
-from .report import Job, TiledRun
+from .report import TiledRun
 from .run import run_plan
 from .settings import TilingOptions, fits_whole
 from .store import load_arrays, save_arrays, written
@@ -54,31 +54,16 @@ _NAMED = 3
 
 @dataclass(frozen=True)
 class TrainTask:
-    """What a model is trained on, and how.
+    """What a model is trained on, and how."""
 
-    Attributes
-    ----------
-    files : sequence of str
-        Labeled inputs.
-    model : str
-        The file to write.
-    overrides : sequence of Override
-    given : mapping
-        Options of ``writers.classifiermodel``.
-    options : TilingOptions
-    surveys : mapping of str to sequence of str
-        The files of each survey, where these do not see each other.
-    survey : str
-        Of which survey all files are.
-    """
-
-    files: Sequence[str]
-    model: str
+    files: Sequence[str]  #: labeled inputs
+    model: str  #: the file to write
     overrides: Sequence[Override] = ()
-    given: Mapping[str, Any] = field(default_factory=dict)
+    given: Mapping[str, Any] = field(default_factory=dict)  #: options of ``writers.classifiermodel``
     options: TilingOptions = field(default_factory=TilingOptions)
+    #: the files of each survey, where these do not see each other
     surveys: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    survey: str = ""
+    survey: str = ""  #: of which survey all files are
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
@@ -169,7 +154,7 @@ class TrainTask:
                 if task.survey:
                     yield replace(cloud, name=task.survey, survey=task.survey)
                 else:
-                    yield from (one for _, one in self.stage.surveys(cloud, points))
+                    yield from (one for _, one in self.stage.surveys(cloud))
 
         made = clouds()
         first = next(made)  # what is trained on follows from its dimensions
@@ -230,14 +215,6 @@ class TrainTask:
         known = (is_ept(name) or CHECKED in extra_dimensions(name) for name in self.files)
         return self.stage.checked_only and any(known)
 
-    def _choice(self, jobs: Iterable[Job], report: Report) -> CheckedChoice | None:
-        """What points samples are drawn from, where a person checked any."""
-        choice = self.stage.choice(job.record["looked"] for job in jobs if "looked" in job.record)
-        if not choice:
-            return None
-        choice.say(report)
-        return choice
-
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
     ) -> tuple[Report, list[TiledCloud], list[str]]:
@@ -254,17 +231,21 @@ class TrainTask:
         side = run.summary["tile"] * run.summary["meters_per_unit"]
         clouds: dict[float, TiledCloud] = {}
         dimensions: list[str] | None = None
-        choice = self._choice(run.tiles, report)
+        looked = (job.record["looked"] for job in run.tiles if "looked" in job.record)
+        choice = self.stage.choice(looked) or None  # what samples are drawn from, where a person checked any
+        if choice:
+            choice.say(report)
         for job in run.tiles:
-            for number, cloud in enumerate(job.record.get("clouds", ())):
-                _check_same(cloud["dimensions"], dimensions or cloud["dimensions"])
-                dimensions = cloud["dimensions"]
-                if cloud["value"] not in clouds:
-                    clouds[cloud["value"]] = TiledCloud(folder / f"cloud{len(clouds)}", side)
-                assert job.outputs is not None
-                points = _read_back(job.outputs[0], number, self.survey or cloud["name"], self.survey, choice)
-                assert job.tile is not None
-                clouds[cloud["value"]].put(job.tile, points)
+            if "dimensions" in job.record:
+                assert job.outputs is not None and job.tile is not None
+                _check_same(job.record["dimensions"], dimensions or job.record["dimensions"])
+                dimensions = job.record["dimensions"]
+                for value, cloud in self.stage.surveys(_read_back(job.outputs[0], self.stage.named, choice)):
+                    if value not in clouds:
+                        clouds[value] = TiledCloud(folder / f"cloud{len(clouds)}", side)
+                    if self.survey:
+                        cloud = replace(cloud, name=self.survey, survey=self.survey)
+                    clouds[value].put(job.tile, cloud)
             for path in job.outputs or ():
                 Path(path).unlink(missing_ok=True)
         if dimensions is None:
@@ -283,7 +264,7 @@ def _check_same(found: Sequence[str], before: Sequence[str]) -> None:
 
 def _say(report: Report, run: TiledRun) -> None:
     """What the stage says of tiles, once each; that it takes no point of a tile only where it takes none of any."""
-    said = [job.record.get("said", []) for job in run.tiles if job.record.get("clouds")]
+    said = [job.record["said"] for job in run.tiles if "said" in job.record]
     for text in dict.fromkeys(text for lines in said for text in lines):
         if not text.startswith(HOLDS_NOWHERE):
             report.notes.append(text)
@@ -294,16 +275,15 @@ def _say(report: Report, run: TiledRun) -> None:
     report.figures["ignored"] = ignored
 
 
-def _read_back(path: str, number: int, name: str, survey: str, choice: CheckedChoice | None) -> TrainingCloud:
-    """A cloud's points of a tile, as :class:`Taking` wrote them."""
-    mark = f"{number}/"
-    arrays = {key.removeprefix(mark): v for key, v in load_arrays(path).items() if key.startswith(mark)}
+def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCloud:
+    """The points of a tile, as :class:`Taking` wrote them."""
+    arrays = load_arrays(path)
     dimensions = {key[2:]: values for key, values in arrays.items() if key.startswith("d/")}
-    mask, told = arrays.get("mask"), survey or None
     wanted, sure = (dimensions.pop(mark, np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
+    mask = arrays.get("mask")
     if choice is not None:
         mask = choice.mask(Looked(wanted, sure, arrays["labels"]), arrays["xyz"])
-    return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, mask, told)
+    return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, mask)
 
 
 @dataclass(frozen=True)
@@ -327,25 +307,25 @@ class Taking:
         points = points_of_views(run.arrays, run.metadata, stage.points)
         run.arrays.clear()
         training = stage.training_on(points)
-        arrays: dict[str, NDArray] = {}
         marks: dict[str, NDArray] = {}
         looked: dict[str, Any] = {}
         if self.looks:
-            found, looked = stage.looked(points)
-            marks = {_WANTED: found.wanted, _SURE: found.sure}
-        clouds = []
-        whole = stage.cloud_of(points, training, marks)
-        for number, (value, cloud) in enumerate(stage.surveys(whole, points)):
-            arrays |= {f"{number}/xyz": cloud.xyz, f"{number}/labels": np.asarray(cloud.labels)}
-            if cloud.mask is not None:
-                arrays[f"{number}/mask"] = np.asarray(cloud.mask)
-            arrays |= {f"{number}/d/{name}": np.asarray(v) for name, v in cloud.dimensions.items()}
-            clouds.append({"value": value, "name": cloud.name, "dimensions": list(training.dimensions)})
+            found, counts = stage.looked(points)
+            marks, looked = {_WANTED: found.wanted, _SURE: found.sure}, {"looked": counts}
+        cloud = stage.cloud_of(points, training, marks)
+        arrays = {"xyz": cloud.xyz, "labels": np.asarray(cloud.labels)}
+        if cloud.mask is not None:
+            arrays["mask"] = np.asarray(cloud.mask)
+        arrays |= {f"d/{name}": np.asarray(values) for name, values in cloud.dimensions.items()}
         save_arrays(outputs[0], arrays)
-        report = points.report
-        said = {"said": report.messages, "ignored": int(report.figures.get("ignored", 0)), "clouds": clouds}
-        said |= {"looked": looked} if looked else {}
-        return {"outputs": written(outputs), "written": run.count} | said
+        return {
+            "outputs": written(outputs),
+            "written": run.count,
+            "said": points.report.messages,
+            "ignored": int(points.report.figures.get("ignored", 0)),
+            "dimensions": list(training.dimensions),
+            **looked,
+        }
 
     def _new_values(self, result: PieceResults) -> NewValues:
         """The results, with the number of each point's file."""
