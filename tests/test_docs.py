@@ -15,7 +15,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.base.errors import ModelError
-from pdal_stages.pipeline.lowering import lower
+from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import parse_pipeline
 from pdal_stages.stages import registry
 from pdal_stages.stages.base import Stage
@@ -45,7 +45,7 @@ def test_json_in_the_docs_is_valid(tmp_path, monkeypatch):
             for stage in ours:
                 found += 1
                 try:
-                    lower(parse_pipeline(json.dumps([stage])))
+                    expand(parse_pipeline(json.dumps([stage])))
                 except ModelError:
                     pass  # the example names a model file that is not here
     assert found >= 5

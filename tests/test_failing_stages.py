@@ -64,7 +64,7 @@ assert failures == 36, failures
 """
 TEXTS = """
 for turn in range(12):
-    stages = ps.Pipeline([good, {"type": "filters.hag_minima"}]).lowered.stages
+    stages = ps.Pipeline([good, {"type": "filters.hag_minima"}]).expanded.stages
     stages[1]["pdalargs"]["options"]["cell"] = "wide " + str(turn)
     try:
         pdal.Pipeline(json.dumps(stages)).execute()

@@ -92,12 +92,12 @@ def test_models_are_listed(capsys):
 def test_a_pipeline_with_other_heights_is_told(town):
     same = [str(town), *load_model(shipped()[STANDARD]).info["preparation"]]
     classify = {"type": "filters.modelclassifier", "model": STANDARD}
-    assert Pipeline([*same, classify]).lowered.warnings == []
+    assert Pipeline([*same, classify]).expanded.warnings == []
     other = [
         str(town),
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "window": 20},
     ]
-    (warning,) = Pipeline([*other, classify]).lowered.warnings
+    (warning,) = Pipeline([*other, classify]).expanded.warnings
     assert "trained on other heights" in warning and '"window": 20' in warning
 
 

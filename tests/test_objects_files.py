@@ -252,7 +252,7 @@ def test_layers_are_written_all_or_none_and_nothing_older_is_left(folder, tmp_pa
     old = tmp_path / f"t_decks.{ending}"
     without = {"type": "filters.range", "limits": "Classification![17:17]"}
     job = [str(folder / "parts" / "0.laz"), without, {"type": "writers.objects", "filename": str(target)}]
-    stage = Pipeline(job).lowered.ours[0].stage
+    stage = Pipeline(job).expanded.ours[0].stage
     assert [output.path for output in stage.outputs()] == [str(tmp_path / name) for name in names]
     old.write_text("of an earlier run")
     Pipeline(job).execute(arrays=False)

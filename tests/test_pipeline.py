@@ -278,7 +278,7 @@ def test_points_of_two_readers_see_each_other(tmp_path, write_las):
         for i, m in enumerate((west, ~west))
     ]
     both = ps.Pipeline([*map(str, files), {"type": "filters.hag_minima"}])
-    assert [s["type"] for s in both.lowered.stages[2:]] == ["filters.merge", "filters.python"]
+    assert [s["type"] for s in both.expanded.stages[2:]] == ["filters.merge", "filters.python"]
     assert both.execute() == 3000
     order = np.concatenate([np.flatnonzero(west), np.flatnonzero(~west)])
     whole = hag_minima(arrays["X"], arrays["Y"], arrays["Z"])[order]

@@ -93,7 +93,7 @@ def executed(options: argparse.Namespace, pipeline: Pipeline) -> list[str]:
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
     more = [Output(options.log, "log")] if options.log else []
     pipeline.check_outputs(*more, *([Output(metadata, "metadata", JSON)] if metadata else []))
-    before = list(pipeline.lowered.warnings)
+    before = list(pipeline.expanded.warnings)
     print_messages(*before)
     end_at_once(options)
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
@@ -122,7 +122,7 @@ def _validate(options: argparse.Namespace) -> int:
     try:
         pipeline = _built(options)
         print(pipeline.validate())
-        print_messages(*pipeline.lowered.warnings)
+        print_messages(*pipeline.expanded.warnings)
         return 0
     except StageError as error:
         print(json.dumps({"valid": False, "error_detail": str(error), "streamable": False}, indent=2))

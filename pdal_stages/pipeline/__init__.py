@@ -1,4 +1,4 @@
-"""Pipelines: read, override, lower to plain PDAL, run, and describe what there is.
+"""Pipelines: read, override, expand to plain PDAL, run.
 
 Names are imported when first used: the command line reads overrides before it needs NumPy or PDAL.
 """

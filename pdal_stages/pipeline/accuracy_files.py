@@ -17,9 +17,9 @@ from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from .classify_request import ClassifyRequest
+from .expansion import expand_stage
 from .filenames import stage_files
 from .inputs_outputs import in_folders, input_files, reader_of
-from .lowering import lower_stage
 from .overrides import Override, apply_overrides
 from .run import Pipeline
 from .runtime import points_of_views
@@ -59,7 +59,7 @@ def compare_files(
         wanted["model"] = model
     (given,) = apply_overrides([wanted], own)
     renamed = {"dimension": "Classification", "reference": "Reference"}
-    stage = cast(AccuracyStage, lower_stage({**given, **renamed}).stage)
+    stage = cast(AccuracyStage, expand_stage({**given, **renamed}).stage)
     check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
     others = tuple(one for one in overrides if one not in own)
     parts = []

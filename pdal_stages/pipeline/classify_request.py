@@ -11,10 +11,10 @@ from ..base.errors import ModelError, OptionError, suggest
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation, registry
 from ..stages.loading import loaded_model
+from .expansion import expand_stage
 from .filenames import LAS_WRITERS
 from .inputs_outputs import overridden, reader_of, writer_of
 from .las_output import extra_dims_option
-from .lowering import lower_stage
 from .overrides import Override
 from .run import Pipeline
 
@@ -97,7 +97,7 @@ class ClassifyRequest:
         given = overridden(self._classifier, self.overrides)
         if given.get("keep_sure") is None:
             return []
-        stage: Any = lower_stage(given).stage
+        stage: Any = expand_stage(given).stage
         return stage.cost()
 
     @cached_property
@@ -189,7 +189,7 @@ class ClassifyRequest:
             if stage["type"] in preparation.OF_PDAL:
                 made["HeightAboveGround"] = "double"
             elif stage["type"] in registry.stages():
-                made |= lower_stage(overridden(stage, self.overrides)).stage.creates()
+                made |= expand_stage(overridden(stage, self.overrides)).stage.creates()
         made.pop("Classification", None)
         for name in self.dimensions:
             if name not in ("all", "none", *made) and self.dimensions != WRITTEN:

@@ -73,7 +73,7 @@ def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
 def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int]]) -> None:
     """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS record.
 
-    `ours` are our stages in the lowered pipeline: the stage, its name in messages, its place.
+    `ours` are our stages in the expanded pipeline: the stage, its name in messages, its place.
 
     Raises
     ------

@@ -14,7 +14,7 @@ from ..stages import registry
 from ..stages.base import Stage
 from . import pdal as pdal_env
 from . import runtime
-from .lowering import lower_stage
+from .expansion import expand_stage
 
 
 class _Family:
@@ -39,11 +39,13 @@ class _Family:
                 options["merge"], merge = merge, True
             # Points of several readers must see each other; of one reader merging costs nothing.
             wired = {"inputs": options["inputs"]} if merge and "inputs" in options else {}
-            lowered = lower_stage({"type": kind.type, **{k: v for k, v in options.items() if k not in wired}})
+            expanded = expand_stage(
+                {"type": kind.type, **{k: v for k, v in options.items() if k not in wired}}
+            )
             runtime.remember_stdout()
-            stages = [*([{"type": "filters.merge", **wired}] if merge else []), lowered.plain]
+            stages = [*([{"type": "filters.merge", **wired}] if merge else []), expanded.plain]
             shown = f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
-            return _joined(stages, shown, lowered.stage)
+            return _joined(stages, shown, expanded.stage)
 
         make.__name__ = make.__qualname__ = name
         make.__signature__ = signature  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Run a pipeline: read, override, validate, lower, execute, report; outputs whole or not at all."""
+"""Run a pipeline: read, override, validate, expand, execute, report; outputs whole or not at all."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from ..stages import registry
 from . import interrupts, las_output, runtime
 from . import pdal as pdal_env
 from .callbacks import Callbacks
+from .expansion import Expanded, check_dimensions, expand
 from .filenames import (
     is_reader,
     is_writer,
@@ -31,7 +32,6 @@ from .filenames import (
     with_outputs,
     writers_outputs,
 )
-from .lowering import Lowered, check_dimensions, lower
 from .overrides import Override, apply_overrides
 from .read import PipelineSource, read_pipeline
 from .references import check_readers
@@ -71,7 +71,7 @@ class Pipeline:
     ) -> None:
         read = source if isinstance(source, PipelineSource) else read_pipeline(source)
         self.source = PipelineSource(apply_overrides(read.stages, overrides), read.lines, read.name)
-        self.lowered: Lowered = lower(self.source, whole)
+        self.expanded: Expanded = expand(self.source, whole)
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
         self.log_lines: list[str] = []
@@ -92,8 +92,8 @@ class Pipeline:
 
     @property
     def json(self) -> str:
-        """The lowered pipeline, which stock ``pdal pipeline`` runs."""
-        return json.dumps({"pipeline": pdal_env.adapted(self.lowered.stages)}, indent=2)
+        """The expanded pipeline, which stock ``pdal pipeline`` runs."""
+        return json.dumps({"pipeline": pdal_env.adapted(self.expanded.stages)}, indent=2)
 
     def validate(self) -> str:
         """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
@@ -103,7 +103,7 @@ class Pipeline:
 
     def prepare(self) -> None:
         """Let PDAL check its own stages' options and dimensions, without reading points; outputs are not looked at."""
-        stages = self.lowered.stages
+        stages = self.expanded.stages
         try:
             self._check_inputs()
             # Some of PDAL's writers open their file, and empty it, when they are prepared: theirs are in a folder of ours.
@@ -124,13 +124,13 @@ class Pipeline:
         *more : Output
             What the caller will write beside the pipeline's own.
         """
-        own = [output for ours in self.lowered.ours for output in ours.stage.outputs()]
-        check_outputs([*writers_outputs(self.lowered.stages), *own, *more], self.inputs())
+        own = [output for ours in self.expanded.ours for output in ours.stage.outputs()]
+        check_outputs([*writers_outputs(self.expanded.stages), *own, *more], self.inputs())
 
     def inputs(self) -> list[str]:
         """Local files that are read: by readers, by other stages, and the pipeline itself."""
-        stages = self.lowered.stages
-        named = [name for ours in self.lowered.ours for name in stage_files(ours.stage)]
+        stages = self.expanded.stages
+        named = [name for ours in self.expanded.ours for name in stage_files(ours.stage)]
         return [*readers_files(stages), *named_files(stages), *named, *filter(None, [self.source.name])]
 
     def __or__(self, other: Any) -> Pipeline:
@@ -159,7 +159,7 @@ class Pipeline:
         """
         self._check_inputs()
         self.check_outputs()
-        stages = self.lowered.stages
+        stages = self.expanded.stages
         outputs = [output.path for output in writers_outputs(stages)]
         writers = [stage for stage in stages if is_writer(stage, stages)]
         alone = len(writers) == 1 and writers[0] is stages[-1] and "where" not in writers[0]
@@ -185,11 +185,11 @@ class Pipeline:
                     compressed = las_output.compress(partials)
                 finally:
                     self.reports = []
-                    for ours in self.lowered.ours:
+                    for ours in self.expanded.ours:
                         reports, failed = runtime.collect(ours.label)
                         failure = failure or failed
                         self.reports.append((ours.place, reports))
-                for ours, (_, reports) in zip(self.lowered.ours, self.reports, strict=True):
+                for ours, (_, reports) in zip(self.expanded.ours, self.reports, strict=True):
                     if not reports:  # newer PDAL leaves filters out where there are no points
                         reports.append(runtime.run_on_nothing(ours.stage, ours.place))
         except StageError as error:
@@ -204,31 +204,31 @@ class Pipeline:
 
     def _check_inputs(self) -> None:
         """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
-        for path in readers_files(self.lowered.stages):
+        for path in readers_files(self.expanded.stages):
             try:
                 with open(path, "rb"):
                     pass
             except OSError as error:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
-        stages = self.lowered.stages
+        stages = self.expanded.stages
         if stages and not is_reader(stages, 0):  # newer PDAL refuses it, older PDAL runs it on nothing
-            first = [ours.stage.type for ours in self.lowered.ours if ours.index == 0]
+            first = [ours.stage.type for ours in self.expanded.ours if ours.index == 0]
             found = (first or [stages[0].get("type", "")])[0]
             cure = "Put the file that is to be read first"
             raise PipelineError("the pipeline does not start with a reader", found=found, cure=cure)
-        check_dimensions(self.lowered)
-        odd = (check_readable(path) for path in readers_files(self.lowered.stages, las=True))
-        self.warnings = [*self.lowered.warnings, *filter(None, odd)]
-        units = [ours.stage.horizontal_unit for ours in self.lowered.ours]
+        check_dimensions(self.expanded)
+        odd = (check_readable(path) for path in readers_files(self.expanded.stages, las=True))
+        self.warnings = [*self.expanded.warnings, *filter(None, odd)]
+        units = [ours.stage.horizontal_unit for ours in self.expanded.ours]
         if units:
-            self.warnings += check_readers(self.lowered.stages, next(filter(None, units), ""))
+            self.warnings += check_readers(self.expanded.stages, next(filter(None, units), ""))
 
     def _located(self, error: StageError) -> StageError:
         """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
         found = str(error.found or "")
-        for path in readers_files(self.lowered.stages, las=True) if _NOT_UTF8.search(found) else ():
+        for path in readers_files(self.expanded.stages, las=True) if _NOT_UTF8.search(found) else ():
             if (odd := odd_text(path)) is not None:
                 return PipelineError(
                     f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",

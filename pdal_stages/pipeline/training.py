@@ -12,8 +12,8 @@ from ..classifier.summary import FILE_NUMBER
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
 from ..stages.preparation import preparation_of
+from .expansion import expand_stage
 from .inputs_outputs import reader_of
-from .lowering import lower_stage
 from .overrides import Override
 from .references import check_readers
 from .run import Pipeline
@@ -33,7 +33,7 @@ def stage(ins, outs):
 
 def lowered_writer(given: Mapping[str, Any]) -> ClassifierModel:
     """The stage that trains."""
-    return cast(ClassifierModel, lower_stage(dict(given)).stage)
+    return cast(ClassifierModel, expand_stage(dict(given)).stage)
 
 
 def heights_for(stage: ClassifierModel) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from typing import Any
 
 from ..base.errors import StageError
 from ..base.version import __version__
-from ..pipeline import lowering, runtime
+from ..pipeline import expansion, runtime
 from ..stages import registry
 from ..stages.base import Stage
 from . import declarations
@@ -85,7 +85,7 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     options = {**kind.from_pipeline(given, before), **given}
     where = runtime.place(kind.type, question.get("tag"))
     stage = kind(_own(options), where)
-    return stage, lowering.settle_upstream(stage, [(one, _creates(one)) for one in before])[1]
+    return stage, expansion.settle_upstream(stage, [(one, _creates(one)) for one in before])[1]
 
 
 def _stages(text: str) -> list[dict[str, Any]]:
@@ -98,13 +98,13 @@ def _stages(text: str) -> list[dict[str, Any]]:
 
 
 def _own(stage: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in stage.items() if name not in ("type", *lowering.PDAL_OWN)}
+    return {name: value for name, value in stage.items() if name not in ("type", *expansion.PDAL_OWN)}
 
 
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
     """What a stage before makes, as far as it matters: of ours, what it says; of PDAL's, heights."""
     if stage.get("type") not in registry.stages():
-        return lowering.heights_of(stage)
+        return expansion.heights_of(stage)
     try:
         return registry.get(stage["type"])(_own(stage)).creates()
     except StageError:  # its own preparation has said so

@@ -121,7 +121,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         For pipelines whose result tiles cannot give, with the reason and the cure.
     """
     source = pipeline.source
-    ours = {lowered.number: lowered for lowered in pipeline.lowered.ours}
+    ours = {expanded.number: expanded for expanded in pipeline.expanded.ours}
     steps = []
     for index, stage in enumerate(source.stages):
         made = ours.get(index)
@@ -148,7 +148,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     stages = [step.ours for step in head if step.ours is not None]
     makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
-    messages = list(pipeline.lowered.warnings)
+    messages = list(pipeline.expanded.warnings)
     if any(step.ours is None and step.sees_neighbors for step in head):
         messages.append(
             "PDAL filters that look at neighbors were given --buffer; the result is seamless only if it is wide enough "

@@ -103,9 +103,9 @@ def run_head(
                 stages.append(callbacks.filter(reach))
         stages.append(callbacks.filter(found))
         pipeline = Pipeline(stages, whole=False)
-        ours = pipeline.lowered.ours
+        ours = pipeline.expanded.ours
         check_writers(
-            [*pipeline.lowered.stages, *plan.tail], [(one.stage, one.place, one.index) for one in ours]
+            [*pipeline.expanded.stages, *plan.tail], [(one.stage, one.place, one.index) for one in ours]
         )
         for one in ours:
             one.stage.own_points = OUTSIDE
@@ -147,7 +147,7 @@ def run_first(
         stages = _marked(callbacks, marks)
         head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
         head[0] |= _after(marks)
-        stage = Pipeline([*stages, *head], whole=False).lowered.ours[-1].stage
+        stage = Pipeline([*stages, *head], whole=False).expanded.ours[-1].stage
         run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
         pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
         pipeline.execute(arrays=False)

@@ -29,7 +29,7 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.model import assemble
-from pdal_stages.pipeline.lowering import lower
+from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.pipeline.read import decode, parse_pipeline
 from pdal_stages.tiling import inputs, outputs
@@ -92,7 +92,7 @@ def _pipelines() -> list[bytes]:
 
 @target(_pipelines)
 def pipeline(data: bytes) -> str:
-    """Parse, override, lower: what PDAL gets is JSON, with no stage of ours left and none of PDAL's lost."""
+    """Parse, override, expand: what PDAL gets is JSON, with no stage of ours left and none of PDAL's lost."""
     source = parse_pipeline(decode(data, "fuzz.json"), "fuzz.json")
     assert len(source.lines) == len(source.stages) and all(line >= 1 for line in source.lines)
     overrides, _ = parse_overrides(
@@ -100,12 +100,12 @@ def pipeline(data: bytes) -> str:
     )
     with contextlib.suppress(StageError):  # one that fits no stage
         source.stages = apply_overrides(source.stages, overrides)
-    lowered = lower(source)
-    assert json.loads(json.dumps(lowered.stages, allow_nan=False)) == lowered.stages
-    types = [str(stage.get("type", "")) for stage in lowered.stages]
+    expanded = expand(source)
+    assert json.loads(json.dumps(expanded.stages, allow_nan=False)) == expanded.stages
+    types = [str(stage.get("type", "")) for stage in expanded.stages]
     assert not {"filters.hag_minima", "filters.multiscalefeatures", "writers.classifiermodel"} & set(types)
-    assert types.count("filters.python") >= len(lowered.ours) and len(types) >= len(source.stages)
-    return "lowered"
+    assert types.count("filters.python") >= len(expanded.ours) and len(types) >= len(source.stages)
+    return "expanded"
 
 
 # ---- files of points, and what names many of them ------------------------------------------------------------

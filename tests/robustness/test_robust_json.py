@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from robustness_kit import HAG, job
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.pipeline.lowering import lower
+from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import parse_pipeline
 
 STAGE = b'{"type": "filters.hag_minima"}'
@@ -115,8 +115,8 @@ def test_any_json_is_lowered_or_refused(given_stages, as_object, indent):
     try:
         source = parse_pipeline(json.dumps(value, indent=indent))
         assert source.stages == given_stages
-        lowered = lower(source)
-        assert json.loads(json.dumps(lowered.stages, allow_nan=False)) == lowered.stages
+        expanded = expand(source)
+        assert json.loads(json.dumps(expanded.stages, allow_nan=False)) == expanded.stages
     except StageError:
         pass
 

@@ -25,36 +25,36 @@ from .las_output import check_copc, check_writers, files_with_flags_to_split, fl
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, made, place, python_filter
 
-#: Options of every PDAL stage that a lowered stage hands on.
+#: Options of every PDAL stage that a expanded stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
 #: Stages after which there is one view, or several are what the user asked for.
 _ONE_VIEW = {f"filters.{name}" for name in ("merge", "splitter", "chipper", "divider", "groupby", "returns")}
 
 
 @dataclass
-class LoweredStage:
-    """One of our stages after lowering."""
+class ExpandedStage:
+    """One of our stages after expanding."""
 
     stage: Stage
     place: str  #: its type and tag, for messages
     label: str  #: the unique `module` label, under which the runtime knows it
     number: int  #: its place in the given list
-    index: int  #: its place in the lowered list
+    index: int  #: its place in the expanded list
     given: dict[str, Any]  #: the stage as it was written
     plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
 
 
 @dataclass
-class Lowered:
+class Expanded:
     """A plain PDAL pipeline, which of its stages are ours, and what the user should know of it."""
 
     stages: list[dict[str, Any]]
-    ours: list[LoweredStage] = field(default_factory=list)
+    ours: list[ExpandedStage] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
-def lower(source: PipelineSource, whole: bool = True) -> Lowered:
-    """Lower a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves.
+def expand(source: PipelineSource, whole: bool = True) -> Expanded:
+    """Expand a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
     places = [source.where(number) for number in range(len(stages))]
     _refuse_several_ends(stages, places)
     check_copc(stages)
-    out = Lowered([], warnings=unread_extra_dimensions(stages))
+    out = Expanded([], warnings=unread_extra_dimensions(stages))
     flags = _flags_to_split(stages) if whole else []
     last_reader = max((n for n in range(len(stages)) if is_reader(stages, n)), default=None)
     reaching = _views_reaching(stages)
@@ -91,11 +91,11 @@ def lower(source: PipelineSource, whole: bool = True) -> Lowered:
                     stage["inputs"] = [merge["tag"]]
                 out.stages.append(merge)
             taken = registry.get(type_name).from_pipeline(stage, stages[:index])
-            lowered = lower_stage({**taken, **stage}, index, len(out.stages))
+            expanded = expand_stage({**taken, **stage}, index, len(out.stages))
         except StageError as error:
             raise error.within(places[index]) from None
-        out.ours.append(lowered)
-        out.stages.append(lowered.plain)
+        out.ours.append(expanded)
+        out.stages.append(expanded.plain)
     _follow_preparations(out)
     check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
     return out
@@ -187,11 +187,11 @@ def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
     return {"HeightAboveGround": "double"} if stage.get("type") in preparation.OF_PDAL else {}
 
 
-def _follow_preparations(lowered: Lowered) -> None:
+def _follow_preparations(expanded: Expanded) -> None:
     """Let each stage of ours know which stages before it made what it reads."""
-    numbered = {ours.index: ours for ours in lowered.ours}
+    numbered = {ours.index: ours for ours in expanded.ours}
     before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
-    for index, plain in enumerate(lowered.stages):
+    for index, plain in enumerate(expanded.stages):
         if (ours := numbered.get(index)) is None:
             before.append((plain, heights_of(plain)))
             continue
@@ -201,7 +201,7 @@ def _follow_preparations(lowered: Lowered) -> None:
         if makers:
             plain["pdalargs"]["preparation"] = makers
         if warning is not None:
-            lowered.warnings.append(warning)
+            expanded.warnings.append(warning)
         before.append(({"type": ours.stage.type, **ours.given}, ours.stage.creates()))
 
 
@@ -214,16 +214,16 @@ _DEGREES = re.compile(
 )
 
 
-def check_dimensions(lowered: Lowered) -> None:
+def check_dimensions(expanded: Expanded) -> None:
     """Refuse a stage that reads heights or labels that no stage makes and no input has, and one that would get degrees.
 
     Raises
     ------
     DimensionError, PipelineError
     """
-    of_ours = {ours.index: ours.stage.creates() for ours in lowered.ours}
-    for ours in lowered.ours:
-        before = list(enumerate(lowered.stages[: ours.index]))
+    of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
+    for ours in expanded.ours:
+        before = list(enumerate(expanded.stages[: ours.index]))
         moved = [stage for _, stage in before if stage.get("type") == "filters.reprojection"]
         if moved and _DEGREES.search(
             str(moved[-1].get("out_srs", ""))
@@ -278,7 +278,7 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
 # ---- one stage -----------------------------------------------------------------------------------
 
 
-def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> LoweredStage:
+def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> ExpandedStage:
     """One stage of ours, checked, and the ``filters.python`` that stands for it."""
     kind = registry.get(given["type"])
     named = place(kind.type, given.get("tag"))
@@ -291,4 +291,4 @@ def lower_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Lower
     plain = python_filter(label, TRAMPOLINE, arguments, stage.creates())
     plain |= {key: given[key] for key in PDAL_OWN if key in given}
     made[label] = stage
-    return LoweredStage(stage, named, label, number, index, given, plain)
+    return ExpandedStage(stage, named, label, number, index, given, plain)
