@@ -36,27 +36,14 @@ _NODE = np.dtype(
 class Forest:
     """A random forest; its probabilities are the mean of its trees' leaf frequencies.
 
-    Parameters
-    ----------
-    tree_sizes : (trees,) int32
-        Nodes of each tree.
-    feature : (nodes,) int16 or int32
-        Feature a split node compares, -1 in a leaf. Trees follow each other, each level by level.
-    threshold : (nodes,) float32
-        A row goes to the left child where its value <= threshold. 0 in a leaf.
-    leaf_counts : (leaves, classes) uint32
-        Training samples of each class in each leaf, leaves in the order of their nodes.
-    n_features : int
-
-    Raises
-    ------
-    ModelError
-        If the arrays are not a forest.
+    Trees follow each other, each level by level. ModelError if the arrays are not a forest.
     """
 
-    tree_sizes: npt.NDArray[np.int32]
-    feature: npt.NDArray[Any]
+    tree_sizes: npt.NDArray[np.int32]  #: (trees,) nodes of each tree
+    feature: npt.NDArray[Any]  #: (nodes,) int16 or int32: which a split node compares, -1 in a leaf
+    #: (nodes,) a row goes to the left child where its value <= threshold; 0 in a leaf
     threshold: npt.NDArray[np.float32]
+    #: (leaves, classes) training samples of each class in each leaf, leaves in the order of their nodes
     leaf_counts: npt.NDArray[np.uint32]
     n_features: int
     depths: npt.NDArray[np.int32] = field(init=False)

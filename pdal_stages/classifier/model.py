@@ -50,8 +50,6 @@ class Model:
     info: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
-    # ---- what it is ----------------------------------------------------------------------------------------
-
     @property
     def algorithm(self) -> Any:
         """The last pass, whose answer is the model's."""
@@ -109,14 +107,9 @@ class Model:
     def importances(self, by: str = "feature", number: int = -1) -> dict[str, float]:
         """Mean decrease in impurity, summing to 1, largest first.
 
-        Parameters
-        ----------
-        by : {"column", "feature", "group", "neighborhood", "dimension"}
-            Every column; each feature over all neighborhoods (a histogram's bins together); covariance,
-            geometry, shape features and context; each neighborhood; or the points' own dimensions against all
-            others.
-        number : int
-            Place of the pass in ``passes``; the last by default.
+        `by` column, feature (over all neighborhoods, a histogram's bins together), group (covariance, geometry, shape
+        features and context), neighborhood, or dimension (of the points, against all others); `number` is the pass's
+        place in ``passes``.
         """
         values = self.info["passes"][number]["importances"]
         return summary.importances(values, self.passes[number].columns(self.codes_of[number]), by)
@@ -135,8 +128,6 @@ class Model:
     def __str__(self) -> str:
         return summary.text(self.describe())
 
-    # ---- file ----------------------------------------------------------------------------------------------
-
     def manifest(self) -> dict[str, Any]:
         """What the model file says beside its arrays."""
         passes = [
@@ -148,8 +139,6 @@ class Model:
     def save(self, path: str | os.PathLike) -> None:
         """Write the model file: whole, or not at all."""
         modelfile.write(path, self.manifest(), [one.arrays() for one in self.passes])
-
-    # ---- applying it ---------------------------------------------------------------------------------------
 
     def predict(
         self,
@@ -195,14 +184,16 @@ class Model:
                 found=f"a model of {self.algorithm.name}",
                 cure="Use 'margin'",
             )
-        asked = np.ones(n, np.bool_) if where is None else mask_of("where", where, n)
+        asked = np.ones(n, np.bool_) if where is None else _checked("where", where, n, "b", "true or false")
         there, ignored = None, 0
-        if ignore is not None and (gone := mask_of("ignore", ignore, n)).any():
+        if ignore is not None and (gone := _checked("ignore", ignore, n, "b", "true or false")).any():
             there, ignored = np.flatnonzero(~gone), int(np.count_nonzero(gone))
             asked = asked & ~gone
         rows = None if asked.all() else np.flatnonzero(asked)
         codes, factors = self.codes, self.factors
-        now = None if current is None else _codes_now(current, n)
+        now = (
+            None if current is None else _checked("current", current, n, "iu", "class code").astype(np.uint8)
+        )
         out = empty(n, len(codes), now, how)
         values = known(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
@@ -280,13 +271,8 @@ class Model:
             return
         report.figures["density"] = round(found, 3)
         if not trained["low"] / TOLERANCE <= found <= trained["high"] * TOLERANCE:
-            lonely_in = report.figures.get("fewer_than_three", {})
-            token = max(lonely_in, key=lambda one: lonely_in[one], default="")
-            lonely = (
-                f"; {100 * lonely_in[token] / count:.2g} % have fewer than three neighbors in {token}"
-                if lonely_in
-                else ""
-            )
+            few = max(report.figures.get("fewer_than_three", {}).values(), default=0)
+            lonely = f"; {100 * few / count:.2g} % have fewer than three neighbors" if few else ""
             report.warnings.append(
                 f"the cloud has {found:.3g} points/m2, the model was trained on "
                 f"{summary.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
@@ -356,24 +342,13 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
     return Model(tuple(passes), classes, info)
 
 
-def mask_of(name: str, mask: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
-    """A mask of n points, or an OptionError."""
-    array = np.asarray(mask)
-    if array.shape != (n,) or array.dtype != np.bool_:
+def _checked(name: str, given: npt.ArrayLike, n: int, kinds: str, what: str) -> npt.NDArray[Any]:
+    """An array of n points of some NumPy kinds, or an OptionError."""
+    array = np.asarray(given)
+    if array.shape != (n,) or array.dtype.kind not in kinds:
         raise OptionError(
-            f"'{name}' must be one true or false per point", found=f"{array.dtype} of shape {array.shape}"
+            f"'{name}' must be one {what} per point", found=f"{array.dtype} of shape {array.shape}"
         )
+    if n and kinds != "b" and (array.min() < 0 or array.max() > 255):
+        raise OptionError(f"'{name}' must be one {what} per point", found=f"{array.min()} to {array.max()}")
     return array
-
-
-def _codes_now(current: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:
-    array = np.asarray(current)
-    if array.shape != (n,) or array.dtype.kind not in "iu":
-        raise OptionError(
-            "'current' must be one class code per point", found=f"{array.dtype} of shape {array.shape}"
-        )
-    if n and (array.min() < 0 or array.max() > 255):
-        raise OptionError(
-            "'current' has values that are not class codes", found=f"{array.min()} to {array.max()}"
-        )
-    return array.astype(np.uint8)

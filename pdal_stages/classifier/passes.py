@@ -204,36 +204,34 @@ class PassRun:
     ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
         """Yield (rows, what `finish` makes of them) of a band's points that the pass `place` is to look at."""
         features, mask = self._features[place], self._wanted[place]
+        later = features in self._features[place + 1 :]
         context = self._context_at(place, band) if place else None
-
-        def apply(values: Any, rows: npt.NDArray[np.int64]) -> tuple[Any, Any]:
-            columns = [
-                part for part in (values, None if context is None else context(rows)) if part is not None
-            ]
-            return values, finish(columns[0] if len(columns) == 1 else np.concatenate(columns, axis=1), rows)
-
-        def again(block: Any) -> tuple[npt.NDArray[np.int64], Any]:
-            rows, values = block
-            if mask is not None and not (mine := mask[rows]).all():
-                rows, values = rows[mine], values[mine]
-            return rows, apply(values, rows)[1] if len(rows) else None
-
-        if features in held:
-            for rows, result in map_blocks(again, held[features], self._request.threads):
-                if len(rows):
-                    yield rows, result
-            return
         rows = self._strips.rows(band)
         rows = rows if mask is None else rows[mask[rows]]
-        if features is None:
-            if len(rows):
-                yield rows, apply(None, rows)[1]
-            return
-        kept = held[features] = []
-        for some, (values, result) in features.blocks(rows, apply, memory_share=0.5):
-            if features in self._features[place + 1 :]:
-                kept.append((some, values))
-            yield some, result
+
+        def result(values: Any, rows: npt.NDArray[np.int64]) -> Any:
+            parts = [values, None if context is None else context(rows)]
+            there = [part for part in parts if part is not None]
+            return finish(there[0] if len(there) == 1 else np.concatenate(there, axis=1), rows)
+
+        def again(block: Any) -> tuple[npt.NDArray[np.int64], Any]:
+            mine = slice(None) if mask is None else mask[block[0]]
+            rows, values = (part[mine] for part in block)
+            return rows, result(values, rows) if len(rows) else None
+
+        if features in held:
+            for some, made in map_blocks(again, held[features], self._request.threads):
+                if len(some):
+                    yield some, made
+        elif features is not None:
+            held[features] = []
+            both = features.blocks(rows, lambda values, some: (values, result(values, some)), 0.5)
+            for some, (values, made) in both:
+                if later:
+                    held[features].append((some, values))
+                yield some, made
+        elif len(rows):
+            yield rows, result(None, rows)
 
     def _context_at(self, place: int, band: Band) -> Callable[..., npt.NDArray[np.float32]]:
         """What gives the context of rows of a band, by what the pass before said of it and the strips beside it."""

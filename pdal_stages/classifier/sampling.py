@@ -87,15 +87,9 @@ def draw_samples(
         count/n times, rounded down or up.
     seed : int
     groups : sequence of str, optional
-        The group of each cloud: each gives as many samples of a class as the others, as far as it has them. Without,
-        all clouds are one.
+        The group of each cloud: each gives as many samples of a class as the others, as far as it has them.
     progress : Progress, optional
         Updated with the points looked at: all of them once, and once more for each class.
-
-    Raises
-    ------
-    OptionError
-        If a class has no points at all. (The caller knows the labels and says which were found.)
     """
     of_cloud = np.zeros(len(clouds), np.int64)
     names: Any = [""]
