@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
-from pdal_stages.base.resources import available_threads
 from pdal_stages.pipeline.inputs_outputs import locations
 from pdal_stages.synthetic.townfile import WKT
 from pdal_stages.terrain.minima import terrain_reach
@@ -149,19 +148,11 @@ def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole)
     assert (tmp_path / "out.laz").read_bytes() == whole.read_bytes()
 
 
-def test_two_worker_processes_give_the_same(tmp_path, town_file, model_file, whole):
-    cores = available_threads()
-    run = run_tiled(clouds.stages([town_file], tmp_path / "out.laz", model_file), 45, workers=min(2, cores))
-    assert not run.failures and run.summary["workers"] * run.summary["threads_per_worker"] <= cores
-    clouds.same_points(whole, tmp_path / "out.laz")
-
-
-@pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole, suffix, monkeypatch):
+def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole, monkeypatch):
     from pdal_stages.tiling import outputs
 
-    monkeypatch.setattr(outputs, "MOST_AT_ONCE", 11_000)
-    out = tmp_path / f"out.{suffix}"
+    monkeypatch.setattr(outputs, "MOST_AT_ONCE", 7_000)
+    out = tmp_path / "out.laz"
     assert not run_tiled(clouds.stages([town_file], out, model_file), 60, workers=0).failures
     clouds.same_points(whole, out)
     one, two = laspy.read(whole).header, laspy.read(out).header
@@ -327,7 +318,6 @@ def _features(neighborhoods, chosen):
         [
             _features("k2", "surfaces")
         ],  # neighbors' surfaces are made of their own neighbors, which lie farther still
-        [_features("k30", "surfaces")],
         "model",  # of two passes, which says as well how many neighbors it looks for
     ],
 )
@@ -447,14 +437,12 @@ def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
 def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, whole):
     import subprocess
 
-    for name, driver in (("a.shp", "ESRI Shapefile"), ("b.gpkg", "GPKG"), ("d.geojson", "GeoJSON")):
+    for name, driver in (("b.gpkg", "GPKG"), ("d.geojson", "GeoJSON")):
         done = subprocess.run(
             [pdal_program, "tindex", "create", tmp_path / name, town_file, "-f", driver, "--fast_boundary"],
             capture_output=True,
             text=True,
         )
-        if "supports a maximum of 254" in done.stderr:
-            continue  # newer PDAL puts no long spatial reference into a Shapefile
         assert done.returncode == 0, done.stderr
         assert locations(str(tmp_path / name)) == [str(town_file)]
         with pytest.raises(StageError, match="cannot be read"):

@@ -306,7 +306,7 @@ def test_the_command_says_what_is_missing(tmp_path, folder, capsys):
 # ---- workers and what they listen to ----------------------------------------------------------------------
 
 
-def test_nothing_listens_and_nothing_is_imported_from_the_current_folder(tmp_path, folder):
+def test_nothing_listens_and_nothing_is_imported_from_the_current_folder(tmp_path, folder, expected):
     """Neither the run nor its workers open a port, and modules that lie about are not taken for Python's own."""
     here = tmp_path / "here"
     here.mkdir()
@@ -337,6 +337,7 @@ open({str(tmp_path / "looked")!r}, 'a').write('x')"""
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "looked").read_text() == "x" * 8
     assert not (tmp_path / "sockets").exists() and not (tmp_path / "taken").exists()
+    check_same(tmp_path, expected)
 
 
 def test_stopped_while_workers_start(tmp_path, folder):

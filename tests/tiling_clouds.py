@@ -14,7 +14,7 @@ from pdal_stages.terrain.minima import hag_minima
 CELL = 5
 
 
-def town(size: float = 90.0, density: float = 4.0, seed: int = 5):
+def town(size: float = 90.0, density: float = 2.5, seed: int = 5):
     """A small town with a hole, and points exactly on the edges of 30 m tiles."""
     made = ps.make_town(size, density, seed=seed)
     xyz = made.xyz.copy()
@@ -30,14 +30,14 @@ def model(
     path: Path, neighborhoods: str = "c1,s2,kopt", feature_set: str = "covariance,geometric,D1_3_c1"
 ) -> Path:
     """A small model, trained on another town."""
-    made = ps.make_town(60.0, 4.0, seed=9)
+    made = ps.make_town(60.0, 2.5, seed=9)
     options = ps.TrainingOptions(
         neighborhoods=neighborhoods,
         feature_set=feature_set.split(","),
         dimensions=("HeightAboveGround",),
         classes={"2": 2, "3,4,5": 5, "6": 6},
         count=150,
-        trees=8,
+        trees=6,
     )
     heights = hag_minima(*made.xyz.T, cell=CELL)
     cloud = ps.TrainingCloud(made.xyz, made.classification, {"HeightAboveGround": heights})
