@@ -206,12 +206,9 @@ def spoiled(name, value, at=(0, 0)):
     "weights, text",
     [
         (spoiled("sa1_1", np.nan), "finite"),
-        (spoiled("fp1_2", -1.0, (3, -1)), "negative variance"),
         ({"sa2_1": None}, "lacks an array"),
         ({"sa2_1": np.zeros((32, 9), np.float32)}, r"must be \(32, "),
-        ({"sa9_1": np.zeros((3, 3), np.float32)}, "does not know"),
         ({"scores": np.zeros(3, np.float32)}, "2 axes"),
-        ({"sa1_1": net_with().weights["sa1_1"].astype(np.float64)}, "<f4"),
     ],
 )
 def test_hostile_weights_are_refused(weights, text, tmp_path):
@@ -231,13 +228,11 @@ def greedy():
 @pytest.mark.parametrize(
     "parameters, text",
     [
-        ({"spacing": "3"}, "spacing"),
         ({"configuration": 7}, "parameters are not right"),
         ({"configuration": shallow(points=10**9)}, "points"),
         ({"configuration": shallow(levels=TINY.to_dict()["levels"][:1])}, "does not know|must be"),
         ({"configuration": greedy()}, "too much memory"),
         ({"inputs": [{"name": n, "mean": 0, "scale": 0} for n in INPUTS]}, "scale"),
-        ({"inputs": [{"name": n, "mean": 0, "scale": 1} for n in ("Z", "Z", "Intensity")]}, "inputs"),
         ({"more": 1}, "parameters are not right"),
     ],
 )
@@ -267,7 +262,6 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
         ({"algorithm": "alsnett"}, "must be one of"),
         ({"alsnet": {"epochs": 3}}, "only with algorithm"),
         ({"algorithm": "alsnet", "alsnet": {"epoch": 3}}, "Did you mean 'epochs'"),
-        ({"algorithm": "alsnet", "alsnet": {"epochs": 0}}, "epochs"),
         ({"algorithm": "alsnet", "alsnet": {"configuration": "tinny"}}, "tiny"),
         ({"algorithm": "alsnet", "alsnet": [1]}, "mapping"),
         ({"algorithm": "alsnet", "alsnet": {"augment": 1}}, "augment"),

@@ -318,12 +318,6 @@ def test_the_town(town):
     assert np.mean([n.any() for n in near]) > 0.8
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_next_to_nothing(count):
-    got = found_in(np.zeros((count, 3)), np.full(count, 6, np.uint8))
-    assert all(len(table) == 0 for table in got.tables.values())
-
-
 def test_a_far_point_costs_nothing():
     xyz, codes = scene(house(10, 10, 22, 18, 6.0))
     stray, more = np.array([[9e6, -3e6, 5.0]]), np.array([6], np.uint8)
@@ -331,11 +325,6 @@ def test_a_far_point_costs_nothing():
     assert len(got.tables[Kind.BUILDING]) == 1
     with pytest.raises(StageError, match="too far out"):
         found_in(np.concatenate([xyz, stray * 1e4]), np.r_[codes, more])
-
-
-def test_a_class_of_two_kinds():
-    with pytest.raises(StageError, match="class 6 cannot stand for"):
-        kind_of_code({Kind.BUILDING: (6,), Kind.TREE: (6,)})
 
 
 @settings(max_examples=20, deadline=None)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 from pdal_stages import cli
-from pdal_stages.accuracy.expected import BLOCK, ReviewCells, find_patches, side_for
+from pdal_stages.accuracy.expected import BLOCK, ReviewCells, find_patches
 from pdal_stages.synthetic import write_town
 
 
@@ -23,7 +23,7 @@ def cloud(seed, n=3000, wide=60.0):
     return xyz, random.choice([1, 2, 3, 5, 6, 9], n).astype(np.uint8), random.random(n).astype(np.float32)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 400), st.integers(1, 5))
 def test_order_and_cuts_change_nothing(seed, n, parts):
     points, random = cloud(seed, n, 20.0), np.random.default_rng(seed)
@@ -66,18 +66,11 @@ def test_patches_hold_each_cell_once_and_come_best_first():
         assert max(box[2] - box[0], box[3] - box[1]) <= BLOCK
 
 
-def test_cells_grow_where_points_are_few():
-    assert side_for(8_000_000, 1_000_000.0) == 1.0
-    assert side_for(300_000, 1_000_000.0) == 4.0
-    assert side_for(10**10, 1e9) == 8.0  # 1,000 square kilometers: not more cells than memory holds
-    assert side_for(1, 1_000_000.0) == 16.0
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A town whose buildings are half called vegetation in the east, in two files, with reliabilities."""
     folder = tmp_path_factory.mktemp("review")
-    write_town(ps.make_town(100.0, 6.0, seed=3, progress=False), folder / "town.laz")
+    write_town(ps.make_town(70.0, 5.0, seed=3, progress=False), folder / "town.laz")
     las = laspy.read(folder / "town.laz")
     las.add_extra_dim(laspy.ExtraBytesParams("Reliability", "float32"))
     east = np.asarray(las.x) > np.median(las.x)
@@ -119,10 +112,6 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, capsys):
     base.close()
     assert rank == tuple(range(1, len(rank) + 1)) and all(reason) and min(expected) >= 0
     assert set(styles) == {"patches", "tiles"} and "looked at" in styles["patches"]
-    # In two processes: the same.
-    again = ["review", str(folder / "parts"), str(tmp_path / "again.gpkg"), "--workers", "2"]
-    assert cli.main([*again, "--json", str(tmp_path / "again.json")]) == 0
-    assert json.loads((tmp_path / "again.json").read_text()) == figures
     # One file or two: the same is expected in all.
     whole = [str(folder / "whole.laz"), str(tmp_path / "w.gpkg"), "--json", str(tmp_path / "w.json")]
     assert cli.main(["review", *whole]) == 0
