@@ -70,7 +70,6 @@ class AccuracyStage(Stage):
     )
     json: str | None = option("filename", None, "Write the figures to this JSON file")
     html: str | None = option("filename", None, "Write a report with maps to this HTML file")
-    title: str = option("string", "Classification accuracy", "Heading of the report")
     model_file: str | None = option(
         "model",
         None,
@@ -127,30 +126,6 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
 
     def reads(self) -> list[str]:
         return [self.dimension, self.reference]
-
-    def scored(self) -> dict[str, Any]:
-        """What is compared: `classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`."""
-        rule: dict[str, Any] = {
-            "classes": self.classes or None,
-            "ignore": None if self.ignore is None else list(self.ignore.codes),
-            "merge": self.merge,
-            "names": None,
-        }
-        if not self.model_file:
-            return rule
-        trained = loaded_model(self.model_file).info["classes"]
-        rule["names"] = {c["code"]: c["name"] for c in trained}
-        if self.classes:
-            return rule
-        if self.merge is None and _one_code_system(trained):
-            rule["merge"] = {c["code"]: c["labels"] for c in trained}
-        merged = Merge.parse(rule["merge"])
-        rule["classes"] = sorted({int(merged.target_of[c["code"]]) for c in trained})
-        if self.ignore is None and rule["merge"] is not None:
-            # A class's code need not be one of its labels: 1 is the background, or unclassified.
-            labels = {label for c in trained for label in c["labels"]}
-            rule["ignore"] = [c["code"] for c in trained if c["code"] not in labels]
-        return rule
 
     def run(self, points: Points) -> dict[str, NDArray]:
         if points.count == 0:
@@ -209,27 +184,47 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         return Sides(reference, predicted, confidence, inside)
 
     def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
-        """What :meth:`scored` says, with vegetation as one class where only one was predicted."""
-        rule = self.scored()
+        """`classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`: see the stage's page."""
+        ignore = None if self.ignore is None else list(self.ignore.codes)
+        rule: dict[str, Any] = {
+            "classes": self.classes or None,
+            "ignore": ignore,
+            "merge": self.merge,
+            "names": None,
+        }
+        known: list[int] | None = None
+        if self.model_file:
+            trained = loaded_model(self.model_file).info["classes"]
+            known = [c["code"] for c in trained]
+            rule["names"] = {c["code"]: c["name"] for c in trained}
+            if not self.classes:
+                if self.merge is None and _one_code_system(trained):
+                    rule["merge"] = {c["code"]: c["labels"] for c in trained}
+                target = Merge.parse(rule["merge"]).target_of
+                rule["classes"] = sorted({int(target[code]) for code in known})
+                if self.ignore is None and rule["merge"] is not None:
+                    # A class's code need not be one of its labels: 1 is the background, or unclassified.
+                    labels = {label for c in trained for label in c["labels"]}
+                    rule["ignore"] = [code for code in known if code not in labels]
         if self.merge is not None or self.classes:
             return rule
+        # Vegetation is one class where only one was predicted.
         true, given = (
-            np.unique(np.concatenate([np.unique(getattr(one, side)) for one in sides])).tolist()
+            set(np.unique(np.concatenate([np.unique(getattr(one, side)) for one in sides])).tolist())
             for side in ("reference", "predicted")
         )
-        known = (
-            [c["code"] for c in loaded_model(self.model_file).info["classes"]] if self.model_file else given
-        )
-        merged = Merge.parse(rule["merge"]).target_of
-        if HIGH not in known or {*LOWER} & {*known, *given} or merged[HIGH] != HIGH:
-            return rule
-        parts = [code for code in LOWER if code in true and merged[code] == code]
-        if parts:
+        target = Merge.parse(rule["merge"]).target_of
+        parts = [code for code in LOWER if code in true and target[code] == code]
+        if (
+            parts
+            and HIGH in (given if known is None else known)
+            and not {*LOWER} & {*(known or ()), *given}
+            and target[HIGH] == HIGH
+        ):
             rule["merge"] = {**(rule["merge"] or {}), HIGH: sorted({HIGH, *LOWER})}
-            listed = " and ".join(map(str, parts))
             report.notes.append(
-                f"vegetation is one class, 5, in what is judged: of the reference {listed} count as 5, too. To compare "
-                "them as they are: --filters.accuracy.merge='{}'"
+                f"vegetation is one class, 5, in what is judged: of the reference {' and '.join(map(str, parts))} count as "
+                "5, too. To compare them as they are: --filters.accuracy.merge='{}'"
             )
         return rule
 
@@ -243,35 +238,25 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
     ) -> None:
         from ..reports.accuracypage import Place, places, write_accuracy_report
 
-        about = {
-            "files": self.files,
-            "reference system": ", ".join(
-                dict.fromkeys(name_of_wkt(points.wkt) or "none given" for _, points in parts)
-            ),
-            "model": self.model_file,
-        }
-        how = {k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]}
-        how |= {k: v for k in ("classes", "ignore", "merge") if (v := rule[k]) is not None}
+        systems = ", ".join(dict.fromkeys(name_of_wkt(points.wkt) or "none given" for _, points in parts))
+        settings = {"files": self.files, "reference system": systems, "model": self.model_file}
+        settings |= {k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]}
+        settings |= {k: rule[k] for k in ("classes", "ignore", "merge") if rule[k] is not None}
         model = loaded_model(self.model_file) if self.model_file else None
-        importances = None
-        if model is not None and model.info["passes"][-1]["importances"] is not None:  # networks have none
-            importances = model.importances("column")
+        known = (
+            model is not None and model.info["passes"][-1]["importances"] is not None
+        )  # networks have none
+        shown = [
+            Place(name, points.xyz[one.inside], one.reference, one.predicted)
+            for (name, points), one in zip(parts, sides, strict=True)
+        ]
         write_accuracy_report(
             path,
             accuracy,
-            places=places(
-                [
-                    Place(name, points.xyz[one.inside], one.reference, one.predicted)
-                    for (name, points), one in zip(parts, sides, strict=True)
-                ],
-                [points.wkt for _, points in parts],
-            ),
-            title=self.title,
-            subtitle="; ".join(
-                str(v) for v in (*self.files[:3], about["reference system"], self.model_file) if v
-            ),
-            importances=importances,
-            settings={**about, **how},
+            places=places(shown, [points.wkt for _, points in parts]),
+            subtitle="; ".join(map(str, filter(None, [*self.files[:3], systems, self.model_file]))),
+            importances=model.importances("column") if model is not None and known else None,
+            settings=settings,
         )
 
 
