@@ -71,7 +71,7 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     # Imported here, so that an environment that lacks something is told in a sentence.
     from ..pipeline.overrides import parse_overrides
     from . import files, machine, models, pipelines
-    from .parser import OVERRIDES, Parser, taken, with_levels
+    from .parser import OVERRIDES, Parser
 
     parser = Parser(
         prog="pdal-stages",
@@ -81,12 +81,16 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
     for group in (pipelines, files, models, machine):
         group.add_commands(parser)
-    overrides, rest = parse_overrides(with_levels(arguments))
-    options, unknown = parser.parse_known_args(rest)
-    if unknown and not taken(options, unknown):
-        parser.refuse(options.command, unknown)
+    overrides, rest = parse_overrides(arguments)
+    if not rest or rest[0] not in parser.commands:
+        parser.parse_args(rest)  # which shows help or the version, or says what is wrong, and leaves
+    command, *rest = rest
+    options, unknown = parser.commands[command].parse_known_intermixed_args(rest)
+    if unknown:
+        parser.refuse(command, unknown)
     if overrides and not options.takes_overrides:
-        raise StageError(f"'{options.command}' takes no stage options", found=overrides[0].flag)
+        raise StageError(f"'{command}' takes no stage options", found=overrides[0].flag)
+    options.command = command
     options.overrides, options.arguments, options.is_program = overrides, list(arguments), is_program
     return options
 

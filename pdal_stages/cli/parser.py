@@ -14,7 +14,6 @@ OVERRIDES = (
     "--filters.name.option=VALUE for all stages of a type."
 )
 INPUTS = "Files that PDAL reads, folders, patterns, tile indexes, EPT sources"
-_VERBOSE = ("-v", "--verbose")
 _NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 
 
@@ -65,26 +64,3 @@ class Parser(argparse.ArgumentParser):
 def switch(takes: Callable, flag: str, default: bool, help: str) -> None:
     """Add ``--flag`` and ``--no-flag``."""
     takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
-
-
-def with_levels(arguments: Sequence[str]) -> list[str]:
-    """PDAL's ``-v 4``, and ``-v`` alone, in one form."""
-    out: list[str] = []
-    for before, word, after in zip(["", *arguments], arguments, [*arguments[1:], ""], strict=False):
-        if word in _VERBOSE:
-            out.append(f"--verbose={after if after.isdigit() else 2}")
-        elif not (word.isdigit() and before in _VERBOSE):
-            out.append(word)
-    return out
-
-
-def taken(options: argparse.Namespace, words: list[str]) -> bool:
-    """Whether words left over are names of inputs, and of the output, behind a flag, where argparse does not look."""
-    inputs = getattr(options, "inputs", None)
-    if not isinstance(inputs, list) or any(word.startswith("-") for word in words):
-        return False
-    if hasattr(options, "output"):
-        *inputs[len(inputs) :], options.output = [options.output, *words]
-    else:
-        inputs += words
-    return True

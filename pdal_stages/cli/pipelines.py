@@ -35,9 +35,7 @@ def add_commands(parser: Parser) -> None:
     takes("--validate", action="store_true", help="Check the pipeline without reading points, then stop")
     never = "Accepted for compatibility with PDAL; our stages never stream"
     takes("--nostream", action="store_true", help=never)
-    levels = (
-        "Print more of PDAL's log: 1 warnings (default), 2 what it does (-v alone), 3 and more everything"
-    )
+    levels = "Print more of PDAL's log: 1 warnings (default), 2 what it does, 3 and more everything"
     takes("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
     add_arguments(parser.commands["pipeline"])
 
@@ -101,7 +99,7 @@ def executed(options: argparse.Namespace, pipeline: Pipeline) -> list[str]:
     lines = pipeline.log_lines
     messages = [f"PDAL says: {line}" for line in (lines if verbose > 1 else lines[:_LOG_LINES])]
     if len(lines) > _LOG_LINES and verbose <= 1:
-        messages.append(f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v shows them")
+        messages.append(f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v 2 shows them")
     if metadata:
         write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
     return messages + [line for line in pipeline.messages if line not in before]

@@ -65,7 +65,7 @@ def test_wrong_options(command, tmp_path, monkeypatch, case):
 
 
 STAGES = {
-    "unknown stage of ours": ([{"type": "filters.hagminima"}], ["line 3", "no stage 'filters.hagminima'", "filters.hag_minima"]),
+    "unknown stage of ours": ([{"type": "filters.hagminima"}], ["line 3", "filters.hagminima", "filters.hag_minima"]),
     "reader for a filter": ([{"type": "readers.hag_minima"}], ["line 3", "Did you mean 'filters.hag_minima'?"]),
     "unknown stage": ([{"type": "filters.reprojektion"}], ["line 3", "Did you mean 'filters.reprojection'?"]),
     "unknown option of PDAL's stage": ([{"type": "filters.range", "limit": "Z[0:1]"}], ["line 3", "Unexpected argument 'limit'"]),
