@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import begins_run
-from .linked import longest_sides, sums_around
+from .linked import longest_sides, number_sets, sums_around
 
 #: Side of a voxel, meters.
 SIDE = 1.5
@@ -66,9 +66,6 @@ def surroundings(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 def _small(voxels: Voxels, usual: NDArray[np.float64], most: int) -> tuple[NDArray[np.bool_], NDArray]:
     """Voxels of small components, and weak ones that no large component touches; points of each one's component."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     keys, number = voxels.keys, len(voxels.keys)
     strong = voxels.counts > (WEAK * usual).astype(np.int64)
     pairs = []
@@ -79,8 +76,8 @@ def _small(voxels: Voxels, usual: NDArray[np.float64], most: int) -> tuple[NDArr
         pairs.append([touching, at[touching]])
     one, other = np.concatenate(pairs, axis=1)
     both = strong[one] & strong[other]
-    graph = coo_array((np.ones(both.sum(), np.int8), (one[both], other[both])), (number, number))
-    count, label = connected_components(graph, directed=False)
+    label = np.empty(number, np.int64)
+    count = number_sets(one[both], other[both], label)
     size = np.bincount(label, voxels.counts).astype(np.int64)
     first = np.empty(count, np.int64)
     first[label[::-1]] = np.arange(number)[::-1]  # a component's first voxel stands for it

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import begins_run
+from .linked import number_sets
 
 #: The largest raster that is made in one piece, in cells; else squares of this side plus the reach.
 LARGEST, SIDE = 2048 * 2048, 1024
@@ -93,9 +94,6 @@ def _groups(column: NDArray[np.int64], row: NDArray[np.int64], link: int) -> lis
     order, numbers, starts, stride = _by_block(column, row, side, rings)
     if len(numbers) == 1:
         return [order]
-    from scipy.sparse import coo_array  # dense clouds do without
-    from scipy.sparse.csgraph import connected_components
-
     ones, others = [], []
     for b in range(rings + 1):
         for a in range(-rings if b else 1, rings + 1):
@@ -104,12 +102,8 @@ def _groups(column: NDArray[np.int64], row: NDArray[np.int64], link: int) -> lis
             linked = np.flatnonzero(numbers[at] == numbers + step)
             ones.append(linked)
             others.append(at[linked])
-    pairs = np.concatenate(ones), np.concatenate(others)
-    size = len(numbers)
-    found, label = connected_components(
-        coo_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(size, size)), directed=False
-    )
-    if found == 1:
+    label = np.empty(len(numbers), np.int64)
+    if number_sets(np.concatenate(ones), np.concatenate(others), label) == 1:
         return [order]
     of_points = np.repeat(label, np.diff(starts))
     together = np.argsort(of_points, kind="stable")
