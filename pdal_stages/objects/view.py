@@ -10,7 +10,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..base.jit import njit
 from . import crowns, roofs
 from .cells import GROUND_CELLS, MM, Cells, Kind, unpack
 from .found import ObjectSettings
@@ -167,30 +166,21 @@ def _wide(values: NDArray) -> NDArray:
     return np.repeat(np.repeat(values, GROUND_CELLS, axis=0), GROUND_CELLS, axis=1)
 
 
-@njit
 def fill_gaps(z: NDArray, reach: int) -> NDArray:
-    """Values where there are none (NaN), from the nearest in eight directions, weighed by one over the distance.
+    """Values where there are none (NaN), from the nearest along rows and columns, weighed by one over the distance.
 
     Two that lie opposite give what a line between them does, so a slope goes on below a building. What lies farther
     than `reach` cells does not count: the surroundings of a place decide, whatever the extent of the array.
     """
-    rows, columns = z.shape
-    total, weight = np.zeros((rows, columns)), np.zeros((rows, columns))
-    for way in range(8):
-        dr, dc = (0, 0, 1, -1, 1, -1, 1, -1)[way], (1, -1, 0, 0, 1, -1, -1, 1)[way]
-        last, steps = z.copy(), np.zeros((rows, columns), np.int32)
-        length = np.sqrt(2.0) if dr != 0 and dc != 0 else 1.0
-        for i in range(rows):
-            r = i if dr >= 0 else rows - 1 - i
-            for j in range(columns):
-                c = j if dc >= 0 else columns - 1 - j
-                before_r, before_c = r - dr, c - dc
-                inside = 0 <= before_r < rows and 0 <= before_c < columns
-                if not np.isnan(z[r, c]) or not inside or np.isnan(last[before_r, before_c]):
-                    continue
-                away = steps[before_r, before_c] + 1
-                if away * length <= reach:
-                    last[r, c], steps[r, c] = last[before_r, before_c], away
-                    total[r, c] += last[r, c] / (away * length)
-                    weight[r, c] += 1.0 / (away * length)
-    return np.where(np.isnan(z) & (weight > 0.0), total / weight, z)
+    total, weight = np.zeros(z.shape), np.zeros(z.shape)
+    for turned in (np.s_[:, :], np.s_[:, ::-1]):
+        for values, sums, weights in ((z, total, weight), (z.T, total.T, weight.T)):
+            values, place = values[turned], np.arange(values.shape[1])
+            last = np.maximum.accumulate(np.where(np.isnan(values), -1, place), axis=1)
+            away = place - last
+            near = (last >= 0) & (away > 0) & (away <= reach)
+            sums[turned] += np.where(
+                near, np.take_along_axis(values, last, axis=1) / np.maximum(away, 1), 0.0
+            )
+            weights[turned] += np.where(near, 1.0 / np.maximum(away, 1), 0.0)
+    return np.where(np.isnan(z) & (weight > 0.0), total / np.maximum(weight, 1e-12), z)
