@@ -45,7 +45,13 @@ class _Family:
             runtime.remember_stdout()
             stages = [*([{"type": "filters.merge", **wired}] if merge else []), expanded.plain]
             shown = f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
-            return _joined(stages, shown, expanded.stage)
+            joined = _joined(stages, shown, expanded.stage)
+            joined.type, joined.tag, joined.options = (
+                kind.type,
+                options.get("tag"),
+                {"type": kind.type, **options},
+            )
+            return joined
 
         make.__name__ = make.__qualname__ = name
         make.__signature__ = signature  # type: ignore[attr-defined]
