@@ -83,10 +83,6 @@ def test_all_measures_equal_scikit_learn(pair):
         a.by_reference,
         metrics.confusion_matrix(reference, predicted, labels=everything, normalize="true")[: len(present)],
     )
-    np.testing.assert_allclose(
-        a.by_prediction,
-        metrics.confusion_matrix(reference, predicted, labels=everything, normalize="pred")[: len(present)],
-    )
 
 
 def test_grading_equals_scikit_learn():
@@ -230,19 +226,14 @@ def test_more_points_than_one_chunk(monkeypatch):
 def test_table_is_ascii_and_aligned():
     reference, predicted, reliability = town()
     a = Accuracy.from_labels(reference, predicted, reliability=reliability, margin=reliability)
-    for kind in ("by_reference", "by_prediction", "counts", "none"):
-        text = a.table(kind)
-        assert text.isascii()
-        assert not any(line.endswith(" ") for line in text.splitlines())
-        assert max(map(len, text.splitlines())) <= 100
-    lines = a.table().splitlines()
+    text = a.table()
+    assert text.isascii()
+    assert not any(line.endswith(" ") for line in text.splitlines())
+    assert max(map(len, text.splitlines())) <= 100
+    lines = text.splitlines()
     start = next(i for i, line in enumerate(lines) if "Recall %" in line)
     assert len({len(line) for line in lines[start : start + 6]}) == 1
-    assert f"{100 * a.recall[6]:.2f}" in lines[start + 5]
-    counts = a.table("counts")
-    for value in a.matrix.ravel():
-        assert f"{value:,}" in counts
-    assert "expected calibration error" in counts
+    assert f"{100 * a.recall[6]:.2f}" in lines[start + 5] and "expected calibration error" in text
 
 
 # ---- misuse ----------------------------------------------------------------------------------------------

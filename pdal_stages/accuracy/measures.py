@@ -25,10 +25,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.asprs import UNINFORMATIVE, class_name
-from ..base.errors import OptionError, StageError, suggest
+from ..base.errors import StageError
 from .confidence import Grading
 from .labels import CHUNK, Merge, as_codes, class_names, code_list, pair_counts, regroup, same_length
-from .text import CONFUSIONS, table
+from .text import table
 
 FORMAT = "pdal-stages accuracy"
 VERSION = 1
@@ -273,12 +273,6 @@ class Accuracy:
         total = self.matrix.sum(axis=1, keepdims=True)
         return np.divide(self.matrix, total, out=np.zeros(self.matrix.shape), where=total > 0)
 
-    @cached_property
-    def by_prediction(self) -> npt.NDArray[np.float64]:
-        """Each column as shares of the predicted class: its diagonal is precision. Empty columns are 0."""
-        total = self.matrix.sum(axis=0, keepdims=True)
-        return np.divide(self.matrix, total, out=np.zeros(self.matrix.shape), where=total > 0)
-
     def _checked(self) -> None:
         if self.points == 0:
             raise StageError("no point was compared, so there is no accuracy", found="0 points")
@@ -385,24 +379,11 @@ class Accuracy:
                 "columns": described(self.columns),
                 "counts": self.matrix.tolist(),
                 "by_reference": self.by_reference.tolist(),
-                "by_prediction": self.by_prediction.tolist(),
             },
             "reliability": self.reliability.to_dict("curve") if self.reliability else None,
             "margin": self.margin.to_dict("deciles") if self.margin else None,
         }
 
-    def table(self, confusion: str = "by_reference") -> str:
-        """The figures as aligned text, in percent.
-
-        Parameters
-        ----------
-        confusion : {"by_reference", "by_prediction", "counts", "none"}
-            How the confusion matrix is given.
-        """
-        if confusion not in CONFUSIONS:
-            raise OptionError(
-                "'confusion' is not a way to give the matrix",
-                found=confusion,
-                cure=suggest(confusion, CONFUSIONS) + f"Use one of {', '.join(CONFUSIONS)}",
-            )
-        return table(self.to_dict(), confusion, self.name)
+    def table(self) -> str:
+        """The figures as aligned text, in percent."""
+        return table(self.to_dict(), self.name)

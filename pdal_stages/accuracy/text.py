@@ -5,14 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-#: Ways to give the confusion matrix, and what its values are then.
-CONFUSIONS = {
-    "by_reference": "% of the reference class; the diagonal is recall",
-    "by_prediction": "% of the predicted class; the diagonal is precision",
-    "counts": "points",
-    "none": "",
-}
-
 
 def percent(share: float | None, digits: int = 2) -> str:
     """A share in percent, without its sign; ``-`` where it is not defined."""
@@ -50,11 +42,9 @@ def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
     )
 
 
-def table(figures: Mapping[str, Any], confusion: str, name: Callable[[int], str]) -> str:
-    """What ``accuracy-1.json`` describes as aligned text, in percent; `confusion` is one of :data:`CONFUSIONS`."""
-    blocks = [_headline(figures, name), _classes(figures)]
-    if confusion != "none":
-        blocks.append(_confusion(figures["confusion"], confusion))
+def table(figures: Mapping[str, Any], name: Callable[[int], str]) -> str:
+    """What ``accuracy-1.json`` describes as aligned text, in percent."""
+    blocks = [_headline(figures, name), _classes(figures), _confusion(figures["confusion"])]
     return "\n\n".join([*blocks, *_confidence(figures)])
 
 
@@ -92,15 +82,15 @@ def _classes(d: Mapping[str, Any]) -> str:
     return _aligned(header, rows)
 
 
-def _confusion(d: Mapping[str, Any], kind: str) -> str:
+def _confusion(d: Mapping[str, Any]) -> str:
     known = len(d["rows"])
     header = ["", "Reference", *(f"{c['code']}{'*' * (i >= known)}" for i, c in enumerate(d["columns"]))]
     rows = [
-        [str(c["code"]), c["name"], *(f"{v:,}" if kind == "counts" else percent(v) for v in values)]
-        for c, values in zip(d["rows"], d[kind], strict=True)
+        [str(c["code"]), c["name"], *map(percent, values)]
+        for c, values in zip(d["rows"], d["by_reference"], strict=True)
     ]
-    text = f"Confusion: rows reference, columns prediction, {CONFUSIONS[kind]}\n" + _aligned(header, rows)
-    return text + ("\n* not a class of the reference" if len(d["columns"]) > known else "")
+    text = "Confusion: rows reference, columns prediction, % of the reference class; the diagonal is recall\n"
+    return text + _aligned(header, rows) + "\n* not a class of the reference" * (len(d["columns"]) > known)
 
 
 def _confidence(d: Mapping[str, Any]) -> list[str]:

@@ -132,7 +132,6 @@ def write_accuracy_report(
         a=accuracy,
         scenes=scenes,
         hidden=max(0, len(places) - DRAWN),
-        matrix_width=_matrix_width(accuracy),
         confidence=_confidence(accuracy),
         importances=[(name, float(share)) for name, share in ordered],
         settings=settings,
@@ -202,13 +201,6 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any, unit: str) -> d
         ],
         "in_a_row": wide < 1.7 * tall,
     }
-
-
-def _matrix_width(a: Accuracy) -> int:
-    """Pixels a confusion matrix needs, estimated from its longest words at about 7 pixels a letter."""
-    titles = [f"{c} {a.name(c)}{' compared)' * (c in a.extra)}" for c in a.columns]
-    columns = sum(max(64, 18 + 7 * max(map(len, title.split()))) for title in titles)
-    return 120 + 7 * max(len(f"{c} {a.name(c)}") for c in a.classes) + columns
 
 
 def _confidence(a: Accuracy) -> list[dict[str, Any]]:
