@@ -164,25 +164,13 @@ def test_a_missing_dimension_names_itself_and_its_maker(trained, other):
         trained.predict(xyz, {"HeightAboveGround": np.zeros(3)})
 
 
-def test_return_ratio_and_intensity(other):
+def test_intensity(other):
     xyz, label, dimensions = scene()
-    options = TrainingOptions(**{**SMALL, "dimensions": "HeightAboveGround,Intensity,ReturnRatio"})
+    options = TrainingOptions(**{**SMALL, "dimensions": "HeightAboveGround,Intensity"})
     model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
-    assert model.plan.names[-3:] == ("HeightAboveGround", "Intensity", "ReturnRatio")
-    assert set(model.required_dimensions) == {
-        "HeightAboveGround", "Intensity", "ReturnNumber", "NumberOfReturns",
-    }  # fmt: skip
+    assert model.plan.names[-2:] == model.required_dimensions == ("HeightAboveGround", "Intensity")
     xyz, label, dimensions = other
     assert accuracy(model.predict(xyz, dimensions), label) > 0.85
-    dimensions = {**dimensions, "NumberOfReturns": dimensions["NumberOfReturns"].copy()}
-    dimensions["NumberOfReturns"][:7] = 0
-    assert model.predict(xyz, dimensions).report.figures["points_without_return_numbers"] == 7
-    dimensions["NumberOfReturns"][:] = 0
-    with pytest.raises(DimensionError, match="0 everywhere"):
-        model.predict(xyz, dimensions)
-    del dimensions["NumberOfReturns"]
-    with pytest.raises(DimensionError, match="NumberOfReturns"):
-        model.predict(xyz, dimensions)
 
 
 # ---- training ------------------------------------------------------------------------------------------

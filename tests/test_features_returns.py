@@ -59,7 +59,7 @@ def test_without_return_numbers_all_is_zero():
     xyz, _ = cloud(50)
     assert required(returns.NAMES) == () and welcome(returns.NAMES) == returns.SOURCES
     for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in returns.SOURCES}):
-        fed, _ = gather(returns.NAMES, with_returns(returns.NAMES, xyz, dimensions), 50, np.arange(0, 50, 7))
+        fed = gather(returns.NAMES, with_returns(returns.NAMES, xyz, dimensions), 50, np.arange(0, 50, 7))
         assert all(len(fed[name]) == 8 and not fed[name].any() for name in returns.NAMES)
     assert not len(returns.return_features(returns.NAMES, xyz[:0], {})["MultipleReturn_box2"])
 

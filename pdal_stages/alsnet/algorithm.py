@@ -122,13 +122,12 @@ class AlsNet:
 
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
-        values, missing = gather(
+        values = gather(
             self.inputs,
             with_returns(self.inputs, request.xyz, request.dimensions, request.threads),
             len(request.xyz),
         )
         figures = request.report.figures
-        figures.update({name: number for name, number in missing.items() if number})
         if request.count:
             mean, variance, counted = self._means(request, values)
             figures.update(counted)

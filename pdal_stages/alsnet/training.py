@@ -82,13 +82,9 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     known = label_classes(clouds, options)
     dimensions = [name for name in names if name not in COORDINATES]
     values: list[dict[str, npt.NDArray[Any]]] = []
-    missing: dict[str, int] = {}
     for cloud, places in zip(clouds, xyz, strict=True):
         there = with_returns(names, places, cloud.dimensions, options.threads)
-        found, counted = gather(names, there, len(places), where=cloud.name)
-        values.append(found)
-        for name, number in counted.items():
-            missing[name] = missing.get(name, 0) + number
+        values.append(gather(names, there, len(places), where=cloud.name))
     position = np.concatenate([np.asarray(one) for _, one in known])
     joined = {
         name: np.concatenate([np.asarray(own[name], np.float64) for own in values]) for name in dimensions
@@ -113,7 +109,6 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             "seed": options.seed,
             "samples": int(count.sum()),
             **session.notes(),
-            **{name: number for name, number in missing.items() if number},
         },
         "densities": densities(clouds),
         "voxel": options.voxel,

@@ -19,8 +19,6 @@ ALWAYS = ("HeightAboveGround",)
 WHERE_THERE = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
 #: 1 where a person has checked a point's class.
 CHECKED = "Checked"
-#: Derived here: ReturnNumber / NumberOfReturns, 1 for a last or only return.
-RETURN_RATIO = "ReturnRatio"
 
 _READ = "It comes from the reader; this source has none. Use a model trained without it"
 _MAKERS = {
@@ -34,11 +32,9 @@ _MAKERS = {
 
 def required(names: Iterable[str]) -> tuple[str, ...]:
     """Dimensions the cloud must have for these dimension features."""
-    out: dict[str, None] = {}
-    for name in names:
-        if name not in COORDINATES and returns.parse(name) is None:
-            out.update(dict.fromkeys(returns.SOURCES if name == RETURN_RATIO else (name,)))
-    return tuple(out)
+    return tuple(
+        dict.fromkeys(name for name in names if name not in COORDINATES and returns.parse(name) is None)
+    )
 
 
 def welcome(names: Iterable[str]) -> tuple[str, ...]:
@@ -77,78 +73,35 @@ def gather(
     n: int,
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
-) -> tuple[dict[str, npt.NDArray[Any]], dict[str, int]]:
-    """The values of dimension features at some points.
+) -> dict[str, npt.NDArray[Any]]:
+    """The values (len(rows),) of dimension features at some of n points, all by default, by name.
 
-    Parameters
-    ----------
-    names : iterable of str
-    dimensions : mapping
-        Name to (n,) values of the whole cloud; see :func:`with_returns`.
-    n : int
-    rows : array of int, optional
-        Points wanted; all by default.
-    where : str, optional
-        The cloud, for error texts.
-
-    Returns
-    -------
-    values : dict of name to (len(rows),) array
-    counts : dict
-        What had to be counted: ``points_without_return_numbers`` (their ratio is taken as 1).
-
-    Raises
-    ------
-    DimensionError
-        A dimension is missing, of another length, or not finite somewhere.
+    `dimensions` are (n,) values of the whole cloud, see :func:`with_returns`; `where` is the cloud, for error texts.
+    DimensionError where one is missing, of another length, or not finite somewhere.
     """
-
-    def picked(name: str) -> npt.NDArray[Any]:
+    out = {}
+    for name in names:
+        if name in COORDINATES:
+            continue
         if name not in dimensions:
             cure = _MAKERS.get(name, f"Put the stage that creates {name} before this one")
             raise DimensionError(f"the dimension {name} is missing", where=where, cure=cure)
         values = np.asarray(dimensions[name])
-        if values.shape != (n,):
+        if values.shape != (n,) or values.dtype.kind not in "fiub":
             raise DimensionError(
                 f"the dimension {name} must have one value per point",
                 where=where,
-                found=f"shape {values.shape}",
+                found=f"{values.dtype} of shape {values.shape}",
             )
-        if values.dtype.kind not in "fiub":
-            raise DimensionError(f"the dimension {name} is not numeric", where=where, found=str(values.dtype))
-        values = values if rows is None else values[rows]
-        bad = np.count_nonzero(~np.isfinite(np.asarray(values))) if values.dtype.kind == "f" else 0
-        if bad:
+        out[name] = values if rows is None else values[rows]
+        if values.dtype.kind == "f" and (bad := np.count_nonzero(~np.isfinite(out[name]))):
             raise DimensionError(
                 f"the dimension {name} is not finite at some points",
                 where=where,
                 found=f"{bad:,} points",
                 cure=f"Remove them before this stage. {_MAKERS.get(name, '')}",
             )
-        return values
-
-    counts: dict[str, int] = {}
-    out = {}
-    for name in names:
-        if name in COORDINATES:
-            continue
-        if returns.parse(name) is not None:  # made by with_returns
-            values: Any = dimensions[name]
-            out[name] = values if rows is None else values[rows]
-        elif name != RETURN_RATIO:
-            out[name] = picked(name)
-        else:
-            number, total = (np.asarray(picked(source)) for source in returns.SOURCES)
-            there = (number > 0) & (total > 0)
-            if len(total) and not there.any():
-                raise DimensionError(
-                    "ReturnNumber or NumberOfReturns is 0 everywhere, so there is no ReturnRatio",
-                    where=where,
-                    cure="Use a model trained without ReturnRatio",
-                )
-            counts["points_without_return_numbers"] = int(np.count_nonzero(~there))
-            out[name] = np.where(there, number / np.maximum(total, 1), 1.0)
-    return out, counts
+    return out
 
 
 def preparing() -> Any:

@@ -166,8 +166,7 @@ class CloudFeatures:
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
         self._dimensions = with_returns(names, request.xyz, request.dimensions, request.threads)
-        _, counted = gather(names, self._dimensions, len(request.xyz), request.rows)
-        request.report.figures.update({name: number for name, number in counted.items() if number})
+        gather(names, self._dimensions, len(request.xyz), request.rows)  # says what is wrong with them
 
     def blocks(
         self,
@@ -194,7 +193,7 @@ class CloudFeatures:
             )
         yield from self._engine.blocks(
             queries=rows,
-            dimensions=lambda some: gather(features.plan.dimensions, self._dimensions, n, some)[0],
+            dimensions=lambda some: gather(features.plan.dimensions, self._dimensions, n, some),
             threads=asked.threads,
             memory_mb=max(asked.memory_mb * memory_share, 16.0),
             progress=progress,

@@ -95,7 +95,7 @@ class _ForestTraining:
         self.stands_for = weight * frequent[self.samples.label]
         factors = frequent**options.prior_weight
         self.factors = factors / factors.max() if options.prior_weight else None
-        self.counts: dict[str, int] = {}
+        self.short = 0  # samples of tiles whose nearest neighbors lie beyond the halo of their features
         plan = feature_plan(options)
         used = [clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
         bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
@@ -144,11 +144,8 @@ class _ForestTraining:
                 )
                 for part, block in computed:
                     values[at[np.searchsorted(rows, part)]] = block
-                counts = {k: n for k, n in request.report.figures.items() if isinstance(n, int)}
                 if cloud.own is not None:
-                    counts[SHORT] = max(request.report.beyond_halo.values(), default=0)
-                for key, n in counts.items():
-                    self.counts[key] = self.counts.get(key, 0) + n
+                    self.short += max(request.report.beyond_halo.values(), default=0)
         bad = ~np.isfinite(values).all(axis=0)
         if bad.any():
             raise DimensionError(f"the feature {names[int(bad.argmax())]} is not finite for some samples")
@@ -191,7 +188,7 @@ class _ForestTraining:
                 "min_samples_leaf": o.min_samples_leaf,
                 **notes,
                 **self._held_by_base(),
-                **{key: n for key, n in self.counts.items() if n},
+                **({SHORT: self.short} if self.short else {}),
             },
             "priors": priors,
             "densities": densities(self.clouds),
@@ -290,7 +287,7 @@ class _ForestTraining:
         cloud, name = self.clouds[number], self.options.groups
         if not name:
             return np.broadcast_to(np.array(cloud.flight), len(cloud))
-        return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[0][name]
+        return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
 
     def _count_sure(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
         """Count in how far samples that were held out were right where they were sure, as the points lie."""

@@ -59,8 +59,8 @@ class TrainingOptions:
     dimensions: Sequence[str] = setting(
         ("HeightAboveGround",),
         "list",
-        "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, ReturnRatio, or returns "
-        "for all return features",
+        "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, or returns (all return "
+        "features)",
     )
     classes: Any = setting(
         None,
