@@ -55,13 +55,10 @@ class NewValues:
 
 
 def of_own_points(result: PieceResults) -> NewValues:
-    """The results for a file of the tile's own points alone."""
-    own = result.piece.own
-    rows = np.searchsorted(own, result.rows)
-    kept = np.zeros(len(own), bool)
-    kept[rows] = True
-    at = None if kept.all() else rows
-    return NewValues(kept, {name: (at, values) for name, values in result.values.items()})
+    """The results for a file of the piece, of which the tile's own points alone stay."""
+    kept = np.zeros(len(result.piece.index), bool)
+    kept[result.rows] = True
+    return NewValues(kept, {name: (result.rows, values) for name, values in result.values.items()})
 
 
 def class_counts(values: Iterable[Mapping[str, NDArray]]) -> dict[str, int]:
@@ -353,5 +350,5 @@ def write_tile(
     if plan.takes is not None:
         return plan.takes(mine, outputs, scratch)
     tail = with_dimensions(plan.tail, plan.beside, [result.piece.source.path for result in mine])
-    readers = [{**result.piece.reader, "filename": result.piece.core} for result in mine]
+    readers = [{**result.piece.reader, "filename": result.piece.path} for result in mine]
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, scratch)

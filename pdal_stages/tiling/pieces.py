@@ -182,7 +182,6 @@ class Piece:
 
     source: InputSource
     path: str
-    core: str  #: another file, with the tile's own points alone; empty where none was asked for
     index: NDArray[np.int64]  #: (n,) number of each point in its input file
     #: (n,) how far it lies outside the tile along the farther axis, in the unit of the coordinates; -1 inside
     away: NDArray[np.float64]
@@ -205,11 +204,10 @@ def cut_all(
     sources: Sequence[tuple[InputSource, CloudIndex | None]],
     halo_units: float,
     folder: str,
-    cores: bool = False,
 ) -> list[Piece]:
     """A tile's points and their surroundings, out of every input that has any there.
 
-    `halo_units` is in the unit of the coordinates; `cores`: the tile's own points come in files of their own, too.
+    `halo_units` is in the unit of the coordinates.
     """
     box, own = grid.box(tile, halo_units), grid.box(tile)
     pieces = []
@@ -234,12 +232,8 @@ def cut_all(
         away = np.where((places == tile).all(axis=1), -1.0, np.maximum(away, 0.0))
         target = os.path.join(folder, f"piece{number}.las")
         write_records(target, header, [records])
-        core = ""
-        if cores:
-            core = os.path.join(folder, f"core{number}.las")
-            write_records(core, header, [records[away < 0]])
         corner = places.min(axis=0)
         at = np.ravel_multi_index((places - corner).T, wide := tuple(np.ptp(places, axis=0) + 1))
         there = corner + np.column_stack(np.unravel_index(np.flatnonzero(np.bincount(at)), wide))
-        pieces.append(Piece(source, target, core, numbers, away, {(i, j) for i, j in there.tolist()}))
+        pieces.append(Piece(source, target, numbers, away, {(i, j) for i, j in there.tolist()}))
     return pieces

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of
 from ..stages import registry
-from ..stages.base import Left, Stage
+from ..stages.base import Left
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import TOUCH_NONE
 from .grid import Box, TileGrid, inside
@@ -87,9 +88,28 @@ def run_head(
         begin = first.at
         for mark, changed in zip(marks, before.changed, strict=True):
             mark.changed = changed
-    reaches: dict[int, _Reach] = {}
     from_afar = None
-    found = _Found(plan.creates)
+    reaches: dict[
+        int, float
+    ] = {}  # numbers of open-ended stages: meters outside the tile that their results are used
+    needs = [0.0]
+    views: list[dict[str, NDArray]] = []  # of the tile's own points: far less than all arrays of all points
+    places: list[NDArray[np.float64]] = []  # of all: X, Y, Z and how far outside the tile
+
+    def reach(number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        points = points_of(ours[number].stage, module, ins)
+        wanted = ins[OUTSIDE] <= reaches[number] if reaches[number] > 0 else ins[OUTSIDE] < 0
+        box = [side * points.units.horizontal for side in context.grid.box(tile)]
+        needs.append(ours[number].stage.reach_of(points, wanted, box))
+
+    def take(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        wanted = ins if plan.creates is None else plan.creates
+        names = [name for name in wanted if name in ins and name not in _MARK_TYPES]
+        mine = np.flatnonzero(ins[OUTSIDE] < 0)
+        views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
+        if most > 0:
+            places.append(np.column_stack([ins[name] for name in ("X", "Y", "Z", OUTSIDE)]))
+
     with Callbacks() as callbacks:
         stages = _marked(callbacks, marks)
         for number in range(begin, len(plan.head)):
@@ -99,28 +119,26 @@ def run_head(
                 from_afar = len(stages) - 1
             kind = registry.stages().get(stage["type"])
             if kind is not None and kind.open_ended and not everything:
-                reach = reaches[len(stages) - 1] = _Reach(context.grid.box(tile), plan.later[number])
-                stages.append(callbacks.filter(reach))
-        stages.append(callbacks.filter(found))
+                reaches[len(stages) - 1] = plan.later[number]
+                stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
+        stages.append(callbacks.filter(take))
         pipeline = Pipeline(stages, whole=False)
-        ours = pipeline.expanded.ours
+        ours = {one.number: one for one in pipeline.expanded.ours}
         check_writers(
-            [*pipeline.expanded.stages, *plan.tail], [(one.stage, one.place, one.index) for one in ours]
+            [*pipeline.expanded.stages, *plan.tail],
+            [(one.stage, one.place, one.index) for one in ours.values()],
         )
-        for one in ours:
+        for one in ours.values():
             one.stage.own_points = OUTSIDE
             if before is not None and one.number == from_afar:
                 one.stage.from_blocks = before.blocks
-            if one.number in reaches:
-                reaches[one.number].stage = one.stage
-        most = max((one.stage.most_neighbors() for one in ours), default=0)
-        found.with_places = most > 0
+        most = max((one.stage.most_neighbors() for one in ours.values()), default=0)
         pipeline.execute(arrays=False)
-    results = _collect(found.views, cuts, plan.creates, marks)
-    need = max((reach.need for reach in reaches.values()), default=0.0)
+    results = _collect(views, cuts, plan.creates, marks)
+    need = max(needs)
     if not everything and any(report.beyond_halo for _, reports in pipeline.reports for report in reports):
-        second = max(one.stage.second_neighbors() for one in ours)
-        need = max(need, _far_neighbors(found.places, most, second, context, tile))
+        second = max(one.stage.second_neighbors() for one in ours.values())
+        need = max(need, _far_neighbors(places, most, second, context, tile))
     alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
     return HeadRun(results, need, _messages(pipeline, context.scratch), alone)
 
@@ -248,41 +266,6 @@ class _Mark:
         return self.original[name][np.searchsorted(self.piece.own, rows)] != values
 
 
-class _Reach:
-    """Finds how far an open-ended stage reached for what is used of its results: up to `later` meters outside the tile."""
-
-    def __init__(self, box: Box, later: float) -> None:
-        self.box, self.later, self.need = box, later, 0.0
-        self.stage: Stage | None = None
-
-    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        assert self.stage is not None
-        points = points_of(self.stage, module, ins)
-        wanted = ins[OUTSIDE] <= self.later if self.later > 0 else ins[OUTSIDE] < 0
-        box = [side * points.units.horizontal for side in self.box]
-        self.need = max(self.need, self.stage.reach_of(points, wanted, box))
-
-
-class _Found:
-    """Takes what the stages gave the tile's own points, view by view: far less than all arrays of all points.
-
-    `with_places`: where all points are, too: X, Y, Z and how far outside the tile.
-    """
-
-    def __init__(self, creates: list[str] | None) -> None:
-        self.creates, self.with_places = creates, False
-        self.views: list[dict[str, NDArray]] = []
-        self.places: list[NDArray[np.float64]] = []
-
-    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        wanted = ins if self.creates is None else self.creates
-        names = [name for name in wanted if name in ins and name not in _MARK_TYPES]
-        mine = np.flatnonzero(ins[OUTSIDE] < 0)
-        self.views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
-        if self.with_places:
-            self.places.append(np.column_stack([ins[name] for name in ("X", "Y", "Z", OUTSIDE)]))
-
-
 def _of_piece(
     views: list[dict[str, NDArray]], mark: _Mark, names: Collection[str]
 ) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
@@ -383,8 +366,7 @@ class TileTask:
         side, halo_m, short = grid.size * context.unit, least_m, False
         head: HeadRun | None = None
         for attempt in range(_WIDENINGS + 1):
-            cores = self.outputs is not None
-            cuts = cut_all(grid, self.tile, self.sources, halo_m / context.unit, folder, cores)
+            cuts = cut_all(grid, self.tile, self.sources, halo_m / context.unit, folder)
             read = sum(len(piece.index) for piece in cuts)
             own = sum(len(piece.own) for piece in cuts)
             if not own:

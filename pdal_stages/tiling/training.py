@@ -296,7 +296,7 @@ class Taking:
 
     def __call__(self, results: list[PieceResults], outputs: list[str], scratch: str) -> dict[str, Any]:
         stage = lowered_writer(self.writer)
-        readers = [{**result.piece.reader, "filename": result.piece.core} for result in results]
+        readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
         new = [self._new_values(result) for result in results]
         with Callbacks() as callbacks:
             flags = las_output.files_with_flags_to_split(readers)
@@ -332,5 +332,5 @@ class Taking:
         found = of_own_points(result)
         if not self.numbers:
             return found
-        number = np.full(len(result.piece.own), self.numbers[result.piece.source.path], np.uint32)
+        number = np.full(len(result.piece.index), self.numbers[result.piece.source.path], np.uint32)
         return NewValues(found.kept, {**found.values, FILE_NUMBER: (None, number)})
