@@ -57,20 +57,6 @@ def test_what_the_build_needs_is_sent_to_it():
     assert copied | {name.split("/")[0] for name in setup} | {"pdal_stages"} <= sent
 
 
-def test_compose_has_one_image_one_folder_and_no_open_port():
-    compose = pytest.importorskip("yaml").safe_load((ROOT / "compose.yaml").read_text())
-    services = compose["services"]
-    assert set(services) == {"scheduler", "worker", "job"}
-    for service in services.values():
-        assert service["image"] == "pdal-stages" and service["build"] == "."
-        assert "ports" not in service and "privileged" not in service
-        assert [volume.split(":")[-1] for volume in service["volumes"]] == ["/data", "/var/cache/pdal-stages"]
-    assert "/data" in SCRIPT.read_text() and "/var/cache/pdal-stages" in SCRIPT.read_text()
-    page = (ROOT / "docs" / "large-areas.md").read_text()
-    lines = re.findall(r"^#   (docker .*)$", (ROOT / "compose.yaml").read_text(), re.MULTILINE)
-    assert len(lines) == 3 and all(line in page for line in lines)
-
-
 # ---- starting ----------------------------------------------------------------------------------------------------
 
 

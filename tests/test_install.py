@@ -92,19 +92,6 @@ def test_patch_refuses_unexpected_sources(tmp_path):
 # ---- what is shipped and what is named -------------------------------------------------------------------
 
 
-def repository_files():
-    """Text files of the repository, without a need for git."""
-    made = {"build", "dist", "_build", "__pycache__"}
-    for folder, folders, names in os.walk(ROOT):
-        folders[:] = [
-            f for f in folders if f == ".ci" or (f[0] != "." and f not in made and f[-9:] != ".egg-info")
-        ]
-        for name in names:
-            path = Path(folder, name)
-            if path.suffix in {".py", ".md", ".sh", ".toml", ".yml", ".yaml", ".json", ".cfg", ".txt", ""}:
-                yield path
-
-
 def project():
     return pytest.importorskip("tomllib", reason="Python 3.10 has no tomllib").loads(
         (ROOT / "pyproject.toml").read_text(encoding="utf-8")

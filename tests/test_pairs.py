@@ -42,7 +42,7 @@ VALUES = {
         "vegetation_heights",
         "probabilities",
     ],
-    "writer": ["las 1.2", "las 1.4", "laz", "text", "ply", "gdal", "ogr", "none"],
+    "writer": ["las 1.2", "las 1.4", "laz", "text", "gdal", "ogr", "none"],
 }
 OPTIONS = {
     "none": {},
@@ -61,7 +61,6 @@ WRITERS = {
         "txt",
         {"type": "writers.text", "order": "X,Y,Z,Classification", "keep_unspecified": False, "precision": 4},
     ),
-    "ply": ("ply", {"type": "writers.ply", "dims": "X,Y,Z,Classification", "precision": 4}),
     "gdal": (
         "tif",
         {"type": "writers.gdal", "resolution": 2, "dimension": "Classification", "output_type": "max"},
@@ -307,21 +306,16 @@ def read_back(row, outputs):
         return columns(
             *(np.concatenate([np.asarray(p[n]) for p in parts]) for n in ("x", "y", "z", "classification"))
         )
-    if kind in ("text", "ply"):
+    if kind == "text":
         return columns(*np.concatenate([_table(path) for path in outputs]).T)
     return None
 
 
 def _table(path):
-    """X, Y, Z and class of a text or PLY file, by its header."""
-    text = path.read_text()
-    if path.suffix == ".ply":
-        head, text = text.split("end_header\n")
-        names = [line.split()[2].lower() for line in head.splitlines() if line.startswith("property")]
-    else:
-        head, text = text.split("\n", 1)
-        names = [name.strip('"').lower() for name in head.split(",")]
-    table = np.array([line.replace(",", " ").split() for line in text.splitlines()], float)
+    """X, Y, Z and class of a text file, by its header."""
+    head, text = path.read_text().split("\n", 1)
+    names = [name.strip('"').lower() for name in head.split(",")]
+    table = np.array([line.split(",") for line in text.splitlines()], float)
     return table[:, [names.index(name) for name in ("x", "y", "z", "classification")]]
 
 
@@ -346,6 +340,5 @@ def test_row(number, request, scenes, models, tmp_path, capfd):
         if row["door"] == "objects" and not pdal_env.splits_class_flags():
             found[:, 3] = found[:, 3].astype(int) & 31  # there PDAL 2.2 writes flags as it reads them
         assert np.array_equal(np.bincount(found[:, 3].astype(int)), np.bincount(wanted[:, 3].astype(int)))
-        if (row["door"], row["writer"]) != ("classify", "ply"):  # whose coordinates have six digits
-            assert np.abs(found[:, :3] - wanted[:, :3]).max() <= 10.5  # a centimeter, in writers of LAS
-            assert (found[:, 3] == wanted[:, 3]).mean() > (0.9 if row["writer"].startswith("la") else 0.9999)
+        assert np.abs(found[:, :3] - wanted[:, :3]).max() <= 10.5  # a centimeter, in writers of LAS
+        assert (found[:, 3] == wanted[:, 3]).mean() > (0.9 if row["writer"].startswith("la") else 0.9999)

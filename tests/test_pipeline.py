@@ -317,17 +317,6 @@ def test_where_leaves_the_others_alone(cloud, model):
     assert np.array_equal(part["Reliability"][inside], everything["Reliability"][inside])
 
 
-# ---- units -----------------------------------------------------------------------------------------------
-
-
-def test_degrees_are_refused(tmp_path, write_las):
-    wkt = UTM[UTM.index("GEOGCS") : UTM.index(",PROJECTION")]
-    arrays = {**scene(50), "X": np.linspace(9, 9.001, 50), "Y": np.linspace(48, 48.001, 50)}
-    source = write_las(tmp_path / "deg.las", arrays, point_format=7, wkt=wkt, scale=1e-7)
-    with pytest.raises(ps.StageError, match=r"degrees.*filters\.reprojection"):
-        ps.run_pipeline([str(source), {"type": "filters.hag_minima"}])
-
-
 # ---- errors ----------------------------------------------------------------------------------------------
 
 
