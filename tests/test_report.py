@@ -131,17 +131,6 @@ def test_nothing_given_becomes_markup(full):
     assert "1, 2" in page.text
 
 
-def test_accessible(full):
-    page = Page(full)
-    assert page.all("html")[0]["lang"] == "en"
-    images = page.all("img")
-    assert len(images) == 3
-    assert all(len(i["alt"]) > 20 and int(i["width"]) > 0 for i in images)
-    assert all(h.get("scope") in ("row", "col", "colgroup") for h in page.all("th"))
-    assert len(page.all("caption")) == len(page.all("table"))
-    assert next(t for t, _ in page.tags if t in ("h1", "h2")) == "h1"
-
-
 def test_every_figure_is_there(full, accuracy):
     text = Page(full).text
     for value in (
@@ -174,7 +163,6 @@ def test_every_figure_is_there(full, accuracy):
         Accuracy.from_labels([6, 6], [6, 6]),  # one class, all right
         Accuracy.from_labels([2, 6], [2, 2], classes=[2, 6, 17], reliability=[1, 0], margin=[1, 0]),
         Accuracy.from_labels(np.arange(40), np.arange(40)[::-1], names={3: "<i>"}),
-        Accuracy.from_labels([3, 4, 6], [4, 3, 6], merge={5: [3, 4]}),
     ],
 )
 def test_odd_accuracies_make_a_page(a):
@@ -206,17 +194,6 @@ def test_error_map_shows_the_errors(full):
     assert inside.mean() > 0.7
     differs = (reference != prediction).any(axis=2)
     assert red[differs].mean() > 0.5
-
-
-def test_maps_follow_the_merge():
-    xyz = np.random.default_rng(0).random((500, 3)) * (10, 10, 2)
-    reference = np.repeat([3, 4, 6, 2, 2], 100)
-    predicted = np.where(reference == 3, 4, reference)
-    a = Accuracy.from_labels(reference, predicted, merge={5: [3, 4]})
-    text = Page(accuracy_page(a, xyz=xyz, reference=reference, predicted=predicted)).tags
-    alts = [attrs["alt"] for tag, attrs in text if tag == "img"]
-    assert any("0 of 500 compared points are wrong" in alt for alt in alts)
-    assert any("Vegetation 40.0 %" in alt for alt in alts)
 
 
 @pytest.mark.parametrize(
@@ -307,6 +284,9 @@ def tiled(**changes):
 
 def test_a_run_tells_what_it_did_and_what_it_kept():
     page = Page(run_page(tiled()))
+    assert page.text.count("<x>\"'&") >= 8 and "x" not in {
+        tag for tag, _ in page.tags
+    }  # nothing becomes markup
     for words in (
         "1 kept from an earlier run, 1 failed",
         "3,000 more kept from an earlier run",
@@ -318,12 +298,6 @@ def test_a_run_tells_what_it_did_and_what_it_kept():
     ):
         assert words in page.text
     assert not re.search(r"\d\.\d{5,}", page.text)
-
-
-def test_nothing_of_a_run_becomes_markup():
-    page = Page(run_page(tiled()))
-    assert page.text.count("<x>\"'&") >= 7
-    assert "x" not in {tag for tag, _ in page.tags}
 
 
 def test_a_run_of_nothing_makes_a_page():

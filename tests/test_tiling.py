@@ -23,7 +23,6 @@ from pdal_stages.tiling.classify import ClassifyTask, one_format
 from pdal_stages.tiling.grid import TileGrid, inside, touching
 from pdal_stages.tiling.inputs import InputSource, find_sources, las_extent
 from pdal_stages.tiling.pieces import CloudIndex, cut_all, sort_points
-from pdal_stages.tiling.plan import make_plan
 
 pytestmark = pytest.mark.pdal
 
@@ -283,23 +282,6 @@ def test_flag_bits_of_old_formats_stay_and_are_not_counted(tmp_path, town_file, 
     assert set(run.summary["classes"]) == {"0", "2", "5", "6"}
 
 
-@pytest.mark.data
-@pytest.mark.slow
-def test_delft_comes_back_bit_for_bit(tmp_path, data_dir, model_file):
-    las = laspy.read(data_dir / "delft" / "test.laz")
-    x, y = np.asarray(las.x), np.asarray(las.y)
-    part = las[(x < x.min() + 45) & (y < y.min() + 45)]
-    part.write(tmp_path / "delft.laz")
-    ps.Pipeline(clouds.stages([tmp_path / "delft.laz"], tmp_path / "whole.laz", model_file)).execute(
-        arrays=False
-    )
-    run = run_tiled(
-        clouds.stages([tmp_path / "delft.laz"], tmp_path / "tiled.laz", model_file), 25, workers=0
-    )
-    assert not run.failures and len(run.tiles) >= 4
-    assert (tmp_path / "whole.laz").read_bytes() == (tmp_path / "tiled.laz").read_bytes()
-
-
 # ---- reaches that no halo bounds -------------------------------------------------------------------------
 
 
@@ -421,13 +403,6 @@ def test_outputs_need_names(tmp_path, town_file):
         run_tiled([str(tmp_path / "a.las"), str(tmp_path / "deep" / "a.las"), str(tmp_path / "o_#.las")], 30)
     with pytest.raises(PipelineError, match="no file fits"):
         find_sources([{"type": "readers.las", "filename": str(tmp_path / "none*.las")}])
-
-
-def test_only_seen_points_are_computed(tmp_path, town_file, model_file):
-    plan = make_plan(ps.Pipeline(clouds.stages([town_file], tmp_path / "o.las", model_file)))
-    assert plan.head[1]["where"] == "PdalStagesOutside < 0"
-    assert [s["type"] for s in plan.tail] == ["writers.las"]
-    assert plan.halo_m == pytest.approx(4 * clouds.CELL + ps.load_model(model_file).halo_m)
 
 
 # ---- tile indexes and EPT --------------------------------------------------------------------------------

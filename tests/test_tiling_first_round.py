@@ -200,24 +200,6 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
             assert np.array_equal(values[core], whole[name][near][core]), (box, name)
 
 
-@pytest.mark.parametrize("cell", [1.0, 0.7])
-def test_points_by_block_are_by_the_cells_of_blocks(cell):
-    rng = np.random.default_rng(3)
-    xyz = np.round(rng.uniform(-3000, 3000, (500, 3)), 1)
-    xyz[0] = 1e7, -1e7, 5.0
-    xyz[1, 2] = -1e7  # no terrain
-    use = np.arange(500) != 7
-    found = by_block(*xyz.T, use, cell)
-    assert sum(map(len, found.values())) == 498
-    for block, points in found.items():
-        cells = np.floor(points[:, :2] / cell)
-        assert (cells // BLOCK_SIDE == block).all()
-    assert set(by_block(*xyz[:1].T, use[:1], cell)) == {
-        tuple((np.floor(xyz[0, :2] / cell) // BLOCK_SIDE).astype(int))
-    }
-    assert by_block(*np.empty((3, 0)), use[:0], cell) == {}
-
-
 def test_a_block_without_points_has_no_cells():
     none = cells_of_block(*np.empty((3, 0)), (3, -4), FilterOptions(openings=(5,)))
     assert none.column.size == 0 and none.opened.shape == (1, 0)
@@ -245,42 +227,3 @@ def test_decks_of_blocks_are_those_of_the_whole():
     some = filtered_ground(x, y, z, mask=use, cells=GroundCells.joined(parts, 1), **options)
     for key, values in some.items():
         assert np.array_equal(values, whole[key]), key
-
-
-@pytest.mark.parametrize("count", [0, 1, 3000])
-def test_cells_in_parts_are_the_cells(count):
-    """Those of any box, out of the parts that it needs alone; levels of decks once."""
-    random = np.random.default_rng(count)
-    number = random.permutation(200 * 150)[:count]
-    column, row = number % 200 - 90, number // 200 + 70_000
-    ground, held = random.random((2, count)) < 0.6
-    cells = GroundCells(
-        column, row, *random.random((2, count)).astype(np.float32), ground, random.random((ground.sum(), 3)),
-        random.random((2, count)).astype(np.float32), held, random.random((held.sum(), 3)), random.random((4, 5)),
-    )  # fmt: skip
-    kept = cells.in_parts(32)
-    for box in [
-        (-90, 70_000, 109, 70_149),
-        (-33, 70_031, 0, 70_064),
-        (7, 70_100, 7, 70_100),
-        (500, 0, 600, 9),
-    ]:
-        needed = GroundCells.names_within(32, *box)
-        parts = [
-            one.within(*box) for one in GroundCells.of_parts({n: v for n, v in kept.items() if n in needed})
-        ]
-        found, expected = GroundCells.joined(parts, 2), cells.within(*box)
-        for one in (order := [np.lexsort((g.column, g.row)) for g in (found, expected)]):
-            assert len(one) == len(order[0])
-        for name in ("column", "row", "lowest", "floor", "ground", "opened", "held"):
-            assert np.array_equal(
-                getattr(found, name)[..., order[0]], getattr(expected, name)[..., order[1]]
-            ), name
-        for name, mask in (("place", "ground"), ("means", "held")):
-            given = [np.column_stack([g.column, g.row])[getattr(g, mask)].tolist() for g in (found, expected)]
-            values = [
-                sorted(zip(g, getattr(c, name).tolist(), strict=True))
-                for g, c in zip(given, (found, expected), strict=True)
-            ]
-            assert values[0] == values[1], name
-        assert len(found.decks) == (4 if parts else 0)
