@@ -268,10 +268,10 @@ QUICK = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stag
 @pytest.fixture(scope="session")
 def ready_town(tmp_path_factory) -> Path:
     """A small town, whole."""
-    from pdal_stages.synthetic import TownOptions, write_town
+    from pdal_stages.synthetic import make_town, write_town
 
     path = tmp_path_factory.mktemp("town") / "town.laz"
-    write_town(TownOptions(size=60, density=5, seed=3), path)
+    write_town(make_town(60, 5, seed=3, progress=False), path)
     return path
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pdal_stages import cli
-from pdal_stages.synthetic import TownOptions, write_town
+from pdal_stages.synthetic import make_town, write_town
 
 pytestmark = pytest.mark.pdal
 MADE = {"HeightAboveGround": 32, "Reliability": 64}
@@ -15,7 +15,7 @@ MADE = {"HeightAboveGround": 32, "Reliability": 64}
 
 def test_outputs_are_half_as_large_again_at_most(tmp_path):
     town = tmp_path / "town.laz"
-    write_town(TownOptions(size=60, density=12, seed=4), town)
+    write_town(make_town(60, 12, seed=4, progress=False), town)
     words = ["--where", "X > 500020", "--dimensions", "HeightAboveGround,Reliability,Margin"]
     for name, more in (("small", []), ("exact", ["--filters.modelclassifier.compact=false"])):
         assert cli.main(["classify", str(town), str(tmp_path / f"{name}.laz"), *more]) == 0

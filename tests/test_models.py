@@ -16,14 +16,14 @@ from pdal_stages.cli import main
 from pdal_stages.pipeline import Pipeline
 from pdal_stages.stages.loading import load_model
 from pdal_stages.stages.preparation import made_of_coordinates, preparation_of
-from pdal_stages.synthetic import TownOptions, write_town
+from pdal_stages.synthetic import make_town, write_town
 from pdal_stages.tiling import run_tiled
 
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
     path = tmp_path_factory.mktemp("models") / "town.laz"
-    write_town(TownOptions(size=64, density=5, seed=3), path)
+    write_town(make_town(64, 5, seed=3, progress=False), path)
     return path
 
 

@@ -34,7 +34,7 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     import numpy as np
 
     from ..pipeline.run import Pipeline
-    from . import TownOptions, write_town
+    from . import make_town, write_town
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -42,7 +42,7 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
         raise StageError("the demo's folder cannot be made", found=str(folder))
     town = {"type": "readers.las", "filename": str(folder / "town.laz")}
     with _step(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"):
-        write_town(TownOptions(size=size, density=density, seed=seed), town["filename"])
+        write_town(make_town(size, density, seed), town["filename"])
     bounds = Pipeline([town])
     bounds.execute()
     x = bounds.arrays[0]["X"]

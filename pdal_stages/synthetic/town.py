@@ -1,10 +1,10 @@
-"""A generated town under a simulated flight: options, points, chunks."""
+"""A generated town under a simulated flight: options and points."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -187,19 +187,6 @@ class FlownTown:
         )
 
 
-def town_chunks(options: TownOptions, *, threads: int | None = None, progress: bool = True) -> Iterator[Town]:
-    """The town piece by piece, in order of time, in memory that does not grow with its size.
-
-    The pieces joined are exactly what :func:`make_town` gives for the same options.
-    """
-    flown = FlownTown(options)
-    total, parts = int(options.density * options.size**2), flown.flight.parts(PULSES_PER_CHUNK)
-    with Progress(total, "synthetic", enabled=progress) as line:
-        for piece in map_blocks(lambda part: flown.town(flown.flight, *part), parts, threads):
-            line.update(len(piece))
-            yield piece
-
-
 def make_town(size=200.0, density=7.0, seed=1, *, threads=None, progress=True, **changes) -> Town:
     """A generated town under a simulated flight, with true classes and heights.
 
@@ -212,7 +199,12 @@ def make_town(size=200.0, density=7.0, seed=1, *, threads=None, progress=True, *
         cure = suggest(name, known) + f"The options are {', '.join(known)}"
         raise OptionError(f"unknown option '{name}'", where="synthetic", cure=cure)
     options = TownOptions(size, density, seed, **changes)
-    pieces = list(town_chunks(options, threads=threads, progress=progress))
+    flown, pieces = FlownTown(options), []
+    with Progress(int(options.density * options.size**2), "synthetic", enabled=progress) as line:
+        parts = flown.flight.parts(PULSES_PER_CHUNK)
+        for piece in map_blocks(lambda part: flown.town(flown.flight, *part), parts, threads):
+            line.update(len(piece))
+            pieces.append(piece)
     names = [f.name for f in dataclasses.fields(Town)][:-1]
     columns: dict = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names}
     return Town(**columns, options=options)

@@ -13,7 +13,7 @@ import copclib
 import laspy
 import numpy as np
 
-from pdal_stages.synthetic import TownOptions, write_town
+from pdal_stages.synthetic import make_town, write_town
 
 DIMENSIONS = ("intensity", "return_number", "number_of_returns", "classification")
 
@@ -21,7 +21,7 @@ DIMENSIONS = ("intensity", "return_number", "number_of_returns", "classification
 def main(target: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder, "town.laz")
-        write_town(TownOptions(size=30, density=3, seed=7), source)
+        write_town(make_town(30, 3, seed=7, progress=False), source)
         las = laspy.read(source)
     low = las.header.mins
     half = float((las.header.maxs - low).max() / 2)
