@@ -486,7 +486,7 @@ def test_reports(tmp_path, town_file, model_file):
     assert main([*words, *names, "--dry-run"]) == 1  # an input cannot be read
     assert not list(tmp_path.glob("c_*"))
     dry = json.loads((tmp_path / "r.json").read_text())
-    assert dry["points"] == len(laspy.read(town_file)) and dry["core_hours"] > 0
+    assert dry["points"] == len(laspy.read(town_file)) and dry["disk_gb"] > 0
     assert main([*words, *names, "--metadata", str(tmp_path / "run.metadata")]) == 1
     assert json.loads((tmp_path / "run.metadata").read_text())["failures"]
     told = json.loads((tmp_path / "r.json").read_text())

@@ -311,7 +311,7 @@ def _print_dry(run: TiledRun) -> None:
     print(f"{_counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
     print(f"about {s['points_read_by_a_tile']:,} points read for a tile")
     print(f"up to {s['memory_mb_of_a_worker']:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
-    print(f"roughly {s['core_hours']:.2f} core hours, {s['disk_gb']:,.2f} GB of disk beside the outputs")
+    print(f"about {s['disk_gb']:,.2f} GB of disk beside the outputs")
     for job in run.tiles[:_MOST_TILES]:
         print(f"  {job.name}")
     if len(run.tiles) > _MOST_TILES:

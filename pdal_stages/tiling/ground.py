@@ -114,8 +114,6 @@ def tiles_around(
     """The known tiles whose points may matter for a block."""
     x0, y0, x1, y1 = (side / unit for side in TileGrid(first.blocks.side).box(block, first.blocks.reach))
     (i0, j0), (i1, j1) = grid.index(np.array([x0, y0])).tolist(), grid.index(np.array([x1, y1])).tolist()
-    if (i1 - i0 + 1) * (j1 - j0 + 1) > len(known):
-        return [t for t in known if i0 <= t[0] <= i1 and j0 <= t[1] <= j1]
     return [(i, j) for j in range(j0, j1 + 1) for i in range(i0, i1 + 1) if (i, j) in known]
 
 

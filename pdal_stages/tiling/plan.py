@@ -11,6 +11,7 @@ from typing import Any
 from ..base.errors import PipelineError, StageError
 from ..base.outputs import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
+from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
 from ..stages.base import Blocks, Stage
@@ -35,9 +36,6 @@ _GLOBAL = _filters(
     "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad mortonorder "
     "randomize relaxationdartthrowing returns shell sort splitter stats tail teaser"
 )
-#: What PDAL takes for bare file names.
-_DRIVERS = {f".{name}": name for name in ("las", "ply", "bpf", "pcd")}
-_DRIVERS |= {".laz": "las", ".txt": "text", ".csv": "text"}
 
 
 @dataclass(frozen=True)
@@ -201,16 +199,18 @@ def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
     """A stage as an object with a type; bare names become readers and the writer that PDAL would take."""
     out = dict(stage) if isinstance(stage, dict) else {"filename": stage}
     if not out.get("type"):
-        name, kind = str(out.get("filename", "")), "writers" if 0 < index == count - 1 else "readers"
-        driver = _DRIVERS.get(Path(name).suffix.lower())
-        if kind == "readers" and name.endswith("ept.json"):
-            driver = "ept"
-        if driver is None:
+        name = str(out.get("filename", ""))
+        if writes := 0 < index == count - 1:
+            out["type"] = pdal_env.writer_type(name)
+        else:
+            suffix = "ept" if name.endswith("ept.json") else Path(name).suffix.lower().lstrip(".")
+            out["type"] = f"readers.{'las' if suffix == 'laz' else suffix}" if suffix else ""
+        if not out["type"]:
+            kind = "writer" if writes else "reader"
             raise PipelineError(
-                f"the {kind[:-1]} of '{name}' cannot be inferred from the file name",
-                cure=f'Give the stage a type: "{kind}.las"',
+                f"the {kind} of '{name}' cannot be inferred from the file name",
+                cure=f'Give the stage a type: "{kind}s.las"',
             )
-        out["type"] = f"{kind}.{driver}"
     return out
 
 

@@ -37,10 +37,8 @@ from .tile import RunContext, TileTask
 
 #: A run stops when so many tiles failed for one reason and none succeeded.
 _HOPELESS = 10
-#: CPU seconds of a core for a point of a tile, for one that is only read around a tile, and for one in all other steps.
-_OWN, _AROUND, _OTHER = 8.0e-6, 1.3e-6, 5.0e-6
 #: Bytes that a run keeps of a point until its output is written; in the rounds before the tiles, and there of a cell.
-_KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 20, 24, 112
+_KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 60, 24, 112
 
 
 def run_tiled(
@@ -462,13 +460,12 @@ def _make_ready(out: Job, waiting: deque[Job]) -> None:
 
 
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
-    """What a run would do: tiles, points, memory and time, as the headers of the inputs tell (``--dry-run``)."""
+    """What a run would do: tiles, points, memory and disk, as the headers of the inputs tell (``--dry-run``)."""
     grid, options, density = survey.grid, survey.options, survey.density
     tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
     outputs_for(plan, survey.names if survey.per == "file" else [job.name for job in tiles], survey.paths)
     count, read = density.points, density.read_by(grid.size, survey.halo_units)
-    seconds = count * (_OWN + _OTHER) + max(0, read * len(tiles) - count) * _AROUND
-    kept = float(count * _KEPT * (survey.per == "file"))
+    kept = float(count * _KEPT)
     if plan.first is not None:
         cells = density.area * (survey.unit / plan.first.blocks.cell) ** 2
         kept += count * _KEPT_BEFORE + cells * _KEPT_OF_CELL
@@ -479,8 +476,6 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "points": count,
         "points_read_by_a_tile": read,
         "memory_mb_of_a_worker": worker_bytes(read, largest, survey.block_bytes) / 2**20,
-        "points_per_core_second": count / seconds if seconds else 0.0,
-        "core_hours": seconds / 3600,
         "disk_gb": kept / 1e9,
         "states": {"waiting": len(tiles)},
     }

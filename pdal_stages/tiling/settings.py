@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ..base import checks
 from ..base.errors import OptionError
 from ..base.resources import available_threads, free_memory
@@ -128,20 +130,19 @@ class Density:
     @classmethod
     def of(cls, extents: Iterable[Extent]) -> Density:
         """Of inputs, as their headers tell."""
-        rows = []
-        for one in extents:
-            if one.count:
-                x0, y0, x1, y1 = one.box
-                area = (x1 - x0) * (y1 - y0)
-                rows.append((one.count / max(area, 1e-6), one.count, area))
-        points = sum(row[1] for row in rows)
+        boxes = [(*one.box, one.count) for one in extents if one.count]
+        x0, y0, x1, y1, count = np.array(boxes, np.float64).reshape(-1, 5).T
+        area = (x1 - x0) * (y1 - y0)
+        each = count / np.maximum(area, 1e-6)
         # The density that a twentieth of all points exceed: a single odd file does not decide.
-        dense, beyond = 0.0, 0
-        for each, count, _ in sorted(rows, reverse=True):
-            dense, beyond = each, beyond + count
-            if beyond * 20 > points:
-                break
-        return cls(points, max((row[1] for row in rows), default=0), sum(row[2] for row in rows), dense)
+        order = np.argsort(-each)
+        dense = each[order][20 * np.cumsum(count[order]) > count.sum()]
+        return cls(
+            int(count.sum()),
+            int(count.max(initial=0)),
+            float(area.sum()),
+            float(dense[0]) if len(dense) else 0.0,
+        )
 
     def read_by(self, side: float, halo_units: float) -> int:
         """Points of a tile of this side with its surroundings."""
