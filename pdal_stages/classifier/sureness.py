@@ -19,7 +19,6 @@ from ..base.messages import one_line
 BINS = 64
 #: What the file beside a model's is called.
 SUFFIX = ".sureness.json"
-_FORMAT = "pdal-stages sureness"
 
 
 class Limit(NamedTuple):

@@ -91,11 +91,6 @@ def _check_ground(where: str, module: dict[str, Any], ins: Mapping[str, Any], ou
     )
 
 
-def function_of(label: str) -> Function | None:
-    """The function of a filter that :class:`Callbacks` made, by its label."""
-    return _functions.get(label)
-
-
 @catches
 def call_back(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
     """Call the function of a filter that :class:`Callbacks` made."""

@@ -27,8 +27,8 @@ from .runtime import TRAMPOLINE, made, place, python_filter
 
 #: Options of every PDAL stage that a expanded stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
-#: Stages after which there is one view, or several are what the user asked for.
-_ONE_VIEW = {f"filters.{name}" for name in ("merge", "splitter", "chipper", "divider", "groupby", "returns")}
+#: Stages after which several views are what the user asked for.
+_SPLITS = {f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns")}
 
 
 @dataclass
@@ -69,8 +69,8 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
     out = Expanded([], warnings=unread_extra_dimensions(stages))
     flags = _flags_to_split(stages) if whole else []
     last_reader = max((n for n in range(len(stages)) if is_reader(stages, n)), default=None)
-    reaching = _views_reaching(stages)
-    tags = {str(stage["tag"]) for stage in stages if "tag" in stage}
+    readers = [str(stage.get("filename", "")) for n, stage in enumerate(stages) if is_reader(stages, n)]
+    several = len(readers) > 1 or any(c in name for name in readers for c in "*?[")
     for index, stage in enumerate(stages):
         type_name = stage.get("type", "")
         if type_name not in registry.stages():
@@ -79,15 +79,10 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
                 out.stages.append(flag_splitter(flags))
             continue
         try:
-            if reaching[index] > 1:  # points of several readers
+            if several and _may_be_apart(stages, index):
                 merge: dict[str, Any] = {"type": "filters.merge"}
                 if "inputs" in stage:
-                    names = (f"pdal_stages_merge_{number}" for number in itertools.count(1))
-                    merge |= {
-                        "inputs": stage["inputs"],
-                        "tag": next(name for name in names if name not in tags),
-                    }
-                    tags.add(merge["tag"])
+                    merge |= {"inputs": stage["inputs"], "tag": f"pdal_stages_merge_{index}"}
                     stage["inputs"] = [merge["tag"]]
                 out.stages.append(merge)
             taken = registry.get(type_name).from_pipeline(stage, stages[:index])
@@ -135,18 +130,12 @@ def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
     return inputs
 
 
-def _views_reaching(stages: Sequence[dict[str, Any]]) -> list[int]:
-    """How many views of points, of readers that are still apart, reach each stage; "several" counts as two."""
-    views: list[int] = []
-    reaching: list[int] = []
-    for number, inputs in enumerate(_wiring(stages) or [[]] * len(stages)):
-        kind = stages[number].get("type", "")
-        reaching.append(sum(views[one] for one in inputs))
-        if is_reader(stages, number):
-            views.append(2 if any(c in str(stages[number].get("filename", "")) for c in "*?[") else 1)
-        else:
-            views.append(1 if kind in _ONE_VIEW or kind in registry.stages() else reaching[-1])
-    return reaching
+def _may_be_apart(stages: Sequence[dict[str, Any]], number: int) -> bool:
+    """Whether points of several readers may reach a stage in several views, and nobody split them on purpose."""
+    if any(stage.get("type") in _SPLITS for stage in stages[:number]):
+        return False
+    before = stages[number - 1].get("type") if number else None
+    return "inputs" in stages[number] or before not in ("filters.merge", *registry.stages())
 
 
 def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str]) -> None:
