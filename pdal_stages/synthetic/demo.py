@@ -76,7 +76,6 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
             "json": str(folder / "accuracy.json"),
             "html": str(folder / "accuracy.html"),
             "model": model,
-            "title": "Classification of the generated town",
         },
         {**las, "filename": str(folder / "classified.laz")},
     ]
