@@ -138,27 +138,19 @@ def test_no_tree_over_nothing():
 # ---- the nearest -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("need", [2, 17, 101])
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_nearest_are_those_of_brute_force(cloud, need):
-    check_nearest(CLOUDS[cloud], some(CLOUDS[cloud]), need)
-
-
-@pytest.mark.parametrize("cloud", ["town", "copies", "lattice", "stray", "one"])
-def test_nearest_within_a_cap(cloud):
-    check_nearest(CLOUDS[cloud], some(CLOUDS[cloud], 30), 51, cap=2.0)
+def test_nearest_are_those_of_brute_force(cloud):
+    for need, cap in ((2, math.inf), (17, math.inf), (101, math.inf), (51, 2.0)):
+        check_nearest(CLOUDS[cloud], some(CLOUDS[cloud], 30), need, cap)
 
 
 def test_queries_that_are_no_points_of_the_cloud():
     rng = np.random.default_rng(3)
     queries = np.vstack([rng.uniform(-5, 25, (40, 3)), [[1e6, 1e6, 1e6]], [[5.0, 5.0, 1.0]] * 9])
     check_nearest(CLOUDS["town"], queries, 33)
+    far = np.vstack([CLOUDS["thirty"] + offset for offset in ([0, 0, 0], [5e5, 0, 0], [0, 3e6, 50])])
+    check_nearest(far, far[::7], 17)
     check_nearest(CLOUDS["town"], queries, 33, cap=1.0)
-
-
-def test_queries_far_apart_share_no_group():
-    xyz = np.vstack([scattered(400, 20) + offset for offset in ([0, 0, 0], [5e5, 0, 0], [0, 3e6, 50])])
-    check_nearest(xyz, xyz[::97], 40)
 
 
 @settings(max_examples=30, deadline=None)
@@ -172,22 +164,15 @@ def test_nearest_with_many_ties(points, need, scale):
     check_nearest(xyz, xyz[:10], need)
 
 
-@pytest.mark.timeout(120)
-def test_half_a_million_copies_are_not_quadratic():
-    xyz = np.vstack([np.tile([100.0, 200.0, 5.0], (500_000, 1)), scattered(2000, 13)])
-    values = compute_features(xyz, neighborhoods="kopt", feature_set="Density,Radius,Eigenentropy").values
-    assert np.isfinite(values).all()
-    assert (values[:500_000] == values[0]).all()
-
-
-@pytest.mark.timeout(120)
-def test_a_dense_facade_and_a_dense_ball_are_not_quadratic():
+@pytest.mark.timeout(60)
+def test_copies_a_dense_facade_and_a_dense_ball_are_not_quadratic():
     rng = np.random.default_rng(14)
-    facade = np.c_[np.full(60_000, 3.0), rng.uniform(0, 0.5, 60_000), rng.uniform(0, 30, 60_000)]
-    ball = rng.normal(50, 1e-4, (60_000, 3))
-    xyz = np.vstack([facade, ball])
-    radius = choose(xyz, xyz, "k20")[RADIUS]
-    for i in range(0, len(xyz), 7001):
+    facade = np.c_[np.full(30_000, 3.0), rng.uniform(0, 0.5, 30_000), rng.uniform(0, 30, 30_000)]
+    ball = rng.normal(50, 1e-4, (30_000, 3))
+    xyz = np.vstack([facade, ball, np.tile([100.0, 200.0, 5.0], (200_000, 1))])
+    radius = choose(xyz, xyz[:60_001], "k20")[RADIUS]
+    assert radius[-1] == 0
+    for i in range(0, 60_000, 7001):
         assert radius[i] == pytest.approx(oracle.by_distance(xyz, xyz[i])[1][20], rel=1e-12)
 
 
@@ -212,21 +197,19 @@ def test_kopt_is_the_oracle_s(cloud):
             assert table[RADIUS, i] == r
 
 
-@pytest.mark.parametrize(
-    ("k_min", "k_max", "cap"), [(2, 2, math.inf), (2, 30, math.inf), (10, 50, 1.0), (50, 50, 9.0)]
-)
-def test_other_ranges_and_a_cap(k_min, k_max, cap):
+def test_other_ranges_and_a_cap():
     xyz = CLOUDS["town"]
-    queries = some(xyz, 50)
-    table = choose(xyz, queries, f"kopt({k_min},{k_max})", cap=cap)
-    for i, q in enumerate(queries):
-        members, r, _ = oracle.kopt(xyz, q, k_min, k_max, cap)
-        assert (table[N, i], table[RADIUS, i]) == (len(members), r)
+    queries = some(xyz, 30)
+    for k_min, k_max, cap in ((2, 2, math.inf), (2, 30, math.inf), (10, 50, 1.0)):
+        table = choose(xyz, queries, f"kopt({k_min},{k_max})", cap=cap)
+        for i, q in enumerate(queries):
+            members, r, _ = oracle.kopt(xyz, q, k_min, k_max, cap)
+            assert (table[N, i], table[RADIUS, i]) == (len(members), r)
 
 
 def test_features_of_kopt_and_k():
-    for xyz in (CLOUDS["town"], CLOUDS["utm"]):
-        at = np.arange(0, len(xyz), 40)
+    for xyz in (CLOUDS["town"][::2], CLOUDS["utm"]):
+        at = np.arange(0, len(xyz), 60)
         got = compute_features(xyz, at, "kopt,k50", ["covariance", *oracle.GEOMETRIC, "Radius"])
         for i, q in enumerate(xyz[at]):
             for token, (members, r) in (
@@ -243,28 +226,27 @@ def test_features_of_kopt_and_k():
 
 
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_no_nan_anywhere(cloud):
-    xyz = CLOUDS[cloud]
-    table = compute_features(xyz, neighborhoods="k5,kopt,ropt,copt", feature_set="all")
-    assert np.isfinite(table.values).all()
-    assert (table["Density_kopt"] > 0).all()
-
-
-def test_copies_have_a_finite_density_and_no_structure():
-    table = compute_features(CLOUDS["all copies"], neighborhoods="kopt", feature_set="all")
-    assert table["SurfaceVariation_kopt"][0] == np.float32(1 / 3)
-    assert table["Linearity_kopt"][0] == 0
-    assert table["Density_kopt"][0] == pytest.approx(101 / oracle.ball_volume(0.001))
-
-
-@pytest.mark.parametrize("cloud", CLOUDS)
-def test_several_numbers_of_neighbors_at_once_are_each_by_itself(cloud):
-    xyz = CLOUDS[cloud]
-    together = compute_features(xyz, None, "k3,k10,k20,k50", "covariance,geometric,HeightAboveLowest")
-    for k in (3, 10, 20, 50):
-        alone = compute_features(xyz, None, f"k{k}", "covariance,geometric,HeightAboveLowest")
+def test_features_are_finite_and_those_of_each_neighborhood_alone(cloud):
+    xyz = CLOUDS[cloud][:800]
+    tokens = ["k3", "k20", "kopt", "ropt", "copt"]
+    together = compute_features(xyz, None, tokens, "all,HeightAboveLowest")
+    assert np.isfinite(together.values).all() and (together["Density_kopt"] > 0).all()
+    for token in tokens:
+        alone = compute_features(
+            xyz,
+            None,
+            token,
+            "all,HeightAboveLowest",
+            bins=together.bins,
+            copt_threshold=together.copt_threshold,
+        )
         columns = [together.names.index(name) for name in alone.names]
         assert np.array_equal(together.values[:, columns], alone.values)
+    if cloud == "all copies":
+        assert (
+            together["SurfaceVariation_kopt"][0] == np.float32(1 / 3) and together["Linearity_kopt"][0] == 0
+        )
+        assert together["Density_kopt"][0] == pytest.approx(101 / oracle.ball_volume(0.001))
 
 
 # ---- ropt --------------------------------------------------------------------------------------------------
@@ -276,12 +258,12 @@ def oracle_ropt(xyz, q, radii, least=10):
     return radii[oracle._first_lowest(entropies)], entropies
 
 
-@pytest.mark.parametrize("least", [3, 10])
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_ropt_is_the_oracle_s(cloud, least):
+def test_ropt_is_the_oracle_s(cloud):
     xyz = CLOUDS[cloud]
-    queries = some(xyz, 40)
-    for token, radii in (("ropt", radii_of(0.25, 2.0, 0.05)), ("ropt(1.5,1.5,1)", np.array([1.5]))):
+    queries = some(xyz, 25)
+    default, single = radii_of(0.25, 2.0, 0.05), np.array([1.5])
+    for token, radii, least in (("ropt", default, 3), ("ropt", default, 10), ("ropt(1.5,1.5,1)", single, 10)):
         table = choose(xyz, queries, token, least)
         for i, q in enumerate(queries):
             r, entropies = oracle_ropt(xyz, q, radii, least)
@@ -298,7 +280,6 @@ def test_members_at_exactly_a_radius_are_inside():
 
 def test_radii():
     assert radii_of(0.25, 2.0, 0.05).shape == (36,) and radii_of(0.25, 2.0, 0.05)[-1] == 2.0
-    assert radii_of(0.5, 2.0, 0.05).shape == (31,)
     assert radii_of(1.0, 1.0, 0.5).tolist() == [1.0]
 
 
@@ -308,7 +289,7 @@ def test_radii():
 @pytest.mark.parametrize("cloud", CLOUDS)
 def test_curvature(cloud):
     xyz = CLOUDS[cloud]
-    at = np.unique(np.linspace(0, len(xyz) - 1, 40).astype(int))
+    at = np.unique(np.linspace(0, len(xyz) - 1, 20).astype(int))
     for least in (3, 10):
         got = FeatureEngine(
             xyz, replace(FeaturePlan.parse("copt", "Density"), least_members=least)
@@ -325,10 +306,8 @@ def test_a_curvature_threshold_lies_among_the_values(values):
     assert curvature_threshold(np.array(values[::-1])) == got
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_curvature_threshold_is_the_oracle_s(seed):
-    rng = np.random.default_rng(seed)
-    values = rng.beta(0.5, 4, rng.integers(2, 500)) / 3
+def test_curvature_threshold_is_the_oracle_s():
+    values = np.random.default_rng(0).beta(0.5, 4, 300) / 3
     assert curvature_threshold(values) == pytest.approx(oracle.copt_threshold(values), rel=1e-9)
 
 
@@ -342,7 +321,7 @@ def test_curvature_threshold_of_two_clear_groups():
 
 
 def test_copt_is_the_oracle_s():
-    xyz = CLOUDS["town"]
+    xyz = town(1200)
     engine = FeatureEngine(xyz, FeaturePlan.parse("copt", ["Density", "Radius", "Eigenentropy"])).fit()
     curvatures = np.array([oracle.curvature(xyz, q) for q in xyz])
     threshold = engine.copt_threshold
@@ -362,16 +341,7 @@ def test_copt_is_the_oracle_s():
     assert kinds == {True, False}
 
 
-# ---- the same for any order, block, thread and tile --------------------------------------------------------
-
-ADAPTIVE = "k7,kopt(10,60),ropt,copt"
-
-
-@pytest.fixture(scope="module")
-def reference():
-    xyz = CLOUDS["utm"]
-    engine = FeatureEngine(xyz, FeaturePlan.parse(ADAPTIVE), seed=4)
-    return xyz, engine.fit(), engine.table()
+# ---- what is reported, and real clouds -----------------------------------------------------------------------
 
 
 def test_what_reaches_beyond_the_halo_is_counted():
@@ -380,21 +350,17 @@ def test_what_reaches_beyond_the_halo_is_counted():
     assert report.beyond_halo == {"k10": 3, "kopt": 3}
 
 
-def test_a_different_seed_changes_shapes_only(reference):
-    xyz, engine, table = reference
-    other = FeatureEngine(
-        xyz, engine.plan, bins=engine.bins, copt_threshold=engine.copt_threshold, seed=5
-    ).table(np.arange(20))
-    shape = np.array([name[:2] in oracle.METRICS for name in table.names])
-    assert np.array_equal(other.values[:, ~shape], table.values[:20, ~shape])
-    assert not np.array_equal(other.values[:, shape], table.values[:20, shape])
-
-
-# ---- real clouds -------------------------------------------------------------------------------------------
+def test_a_different_seed_changes_shapes_only():
+    xyz = CLOUDS["utm"][:400]
+    one = compute_features(xyz, None, "k7,kopt", "all", seed=4)
+    other = compute_features(xyz, None, "k7,kopt", "all", seed=5, bins=one.bins)
+    shape = np.array([name[:2] in oracle.METRICS for name in one.names])
+    same = (one.values == other.values).all(axis=0)
+    assert same[~shape].all() and not same[shape].all()
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("file", ["delft/train", "montpellier/train", "oakland/train", "isprs_filter"])
+@pytest.mark.parametrize("file", ["delft/train", "oakland/train"])
 def test_real_clouds(data_dir, file):
     import laspy
 
@@ -403,8 +369,8 @@ def test_real_clouds(data_dir, file):
     with laspy.open(path) as reader:
         cloud = reader.read()
     xyz = np.c_[cloud.x, cloud.y, cloud.z]
-    xyz = xyz[np.lexsort((xyz[:, 0], np.floor(xyz[:, 1] / 20)))][:40_000]
-    queries = some(xyz, 40)
+    xyz = xyz[np.lexsort((xyz[:, 0], np.floor(xyz[:, 1] / 20)))][:20_000]
+    queries = some(xyz, 20)
     check_nearest(xyz, queries, 101)
     table = choose(xyz, queries, "kopt")
     for i, q in enumerate(queries):

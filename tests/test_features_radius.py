@@ -72,7 +72,7 @@ def test_members_at_exactly_the_radius():
     assert round(table["Density_s5"][0] * oracle.ball_volume(5)) == 6
 
 
-@pytest.mark.parametrize("radius", [0.05, 0.3, 0.5, 0.75, 1.0, 1.7, 4.0, 7.0, 20.0, 25.0, 60.0])
+@pytest.mark.parametrize("radius", [0.05, 0.5, 0.75, 4.0, 20.0, 60.0])
 def test_every_cell_size(rng, radius):
     side = radius * 5
     xyz = rng.uniform(-side / 2, side / 2, (1500, 3)) * [1, 1, 0.3]
@@ -108,12 +108,12 @@ def test_degenerate_clouds(rng, name, make):
     assert np.isfinite(values).all()
 
 
-@pytest.mark.parametrize("copies", [3, 40, 700])
-def test_points_of_one_place_coincide_wherever_it_is(rng, copies):
-    """Sums shared by a cell are taken about its center and moved to the query: what is left of that is no variance."""
+def test_points_of_one_place_coincide_wherever_it_is(rng):
+    """Far from 0 too, what rounding leaves is no variance."""
     places = rng.uniform(0, 2000, (300, 3)) + np.array([500_000, 5_400_000, 100])
-    xyz = np.tile(places, (copies, 1))
-    table = compute_features(xyz, np.arange(300), "c1,c3,s3", ["covariance", *oracle.GEOMETRIC])
+    table = compute_features(
+        np.tile(places, (40, 1)), np.arange(300), "c1,c3,s3", ["covariance", *oracle.GEOMETRIC]
+    )
     alone = np.array([np.sum(np.hypot(*(places - p)[:, :2].T) <= 3) == 1 for p in places])
     assert alone.sum() > 200
     for name in table.names:
@@ -149,33 +149,19 @@ def test_horizontal_line_is_not_vertical_and_a_pole_is():
     assert compute_features(pole, [4], "s3", "Verticality").values[0, 0] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_crowded_cell(rng):
-    """More points in a cell than are copied: the same sums without copies."""
-    xyz = np.vstack([rng.normal(0.5, 0.05, (3000, 3)), rng.uniform(-4, 4, (300, 3))])
-    check(xyz, np.arange(0, 3300, 150), radii=(0.5, 1.0, 4.0))
-
-
 def test_large_spheres_in_a_dense_cloud(rng):
     """10 m round points of a cloud of 100 a square meter: 30,000 members each."""
     xyz = rng.uniform(0, 30, (90_000, 3)) * [1, 1, 0.05]
-    near = np.argsort(((xyz[:, :2] - 15) ** 2).sum(axis=1))[:6]
+    near = np.argsort(((xyz[:, :2] - 15) ** 2).sum(axis=1))[:4]
     check(xyz, near, radii=(10.0,))
-
-
-def test_sparse_cloud_has_no_nan(rng):
-    xyz = rng.uniform(0, 100, (3000, 3)) * [1, 1, 0.1]  # 0.3 points a square meter
-    values = compute_features(xyz, None, "c0.5,c1,c5,s0.5,s1,s5,k3,kopt,ropt,copt", "all").values
-    assert np.isfinite(values).all()
 
 
 @pytest.mark.data
 @pytest.mark.parametrize(
     "file",
     [
-        "montpellier/train_77050_627755.laz",
         "delft/train.laz",
         "isprs_filter/samp11.laz",
-        "isprs_filter/samp54.laz",
     ],
 )
 def test_real_tiles(data_dir, file):
@@ -186,43 +172,14 @@ def test_real_tiles(data_dir, file):
     check(near, np.arange(0, len(near), max(len(near) // 40, 1)), radii=(1.0, 3.0), atol=1e-7)
 
 
-@pytest.fixture(scope="module")
-def peers_cloud():
-    rng = np.random.default_rng(8)
-    return rng.random((4000, 3)) * [12, 12, 3]
-
-
-def test_against_jakteristics(peers_cloud):
-    """An independent library, the features whose definitions coincide."""
-    jakteristics = pytest.importorskip("jakteristics")
-    pairs = {
-        "linearity": "Linearity",
-        "planarity": "Planarity",
-        "sphericity": "Scattering",
-        "anisotropy": "Anisotropy",
-        "surface_variation": "SurfaceVariation",
-        "verticality": "Verticality",
-    }
-    theirs = jakteristics.compute_features(
-        peers_cloud, search_radius=1.2, feature_names=[*pairs, "number_of_neighbors"]
-    )
-    ours = compute_features(peers_cloud, None, "s1.2", ["covariance", "geometric"])
-    members = np.rint(ours["Density_s1_2"] * oracle.ball_volume(1.2))
-    assert np.array_equal(members, theirs[:, -1])
-    assert members.min() >= 3
-    for column, name in enumerate(pairs.values()):
-        np.testing.assert_allclose(
-            ours[f"{name}_s1_2"], theirs[:, column], rtol=1e-5, atol=1e-6, err_msg=name
-        )
-
-
-def test_against_pgeof(peers_cloud):
+def test_against_pgeof():
     """An independent library; it takes square roots of eigenvalues and adds 1e-3 to what it divides by."""
     pgeof = pytest.importorskip("pgeof")
+    cloud = np.random.default_rng(8).random((4000, 3)) * [12, 12, 3]
     ids = pgeof.EFeatureID
     wanted = [ids.Verticality, ids.Linearity, ids.Scattering]
-    vertical, linear, scatter = pgeof.compute_features_selected(peers_cloud, 1.2, 4000, wanted).T
-    ours = compute_features(peers_cloud, None, "s1.2", ["covariance", "geometric"])
+    vertical, linear, scatter = pgeof.compute_features_selected(cloud, 1.2, 4000, wanted).T
+    ours = compute_features(cloud, None, "s1.2", ["covariance", "geometric"])
     np.testing.assert_allclose(ours["Verticality_s1_2"], vertical, atol=1e-6)
     np.testing.assert_allclose(1 - np.sqrt(1 - ours["Linearity_s1_2"]), linear, atol=3e-3)
     np.testing.assert_allclose(np.sqrt(ours["Scattering_s1_2"]), scatter, atol=3e-3)

@@ -23,7 +23,7 @@ def test_names_are_the_oracle_s():
 @pytest.mark.parametrize("cloud", CLOUDS)
 def test_surfaces_are_the_oracle_s(cloud):
     xyz = CLOUDS[cloud]
-    queries = some(xyz, 25)
+    queries = some(xyz, 15)
     got = compute_features(xyz, queries, TOKENS, "surfaces")
     assert np.isfinite(got.values).all()
     for i, q in enumerate(queries):
@@ -44,7 +44,7 @@ def test_queries_that_are_no_points_of_the_cloud():
         assert gap < 1e-5 or got.values[i] == pytest.approx(list(expected.values()), rel=1e-4, abs=2e-5)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=40),
     st.integers(1, 25),
@@ -79,11 +79,11 @@ def test_a_plane_agrees_and_a_crown_does_not():
     assert crown["NormalAgreement_k20"].max() < 0.95 and crown["SurfaceVariationMin_k20"].min() > 0
 
 
-@pytest.mark.parametrize("along", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 2.0, 0.5)])
-def test_points_on_a_line_agree(along):
-    table = compute_features(np.outer(np.arange(50), along), None, "k5", "surfaces")
-    assert table["NormalAgreement_k5"].min() > 1 - 1e-6
-    assert table["SurfaceVariationStd_k5"].max() < 1e-12
+def test_points_on_a_line_agree():
+    for along in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 2.0, 0.5)):
+        table = compute_features(np.outer(np.arange(50), along), None, "k5", "surfaces")
+        assert table["NormalAgreement_k5"].min() > 1 - 1e-6
+        assert table["SurfaceVariationStd_k5"].max() < 1e-12
 
 
 def test_copies_of_one_point_have_no_surface():
@@ -91,7 +91,7 @@ def test_copies_of_one_point_have_no_surface():
     assert (values == np.array([0, 1 / 3, 1 / 3, 0], np.float32)).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([(0, 1, 2), (1, 0, 2), (2, 0, 1)]), st.integers(-4000, 4000))
 def test_rigid_motions(seed, axes, shift):
     """Surfaces know neither north nor up."""
@@ -102,7 +102,7 @@ def test_rigid_motions(seed, axes, shift):
     np.testing.assert_allclose(one, other, rtol=1e-4, atol=3e-4)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9))
 def test_the_normal_is_the_eigenvector(values):
     a = np.array(values).reshape(3, 3)
@@ -135,12 +135,10 @@ def test_beside_other_features():
     xyz = town(1500)
     alone = compute_features(xyz, None, "k8", "surfaces")
     beside = compute_features(xyz, None, "c1,k3,k8,k30,kopt(5,20)", "all,HeightAboveLowest,surfaces")
-    with_shapes = compute_features(xyz, None, "k8", "D1,surfaces")
-    for name in alone.names:
-        assert np.array_equal(beside[name], alone[name]) and np.array_equal(with_shapes[name], alone[name])
     plain = compute_features(xyz, None, "k8,k30", "covariance,geometric")
-    for name in plain.names:
-        assert np.array_equal(beside[name], plain[name])
+    for table in (alone, plain):
+        for name in table.names:
+            assert np.array_equal(beside[name], table[name])
 
 
 def test_in_a_tile_as_in_the_whole():
