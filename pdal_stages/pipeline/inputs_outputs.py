@@ -82,7 +82,9 @@ def locations(path: str, column: str = "location") -> list[str]:
     """
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")
     try:
-        _, _, _, (names,) = pyogrio.raw.read(path, columns=[column], read_geometry=False)
+        names = [*pyogrio.raw.read(path, columns=[column], read_geometry=False)[3], None][0]
+        if names is None:
+            raise ValueError(f"it has no column '{column}'")
         if odd := [name for name in names if not (isinstance(name, str) and name) or "\0" in name]:
             raise ValueError(f"{odd[0]!r} is not a file's name")
     except (OSError, ValueError, RuntimeError) as error:
