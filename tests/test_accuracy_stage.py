@@ -153,13 +153,3 @@ def test_files_without_a_partner_are_refused(tmp_path):
         paired(["c_a.laz", "d_a.laz"], ["a.laz"])
     with pytest.raises(StageError, match="no LAS or LAZ"):
         input_files([str(tmp_path)])
-
-
-def test_names_of_inputs_that_are_no_names(tmp_path, monkeypatch):
-    (tmp_path / "a.laz").touch()
-    monkeypatch.chdir(tmp_path)
-    assert input_files(["."]) == ["a.laz"]
-    with pytest.raises(StageError, match="the name of an input is empty"):  # not the current folder
-        input_files([""])
-    with pytest.raises(StageError, match=r"cannot be read \(found File name too long"):
-        input_files(["a" * 300 + ".laz"])

@@ -147,13 +147,6 @@ def test_metadata_never_replaces_an_input(folder, tmp_path, capsys):
 
 
 @pytest.mark.pdal
-def test_a_reason_that_is_none_is_refused(folder, tmp_path, capsys):
-    files = [str(folder / "town.laz"), str(tmp_path / "t.gpkg")]
-    assert cli.main(["objects", *files, "--writers.objects.refuse=narow"]) == 1
-    assert "Did you mean 'narrow'" in capsys.readouterr().err and not (tmp_path / "t.gpkg").exists()
-
-
-@pytest.mark.pdal
 def test_settings_and_metadata(folder, tmp_path):
     def run(*more):
         files = [str(folder / "town.laz"), str(tmp_path / "t.gpkg"), "--metadata", str(tmp_path / "m.json")]
@@ -230,20 +223,6 @@ def test_without_the_extra(monkeypatch):
         StageError, match=r"needs the Python package 'shapely'.*pip install 'pdal-stages\[vector\]'"
     ):
         outlines.vector("shapely")
-
-
-@pytest.mark.pdal
-def test_classify_goes_on_to_objects(folder, tmp_path, capsys):
-    command = ["classify", str(folder / "parts" / "0.laz"), str(tmp_path / "0.laz"), "--model", "standard"]
-    assert cli.main([*command, "--objects", str(tmp_path / "town.gpkg")]) == 0
-    assert cli.main(["objects", str(tmp_path / "0.laz"), str(tmp_path / "two.gpkg")]) == 0
-    one, shapes, _ = layer(tmp_path / "town.gpkg", "buildings")
-    two, others, _ = layer(tmp_path / "two.gpkg", "buildings")
-    np.testing.assert_array_equal(one["object_id"], two["object_id"])
-    assert len(shapes) and all(shapely.equals_exact(shapes, others))
-    (tmp_path / "0.laz").unlink()
-    assert cli.main([*command, "--objects", str(tmp_path / "town.txt")]) == 1
-    assert "ends in .gpkg" in capsys.readouterr().err and not (tmp_path / "0.laz").exists()
 
 
 @pytest.mark.pdal
@@ -380,7 +359,6 @@ def cloud(path, xyz, codes, epsg=25832):
         ((2, 5, 6), 4326, "degrees"),
         ((0,), 25832, "no point has a class"),
         ((6,), 25832, "there is no ground"),
-        ((5,), 25832, "there is no ground"),
         ((2,), 25832, ""),
         ((2, 2, 2, 2, 2, 2, 2, 2, 2, 5, 6, 14, 17), 25832, ""),
     ],

@@ -14,7 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
+from pdal_stages.stages import registry
+from pdal_stages.stages.loading import load_model
 from pdal_stages.synthetic import Town, make_town, write_town
+from pdal_stages.synthetic.demo import pipelines
 from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene, first_hit
 from pdal_stages.synthetic.townplan import plan_town
 
@@ -215,3 +218,12 @@ def test_pdal_reads_the_file_back(tmp_path, pdal_program):
 def test_bad_options_are_named(options, word):
     with pytest.raises(OptionError, match=word):
         make_town(**options)
+
+
+def test_stages_of_the_demo_take_their_options(tmp_path):
+    load_model("standard").save(tmp_path / "town.model")
+    for stages in pipelines(tmp_path, 0.0, 1).values():
+        for options in map(dict, stages):
+            kind = options.pop("type")
+            if kind in registry.stages():
+                registry.get(kind)(options)

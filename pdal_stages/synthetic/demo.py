@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from ..base.errors import StageError
 from ..base.files import write_whole
@@ -40,14 +41,29 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     folder.mkdir(parents=True, exist_ok=True)
     if not folder.is_dir():
         raise StageError("the demo's folder cannot be made", found=str(folder))
-    town = {"type": "readers.las", "filename": str(folder / "town.laz")}
+    town = str(folder / "town.laz")
     with _step(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"):
-        write_town(make_town(size, density, seed), town["filename"])
-    bounds = Pipeline([town])
-    bounds.execute()
-    x = bounds.arrays[0]["X"]
-    middle = float(np.floor((x.min() + x.max()) / 2))
-    model = str(folder / "town.model")
+        made = make_town(size, density, seed)
+        write_town(made, town)
+    stages = pipelines(folder, float(np.floor((made.x.min() + made.x.max()) / 2)), seed)
+    for name, listed in stages.items():
+        write_whole(folder / f"{name}.json", (json.dumps(listed, indent=4) + "\n").encode())
+    with _step("training on the western half"):
+        Pipeline(stages["train"]).execute(arrays=False)
+    with _step("classifying the eastern half"):
+        job = Pipeline(stages["classify"])
+        job.execute()
+    with _step("classifying it with the model that comes with the package, which has never seen such a town"):
+        Pipeline(stages["standard"]).execute(arrays=False)
+    with _step("drawing the picture"):
+        _draw(folder / "classified.png", job.arrays[0])
+    for file in ("classified.laz", "classified.png", "accuracy.html"):
+        print(folder / file)
+
+
+def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str, Any]]]:
+    """The pipelines ``train``, ``classify`` and ``standard`` of a town in a folder, parted at an X."""
+    town, model = {"type": "readers.las", "filename": str(folder / "town.laz")}, str(folder / "town.model")
     train = [
         town,
         {"type": "filters.range", "limits": f"X[:{middle})"},
@@ -85,19 +101,7 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
         {"type": "filters.accuracy", "classes": [2, 5, 6], "merge": {"5": [4]}},
         {**las, "filename": str(folder / "standard.laz")},
     ]
-    for name, stages in (("train", train), ("classify", classify), ("standard", standard)):
-        write_whole(folder / f"{name}.json", (json.dumps(stages, indent=4) + "\n").encode())
-    with _step("training on the western half"):
-        Pipeline(train).execute(arrays=False)
-    with _step("classifying the eastern half"):
-        job = Pipeline(classify)
-        job.execute()
-    with _step("classifying it with the model that comes with the package, which has never seen such a town"):
-        Pipeline(standard).execute(arrays=False)
-    with _step("drawing the picture"):
-        _draw(folder / "classified.png", job.arrays[0])
-    for file in ("classified.laz", "classified.png", "accuracy.html"):
-        print(folder / file)
+    return {"train": train, "classify": classify, "standard": standard}
 
 
 def compile_kernels() -> None:
