@@ -221,7 +221,7 @@ def slow_below(low, base, side, depth=1.0):
     """Below which height low places are below the ground: by planes, company, and planes of low places under canopies."""
     limit, supported = np.full(low.shape, -np.inf), slow_supported(base)
     for at in np.argwhere(np.isfinite(low)):
-        plane = slow_plane(base, *at, belowground.NEAR) or slow_plane(base, *at, belowground.WIDER)
+        plane = slow_plane(base, *at, belowground.NEAR)
         lowest = plane[0] - depth - belowground.SCATTERS * plane[3] if plane else -np.inf
         if low[tuple(at)] < lowest and not slow_company(base, supported, at, low[tuple(at)], plane, side):
             limit[tuple(at)] = lowest

@@ -16,8 +16,8 @@ from ..base.jit import device, njit
 from .linked import linked_cells, sums_around
 from .openings import HOLE
 
-#: Columns within which a plane is fitted through the ground, and if there are too few, within which then; how many it needs.
-NEAR, WIDER, ENOUGH = 6, 13, 12
+#: Columns within which a plane is fitted through the ground; how many it needs.
+NEAR, ENOUGH = 9, 12
 #: How far below the plane a low place lies at least, in units of the scatter.
 SCATTERS = 4.0
 #: How far away other ground is looked for, in meters, how many columns of it show that a deep place is ground, and how much
@@ -35,7 +35,7 @@ LINK, STEP, GRADE, MOST, EXTENT = 3, 0.35, 0.15, 30, 20
 
 def reach(side: float) -> int:
     """How far away columns of a `side` in meters change what lies below the ground, in columns."""
-    return math.ceil(max(OTHERS / side, AROUND) + max(FAR / side + 2, WIDER))
+    return math.ceil(max(OTHERS / side, AROUND) + max(FAR / side + 2, NEAR))
 
 
 @device
@@ -135,8 +135,6 @@ def _limits(low, base, supported, side, depth, limit):
             if low[j, i] == np.inf:
                 continue
             n, height, across, along, scatter = _plane_under(base, j, i, NEAR)
-            if n < ENOUGH:
-                n, height, across, along, scatter = _plane_under(base, j, i, WIDER)
             lowest = height - depth - SCATTERS * scatter
             if n >= ENOUGH and low[j, i] < lowest:  # noqa: SIM102
                 if not _has_company(base, supported, side, j, i, low[j, i], height, across, along):
