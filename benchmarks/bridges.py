@@ -2,7 +2,7 @@
 
 python benchmarks/bridges.py --data FOLDER
 
-Decks of scenes (tests/bridge_scenes.py, tests/more_bridge_scenes.py, which also has what is no bridge; 16 points/m2),
+Decks of scenes (tests/bridge_scenes.py, tests/more_bridge_scenes.py, which also has what is no bridge; 8 points/m2),
 of the generated town and of the labeled clouds; wires of the town, of
 generated corridors (tests/corridor_scenes.py) and of those clouds. Cars, lamps and what was never labeled count
 neither way. `false` is the share of all points that are wrongly taken; seconds are of one process.
@@ -92,10 +92,10 @@ def main() -> None:
     print("| cloud | what | points | F1 % | false % | CPU s |")
     print("|---|---|---:|---:|---:|---:|")
     for name, make in {**SCENES, **MORE_SCENES, **TRAPS}.items():
-        xyz, codes = scan(make())
+        xyz, codes = scan(make(), 8.0)
         decks(name, xyz, np.ones(len(xyz), bool), codes == 17, codes == 1)
     for name, points in UPRIGHT_SCENES.items():
-        xyz, codes = points()
+        xyz, codes = points(8.0)
         decks(name, xyz, np.ones(len(xyz), bool), codes == 17, codes == 1)
     for seed, density in ((1, 16.0), (2, 7.0)):
         town = make_town(300.0, density, seed, progress=False)

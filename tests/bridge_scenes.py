@@ -217,47 +217,6 @@ def overpass(seed=0, half=4.0, reach=24.0, turn=0.2):
     return Scene(terrain, slabs, [], turn, 160.0, 120.0)
 
 
-def footbridge(seed=0, turn=0.8):
-    """Three meters wide, with ramps on banks, over a road."""
-
-    def top(s):
-        return 5.5 + 0.0 * s
-
-    def terrain(s, t):
-        bank = _road(t, np.clip(5.5 - 0.08 * (np.abs(s) - 20), 0, 5.5), 0.0, 2.5, 0.6)
-        front = np.clip(bank - 0.7 * np.clip(20 - np.abs(s), 0, None), 0, None)
-        return np.where(np.abs(s) > 20, bank, front), np.full(len(s), GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -20, 20, -1.6, 1.6, top, 0.6, 1.1)
-    return Scene(terrain, slabs, [], turn, 200.0, 90.0)
-
-
-def canal(seed=0, turn=0.6, half=5.0):
-    """A street over a canal between quays, hardly higher than these; water gives next to no returns."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return 0.5 * np.cos(np.clip(s / 12.0, -1, 1) * np.pi / 2)
-
-    def terrain(s, t):
-        water = np.abs(s) < 8.0
-        z = np.where(np.abs(t) < half + 0.5, top(s), top(s) * np.clip(1.5 - np.abs(t) / 20, 0, 1) * 0)
-        z = np.where(water, np.where(rng.random(len(s)) < 0.02, -1.7, np.nan), z)
-        return z, np.where(water, WATER, GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -8.1, 8.1, -half, half, top, 0.8, 0.9)
-    for side in (-1, 1):
-        for n in range(4):
-            t = -48 + n * 24.5
-            if abs(t + 9) > 16:
-                slabs.append(
-                    Slab(side * 22 - 6, side * 22 + 6, t, t + 18, lambda a: 9.0 + 0 * a, 9.0, BUILDING)
-                )
-    return Scene(terrain, slabs, [], turn, 120.0, 120.0)
-
-
 SCENES = {
     "viaduct": viaduct,
     "viaduct of two decks": lambda seed=0: viaduct(seed, gap=4.0),
@@ -265,6 +224,4 @@ SCENES = {
     "river": river,
     "river without returns": lambda seed=0: river(seed, returns=0.0),
     "overpass": overpass,
-    "footbridge": footbridge,
-    "canal": canal,
 }

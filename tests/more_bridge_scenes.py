@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from bridge_scenes import BUILDING, DECK, GROUND, LEAF, OTHER, WATER, Scene, Slab, _cars, _deck, _road
 
-WIRE = 14
-
 
 def _valley(s, reach, deep, grade=0.5):
     """A terrain level with the deck's ends, and so deep between them."""
@@ -79,65 +77,6 @@ def wide_river(seed=0, half=10.0, reach=180.0, clear=9.0, turn=0.9, water=np.nan
     return Scene(terrain, slabs, plants, turn, 2 * reach + 150.0, 150.0)
 
 
-def railway(seed=0, half=5.5, reach=100.0, height=9.0, turn=0.7):
-    """Two tracks with masts and wires on a viaduct across a town."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return height + 0.01 * s
-
-    def terrain(s, t):
-        bank = _road(t, top(s), 0.0, half + 1.0, 0.6)
-        front = np.clip(bank - 0.66 * np.clip(reach - np.abs(s), 0, None), 0, None)
-        return np.where(np.abs(s) > reach, bank, front), np.full(len(s), GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -reach, reach, -half, half, top, 1.5, 1.2)
-    for t in (-2.7, -1.3, 1.3, 2.7):  # rails
-        slabs.append(Slab(-reach, reach, t - 0.08, t + 0.08, lambda s: top(s) + 0.2, 0.2, DECK))
-    slabs.append(Slab(-30.0, 60.0, 1.0, 4.0, lambda s: top(s) + 4.0, 3.8, OTHER))  # a train
-    _masts(slabs, top, reach, (-half + 0.4, half - 0.4), 50.0, 7.5)
-    for t in (-2.0, 2.0):
-        for up in (5.5, 6.7):
-            slabs.append(
-                Slab(-reach - 30, reach + 30, t - 0.03, t + 0.03, lambda s, u=up: top(s) + u, 0.05, WIRE)
-            )
-    for s in np.arange(-80, 81, 40.0):
-        for side in (-1, 1):
-            t = side * rng.uniform(14, 18)
-            slabs.append(
-                Slab(
-                    s,
-                    s + 25,
-                    min(t, t + side * 12),
-                    max(t, t + side * 12),
-                    lambda a: 10.0 + 0 * a,
-                    10.0,
-                    BUILDING,
-                )
-            )
-    _piers(slabs, top, reach, half, 25.0, 0.0)
-    return Scene(terrain, slabs, _trees(rng, (-100, 100), (9, 13), 12, (4, 9)), turn, 330.0, 120.0)
-
-
-def low_river(seed=0, half=5.0, reach=50.0, turn=0.8):
-    """Three meters above a river that answers, with trees on both banks up to the parapets."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return 3.2 + 0.6 * np.cos(np.clip(s / reach, -1, 1) * np.pi / 2)
-
-    def terrain(s, t):
-        bank = np.clip((np.abs(s) - reach + 8) * 0.4, 0.0, 3.2)
-        return np.where(np.abs(s) < reach - 8, 0.0, bank), np.where(np.abs(s) < reach - 8, WATER, GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -reach, reach, -half, half, top, 1.0)
-    trees = _trees(rng, (reach - 3, reach + 40), (half + 3, 50), 30, (6, 16))
-    trees += [(-s, t, r, h) for s, t, r, h in trees]
-    return Scene(terrain, slabs, trees, turn, 220.0, 120.0)
-
-
 @dataclass
 class Skewed(Slab):
     """A slab whose ends are cut askew: so many meters along per meter across."""
@@ -170,52 +109,6 @@ def skewed(seed=0, half=6.0, reach=35.0, skew=1.2, turn=0.5):
         slabs.append(Skewed(-reach, reach, low, high, lambda s: top(s) + 1.0, 1.0, DECK, skew))
     _cars(slabs, rng, -reach - 40, reach + 40, (-3.0, 3.0), top, 22.0)
     return Scene(terrain, slabs, _trees(rng, (-90, 90), (22, 60), 25, (6, 15)), turn, 260.0, 140.0)
-
-
-def motorway(seed=0, half=17.0, reach=90.0, gap=4.0, turn=0.9):
-    """Two decks of three lanes full of trucks, over a river that answers, with signs across and barriers."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return 9.0 + 0.0 * s
-
-    def terrain(s, t):
-        bank = _road(t, top(s), 0.0, half + 2.0, 0.5)
-        front = np.clip(bank - 0.5 * np.clip(reach - np.abs(s), 0, None), -1.0, None)
-        wet = np.abs(s) < reach - 24
-        z = np.where(np.abs(s) > reach, bank, front)
-        return np.where(wet, -1.0, z), np.where(wet, WATER, GROUND)
-
-    slabs: list[Slab] = []
-    for right, left in ((-half, -gap / 2), (gap / 2, half)):
-        _deck(slabs, -reach, reach, right, left, top, 2.2, 1.0)
-        for lane in np.arange(right + 2.5, left - 1.5, 3.7):
-            for s in np.arange(-reach - 30, reach + 30, 24.0):
-                s = s + rng.uniform(-5, 5)
-                long, tall = (15.0, 3.9) if rng.random() < 0.5 else (4.5, 1.6)
-                slabs.append(
-                    Slab(s, s + long, lane - 1.2, lane + 1.2, lambda a, h=tall: top(a) + h, tall, OTHER)
-                )
-    for s in (-45.0, 50.0):  # signs across
-        slabs.append(Slab(s, s + 0.8, -half, half, lambda a: top(a) + 7.5, 2.0, OTHER))
-    return Scene(terrain, slabs, _trees(rng, (-150, 150), (24, 60), 30, (6, 16)), turn, 330.0, 140.0)
-
-
-def in_a_wood(seed=0, half=2.5, reach=14.0, turn=0.2):
-    """A forest road over a brook in a ravine; crowns close over it here and there."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return 0.1 + 0.0 * s
-
-    def terrain(s, t):
-        z = _valley(s, reach, 7.0, 0.8) + 0.2 * np.sin(s / 5) * np.cos(t / 6)
-        return np.where((np.abs(s) > reach) & (np.abs(t) < half + 1), top(s), z), np.full(len(s), GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -reach, reach, -half, half, top, 0.8, 1.0)
-    trees = _trees(rng, (-70, 70), (half + 2, 55), 130, (9, 20))
-    return Scene(terrain, slabs, trees, turn, 150.0, 120.0)
 
 
 def very_long(seed=0, half=8.0, reach=300.0, deep=35.0, turn=0.25):
@@ -379,36 +272,16 @@ def levee(seed=0, turn=0.5):
     return Scene(terrain, [], [], turn, 240.0, 130.0)
 
 
-def platform(seed=0, turn=0.3):
-    """A railway station: platforms of 0.8 m, roofs over them on poles, a stepped hill behind."""
-    slabs = []
-    for t in (-10.0, 8.0):
-        slabs.append(Slab(-70, 70, t, t + 6, lambda s: 0.8 + 0 * s, 0.8, GROUND))
-        slabs.append(Slab(-40, 40, t + 0.5, t + 5.5, lambda s: 5.0 + 0 * s, 0.4, BUILDING))
-
-    def terrain(s, t):
-        return np.where(t > 30, 4.0 + np.where(t > 42, 4.0, 0.0), 0.0), np.full(len(s), GROUND)
-
-    return Scene(terrain, slabs, [], turn, 200.0, 110.0)
-
-
 MORE_SCENES = {
     "deep valley, bent": lambda seed=0: deep_valley(seed, bend=260.0, turn=0.1),
-    "deep valley, climbing": lambda seed=0: deep_valley(seed, grade=0.06, turn=1.0),
-    "deep valley, 40 m wide": lambda seed=0: deep_valley(seed, half=20.0, turn=0.7),
     "wide river": wide_river,
-    "railway": railway,
-    "low river": low_river,
     "skewed": skewed,
-    "motorway of two decks": motorway,
-    "in a wood": in_a_wood,
     "600 m long": very_long,
     "walled ramps": walled_ramps,
 }
 #: As simple simulators make them: points and classes.
 UPRIGHT_SCENES = {
     "valley, ground below the deck": upright,
-    "on banks, ground below the deck": lambda density=16.0: upright(density, raised=True),
     "5 m above a river without returns": lambda density=16.0: upright(
         density, high=5.0, bank=10.0, wet=0.0, below=False
     ),
@@ -417,6 +290,5 @@ TRAPS = {
     "terraces": terraces,
     "parking on a roof, with a ramp": parking_roof,
     "dike and mole": levee,
-    "station": platform,
     "a road between walls": walled_road,
 }
