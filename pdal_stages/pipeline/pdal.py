@@ -198,6 +198,14 @@ def stages_of(thing: Any) -> list[dict[str, Any]] | None:
     return [{"type": stage.type, **stage.options} for stage in stages]
 
 
+def writer_type(filename: str) -> str:
+    """The writer that PDAL takes for a file's name; empty where it knows none."""
+    bindings()
+    from pdal import libpdalpython
+
+    return str(libpdalpython.infer_writer_driver(filename))
+
+
 def validate(stages: list[dict[str, Any]]) -> None:
     """Let the program `pdal` check stages and their options, without reading points.
 

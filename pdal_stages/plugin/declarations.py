@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 
 from ..base.version import __version__
 from ..stages import registry
@@ -73,9 +74,14 @@ def header() -> str:
         name = f"OPTIONS_{number}"
         options.append(f"const Option {name}[] = {{{_options(kind)}}};")
         texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")
-        stages.append(f"    {{ {', '.join(map(_text, texts))}, {name}, sizeof({name}) / sizeof(Option) }},")
+        stages.append(
+            f"    {{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option) }},"
+        )
     return _HEADER.format(
-        version=_text(__version__), options="\n".join(options), stages="\n".join(stages), count=len(stages)
+        version=json.dumps(__version__),
+        options="\n".join(options),
+        stages="\n".join(stages),
+        count=len(stages),
     )
 
 
@@ -99,12 +105,12 @@ def _options(kind: type[Stage]) -> str:
             else str(default)
         )
         fields = [
-            _text(option.name),
+            json.dumps(option.name),
             f"Kind::{_KINDS.get(option.kind, 'Text')}",
             str(bool(given)).lower(),
             repr(float(default) if as_number else 0.0),
-            _text(text),
-            _text(_help(kind, option)),
+            json.dumps(text),
+            json.dumps(_help(kind, option)),
         ]
         lines.append(f"    {{ {', '.join(fields)} }},")
     return "\n".join([*lines, ""])
@@ -117,12 +123,3 @@ def _help(kind: type[Stage], option: Option) -> str:
     if option.unit:
         text += f" [{option.unit}]"
     return f"{text} (required)" if option.required else text
-
-
-def _text(text: str) -> str:
-    """A C++ string literal of plain ASCII: what is beyond it, and what C++ reads otherwise, stands as octal bytes."""
-    plain = (
-        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
-        for byte in text.encode()
-    )
-    return f'"{"".join(plain)}"'
