@@ -31,35 +31,19 @@ WORTH = 0.75
 
 @dataclass(frozen=True, eq=False)
 class TrainingCloud:
-    """A labeled cloud.
+    """A labeled cloud."""
 
-    Attributes
-    ----------
-    xyz : (n, 3) float64
-        Coordinates in meters.
-    labels : (n,) int
-    dimensions : mapping
-        Name to (n,) values, as the options' `dimensions` need.
-    name : str
-        For messages and the model file; a path is cut to its last part.
-    mask : (n,) bool, optional
-        Points samples may be drawn from; all points serve as neighbors.
-    survey : str, optional
-        The flight it belongs to; by default it is one of its own.
-    copy : str
-        Which of the survey's copies it is, where there are several.
-    own : (n,) bool, optional
-        Of a tile its own points; the others are only neighbors.
-    """
-
-    xyz: npt.NDArray[np.float64]
-    labels: npt.ArrayLike
+    xyz: npt.NDArray[np.float64]  #: (n, 3) coordinates in meters
+    labels: npt.ArrayLike  #: (n,) whole numbers
+    #: name to (n,) values, as the options' `dimensions` need
     dimensions: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
-    name: str = "cloud"
-    mask: npt.ArrayLike | None = None
-    survey: str | None = None
-    copy: str = ""
-    own: npt.ArrayLike | None = None
+    name: str = "cloud"  #: for messages and the model file; a path is cut to its last part
+    mask: npt.ArrayLike | None = (
+        None  #: (n,) bool, points samples may be drawn from; all points serve as neighbors
+    )
+    survey: str | None = None  #: the flight it belongs to; by default it is one of its own
+    copy: str = ""  #: which of the survey's copies it is, where there are several
+    own: npt.ArrayLike | None = None  #: (n,) bool, of a tile its own points; the others are only neighbors
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
@@ -83,18 +67,24 @@ class TrainingCloud:
         good = np.ones(len(self), np.bool_) if self.mask is None else np.array(self.mask)
         return good if self.own is None else good & np.asarray(self.own)
 
+    @property
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All that is known of each point by name; dimensions as ``d/Intensity``."""
+        found = {"xyz": self.xyz, "labels": self.labels, "mask": self.mask, "own": self.own}
+        found |= {f"d/{name}": values for name, values in self.dimensions.items()}
+        return {name: np.asarray(values) for name, values in found.items() if values is not None}
+
+    def having(self, arrays: Mapping[str, npt.NDArray[Any]], **more: Any) -> TrainingCloud:
+        """The same cloud of other points, of which this is known."""
+        dimensions = {name[2:]: values for name, values in arrays.items() if name.startswith("d/")}
+        known: dict[str, Any] = {name: arrays.get(name) for name in ("xyz", "labels", "mask", "own")}
+        return replace(self, dimensions=dimensions, **known, **more)
+
     def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
         """Some of its points, as a cloud of the same survey."""
-        return TrainingCloud(
-            self.xyz[rows],
-            np.asarray(self.labels)[rows],
-            {name: np.asarray(values)[rows] for name, values in self.dimensions.items()},
-            f"{self.name} {copy}".strip(),
-            None if self.mask is None else np.asarray(self.mask)[rows],
-            self.flight,
-            copy or self.copy,
-            None if self.own is None else np.asarray(self.own)[rows],
-        )
+        some = {name: values[rows] for name, values in self.arrays.items()}
+        name, copy = f"{self.name} {copy}".strip(), copy or self.copy
+        return self.having(some, name=name, survey=self.flight, copy=copy)
 
 
 #: A training cloud, or a function that makes it when it is its turn.
@@ -158,28 +148,19 @@ def spooled(clouds: Iterable[TrainingCloud], folder: Path) -> list[TrainingCloud
 
 
 def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
-    def kept(name: str, array: npt.ArrayLike | None) -> Any:
-        if array is None:
-            return None
-        path = folder / f"{number}.{name}.npy"
+    kept = {}
+    for place, (name, array) in enumerate(cloud.arrays.items()):
+        path = folder / f"{number}.{place}.npy"
         try:
-            np.save(path, np.asarray(array), allow_pickle=False)
-            return np.load(path, mmap_mode="r", allow_pickle=False)
+            np.save(path, array, allow_pickle=False)
+            kept[name] = np.load(path, mmap_mode="r", allow_pickle=False)
         except OSError as error:
             raise StageError(
                 "training clouds cannot be kept on disk while training lasts",
                 found=f"{folder}: {error.strerror or error}",
                 cure="Make room there, set TMPDIR to another disk, or write the model to one",
             ) from error
-
-    return replace(
-        cloud,
-        xyz=kept("xyz", cloud.xyz),
-        labels=kept("labels", cloud.labels),
-        dimensions={k: kept(f"d{i}", v) for i, (k, v) in enumerate(cloud.dimensions.items())},
-        mask=kept("mask", cloud.mask),
-        own=kept("own", cloud.own),
-    )
+    return cloud.having(kept)
 
 
 class TiledCloud:
@@ -219,17 +200,9 @@ class TiledCloud:
                     near = mine | ((part.xyz[:, :2] >= low) & (part.xyz[:, :2] <= high)).all(axis=1)
                     parts.append(part.part(np.flatnonzero(near)))
                     own.append(np.full(len(parts[-1]), mine))
-            first = self.tiles[tile]
-            yield TrainingCloud(
-                np.concatenate([one.xyz for one in parts]),
-                np.concatenate([np.asarray(one.labels) for one in parts]),
-                {k: np.concatenate([one.dimensions[k] for one in parts]) for k in first.dimensions},
-                first.name,
-                None if first.mask is None else np.concatenate([np.asarray(one.mask) for one in parts]),
-                first.survey,
-                first.copy,
-                np.concatenate(own),
-            )
+            each = [part.arrays for part in parts]
+            whole = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+            yield self.tiles[tile].having({**whole, "own": np.concatenate(own)})
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
@@ -320,6 +293,10 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
 
 
 def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
-    """Smallest and largest density of some clouds or tiles, as a manifest has it."""
-    there = [one for cloud in clouds if (one := density(cloud.xyz))]  # empty clouds do not count
+    """Smallest and largest density of some clouds, as a manifest has it; of tiles the median."""
+    found: dict[object, list[float]] = {}
+    for number, cloud in enumerate(clouds):
+        key = number if cloud.own is None else (cloud.name, cloud.flight, cloud.copy)
+        found.setdefault(key, []).append(density(cloud.xyz))
+    there = [one for each in found.values() if (one := float(np.median(each)))]  # empty ones do not count
     return {"low": min(there, default=0.0), "high": max(there, default=0.0)}

@@ -28,7 +28,7 @@ from .training import TrainTask
 #: Reliability from which on a model is believed. With 0.55 less is gained: its errors are learned with the rest.
 SURE = 0.7
 #: Samples of a class: enough for one survey, and quickly trained.
-COUNT = 10_000
+COUNT = 6_000
 #: A class of which the teacher is sure of fewer points is left out: these may well be its errors.
 FEWEST = 200
 #: Points to look at: of a larger survey some of its files, spread over it.

@@ -278,12 +278,10 @@ def _say(report: Report, run: TiledRun) -> None:
 def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCloud:
     """The points of a tile, as :class:`Taking` wrote them."""
     arrays = load_arrays(path)
-    dimensions = {key[2:]: values for key, values in arrays.items() if key.startswith("d/")}
-    wanted, sure = (dimensions.pop(mark, np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
-    mask = arrays.get("mask")
+    wanted, sure = (arrays.pop(f"d/{mark}", np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
     if choice is not None:
-        mask = choice.mask(Looked(wanted, sure, arrays["labels"]), arrays["xyz"])
-    return TrainingCloud(arrays["xyz"], arrays["labels"], dimensions, name, mask)
+        arrays["mask"] = choice.mask(Looked(wanted, sure, arrays["labels"]), arrays["xyz"])
+    return TrainingCloud(arrays["xyz"], arrays["labels"], name=name).having(arrays)
 
 
 @dataclass(frozen=True)
@@ -312,12 +310,7 @@ class Taking:
         if self.looks:
             found, counts = stage.looked(points)
             marks, looked = {_WANTED: found.wanted, _SURE: found.sure}, {"looked": counts}
-        cloud = stage.cloud_of(points, training, marks)
-        arrays = {"xyz": cloud.xyz, "labels": np.asarray(cloud.labels)}
-        if cloud.mask is not None:
-            arrays["mask"] = np.asarray(cloud.mask)
-        arrays |= {f"d/{name}": np.asarray(values) for name, values in cloud.dimensions.items()}
-        save_arrays(outputs[0], arrays)
+        save_arrays(outputs[0], stage.cloud_of(points, training, marks).arrays)
         return {
             "outputs": written(outputs),
             "written": run.count,
