@@ -63,9 +63,6 @@ def test_is_a_model_that_says_what_it_is_of(model, town, tmp_path, capsys):
     assert made.info["teacher"]["name"] == "standard" and made.info["teacher"]["sure"] == adapting.SURE
     assert "what standard is sure of (0.7 and more)" in str(made)
     assert "not scored" in str(made) and "overall accuracy" not in str(made)
-    page = tmp_path / "m.html"
-    assert main(["model", str(model), "--html", str(page)]) == 0
-    assert "Overall accuracy" not in page.read_text() and "teacher" in page.read_text()
     source, target = town / "bare" / "t0.laz", tmp_path / "o.laz"
     code, said = run(capsys, "classify", source, target, "--model", model, "--keep-sure", "0.9")
     assert code == 1 and "it was never scored" in said and "Its labels are another model's answers" in said

@@ -412,9 +412,9 @@ def test_many_files_and_training(qgis, town, tmp_path):
     assert (tmp_path / "r.html").is_file()
     qgis(
         "run", "pdalstages:train", "--", f"INPUTS={town}", "COUNT=50", "TREES=5", "NEIGHBORHOODS=k10",
-        f"MODEL={tmp_path / 'm.model'}", f"PAGE={tmp_path / 'm.html'}",
+        f"MODEL={tmp_path / 'm.model'}",
     )  # fmt: skip
-    assert (tmp_path / "m.html").is_file()
+    assert (tmp_path / "m.model").is_file()
     qgis(
         "run",
         "pdalstages:classify",

@@ -98,7 +98,6 @@ def add_commands(parser: Parser) -> None:
     takes = parser.command("model", _model, "Describe a model file")
     takes("file")
     takes("--showjson", action="store_true", help="Everything, as JSON")
-    takes("--html", help="Write a page with its scores and importances to this file")
 
 
 def _models(options: argparse.Namespace) -> None:
@@ -202,11 +201,6 @@ def _model(options: argparse.Namespace) -> None:
     from ..stages.loading import load_model
 
     model = load_model(options.file)
-    if options.html:
-        from ..reports.modelpage import write_model_report
-
-        check_outputs([Output(options.html, "html", HTML)], [options.file])
-        write_model_report(options.html, model, Path(options.file).name)
     if options.showjson:
         print(json.dumps(model.describe(), indent=2, default=str))
     else:

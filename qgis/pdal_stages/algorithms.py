@@ -283,7 +283,7 @@ class Train(Algorithm):
     key, title, command = "train", "Train a model", "train"
     about = (
         "Trains a model on labeled point clouds, from nothing or on top of a model that knows much already: then few "
-        "labels are enough. The model is scored on points that it has not seen, and the score is in the log."
+        "labels are enough. It is scored on points that it has not seen; the score is in the log."
     )
     listed = ("base", "classes", "count")
     own = ("model",)
@@ -292,25 +292,13 @@ class Train(Algorithm):
         self.add_inputs(self.help_of("inputs"))
         self.add_declared()
         self.add_destination("MODEL", "Model", self.help_of("model"), _MODELS)
-        self.add_destination(
-            "PAGE",
-            "Page about the model",
-            "Its scores, confusion matrix and what it goes by",
-            _PAGES,
-            optional=True,
-            createByDefault=True,
-        )
-        self.addOutput(QgsProcessingOutputHtml("HTML", "Page about the model"))
 
     def processAlgorithm(self, parameters, context, feedback):
         target = self.destination(parameters, "MODEL", context)
         chosen = [*self.arguments(parameters, context), f"--model={target}"]
         self.execute(["train", *chosen, *self.inputs(parameters, context)], feedback)
-        page = self.destination(parameters, "PAGE", context)
-        if not page:
-            return {"MODEL": target}
-        self.execute(["model", target, f"--html={page}"], feedback, quiet=True)
-        return {"MODEL": target, "PAGE": page, "HTML": page}
+        self.execute(["model", target], feedback)
+        return {"MODEL": target}
 
 
 class Accuracy(Algorithm):

@@ -102,7 +102,6 @@ REPLACING = [
     ([*ACCURACY, "--json", "b.las"], OTHER),
     ([*ACCURACY, "--html", "m.model"], "would replace a model file"),
     ([*ACCURACY, "--json", "x", "--html", "x"], "is the json file too"),
-    (["model", "m.model", "--html", "m.model"], "would replace a model file"),
     (["expand", "p.json", "-o", "p.json"], INPUT),
     (["pipeline", "p.json", "--metadata", "p.json"], INPUT),
     (["pipeline", "bins.json", "--metadata", "b.json"], INPUT),
