@@ -132,7 +132,8 @@ class Density:
         """Of inputs, as their headers tell."""
         boxes = [(*one.box, one.count) for one in extents if one.count]
         x0, y0, x1, y1, count = np.array(boxes, np.float64).reshape(-1, 5).T
-        area = float(x1 - x0) * float(y1 - y0)  # of odd headers infinite, without a warning
+        with np.errstate(over="ignore"):  # of odd headers
+            area = (x1 - x0) * (y1 - y0)
         each = count / np.maximum(area, 1e-6)
         # The density that a twentieth of all points exceed: a single odd file does not decide.
         order = np.argsort(-each)
