@@ -121,17 +121,12 @@ def test_where_and_tiles_change_nothing(three, other):
     assert none.classified == 0 and not none.classification.any()
 
 
-def test_rejection_and_empty_clouds(two, other):
-    xyz, _, dimensions = other
-    whole = everything(two, xyz, dimensions)
-    low = whole.reliability < np.float32(0.7)
-    some = two.predict(xyz, dimensions, reject_below=0.7, rejected_code=30)
-    assert low.sum() > 0 and (some.classification[low] == 30).all() and some.rejected == low.sum()
+def test_empty_and_lone(two):
     assert len(two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}).classification) == 0
     lone = two.predict(np.array([[1e6, 2e6, 3.0]]), {"HeightAboveGround": np.zeros(1)})
     assert lone.classified == 1
     with pytest.raises(OptionError, match="variance"):
-        two.predict(xyz, dimensions, variance=True)
+        two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}, variance=True)
 
 
 def test_binary():

@@ -1,7 +1,5 @@
 """Training and prediction on small clouds: labels, files, blocks, threads, where, rejection, dimensions."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -88,18 +86,6 @@ def test_another_place_is_classified(trained, other):
     assert np.array_equal(trained.codes[result.probabilities.argmax(axis=1)], result.classification)
     assert result.classified == len(xyz) and result.rejected == 0
     assert sum(result.report.figures["classes"].values()) == len(xyz)
-
-
-def test_file_gives_the_same_model(trained, other, tmp_path):
-    xyz, _, dimensions = other
-    trained.save(tmp_path / "m.model")
-    again = load_model(tmp_path / "m.model")
-    same(trained.predict(xyz, dimensions, margin=True), again.predict(xyz, dimensions, margin=True))
-    assert again.describe() == json.loads(json.dumps(trained.describe()))
-    assert str(again) == str(trained)
-    again.save(tmp_path / "n.model")
-    assert (tmp_path / "m.model").read_bytes() == (tmp_path / "n.model").read_bytes()
-    assert b"some/folder" not in (tmp_path / "m.model").read_bytes()
 
 
 # ---- where and rejection -------------------------------------------------------------------------------
@@ -202,17 +188,6 @@ def test_small_classes_are_counted_several_times():
     }  # fmt: skip
 
 
-def test_labels_left_out_still_are_neighbors_and_a_mask_limits_samples():
-    xyz, label, dimensions = scene()
-    label = np.where(xyz[:, 0] < 10, 1, label)
-    mask = xyz[:, 1] > 20
-    cloud = TrainingCloud(xyz, label, dimensions, mask=mask)
-    model = train([cloud], TrainingOptions(**SMALL), progress=False)
-    assert [code for code, _ in model.classes] == [2, 5, 6]
-    available = {e["code"]: e["available"] for e in model.info["classes"]}
-    assert available == {c: int((mask & (label == c)).sum()) for c in (2, 5, 6)}
-
-
 def test_several_clouds_are_sampled_together_but_are_not_neighbors():
     a, b = scene(0), scene(1, origin=(1000.0, 0.0, 0.0))
     clouds = [TrainingCloud(*a, name="a"), TrainingCloud(*b, name="b")]
@@ -276,15 +251,6 @@ def test_prior_weight(other):
     assert models[0].info["priors"] is None
     with pytest.raises(OptionError, match="prior_weight"):
         TrainingOptions(prior_weight=1.5)
-
-
-def test_merged_and_named_classes(tmp_path):
-    xyz, label, dimensions = scene()
-    options = TrainingOptions(**SMALL, classes={"2": "Ground", "5,6": "64 Things"})
-    model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
-    assert model.classes == [(2, "Ground"), (64, "Things")]
-    model.save(tmp_path / "m")
-    assert load_model(tmp_path / "m").classes == model.classes
 
 
 # ---- hostile manifests ---------------------------------------------------------------------------------

@@ -119,28 +119,20 @@ def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
 
 
 @pytest.mark.pdal
-def test_classify_keeps_only_what_is_sure(tmp_path, capsys):
-    write_town(ps.make_town(70.0, 4.0, seed=2, progress=False), tmp_path / "town.laz")
-    out = [str(tmp_path / "town.laz"), str(tmp_path / "out.laz")]
-    assert main(["classify", *out, "--keep-sure", "0.95"]) == 0
-    text = capsys.readouterr()
-    assert "expected to become class 1" in text.err and "rejected as unreliable" in text.out
-    las = laspy.read(tmp_path / "out.laz")
-    codes, reliability = np.asarray(las.classification), np.asarray(las["Reliability"])
-    assert np.count_nonzero(codes == 1) > 0 and reliability[codes == 1].max() < 1.0
-    assert main(["classify", *out, "--keep-sure", "1.5"]) == 1
-
-
-@pytest.mark.pdal
-def test_what_is_rejected_is_counted_once_in_tiles(tmp_path, capsys):
-    """Not with each tile's surroundings again."""
+def test_classify_keeps_only_what_is_sure_in_tiles_too(tmp_path, capsys):
+    """What is rejected is counted once, not with each tile's surroundings again."""
     write_town(ps.make_town(60.0, 4.0, seed=2, progress=False), tmp_path / "town.laz")
     source = str(tmp_path / "town.laz")
     counted = []
     for words in ([str(tmp_path / "whole.laz")], [str(tmp_path / "tiles"), "--tile", "30", "--workers", "0"]):
         assert main(["classify", source, *words, "--keep-sure", "0.98"]) == 0
-        (line,) = (line for line in capsys.readouterr().out.splitlines() if "rejected as unreliable" in line)
+        text = capsys.readouterr()
+        assert "expected to become class 1" in text.err
+        (line,) = (line for line in text.out.splitlines() if "rejected as unreliable" in line)
         counted.append(int(line.split()[-1].replace(",", "")))
-    codes = np.asarray(laspy.read(tmp_path / "whole.laz").classification)
+    las = laspy.read(tmp_path / "whole.laz")
+    rejected = np.asarray(las.classification) == 1
     assert (tmp_path / "tiles/town.laz").read_bytes() == (tmp_path / "whole.laz").read_bytes()
-    assert counted == [np.count_nonzero(codes == 1)] * 2
+    assert counted == [np.count_nonzero(rejected)] * 2 and counted[0] > 0
+    assert np.asarray(las["Reliability"])[rejected].max() < 1.0
+    assert main(["classify", source, str(tmp_path / "o.laz"), "--keep-sure", "1.5"]) == 1

@@ -74,12 +74,10 @@ def test_defaults(tmp_path, side):
 @pytest.mark.parametrize(
     "more",
     [
-        {"voxel": 0.0, "passes": 1, "groups": "Flight", "prior_weight": 0.5},
         {"passes": 3, "context": ("own", "box2"), "voxel": 0.9},
         {"strategy": "binary", "target": 6, "classes": {"2": 2, "5": 5, "6": 6}},
-        {"dimensions": ("returns",)},
     ],
-    ids=["groups", "three", "binary", "returns"],
+    ids=["three", "binary"],
 )
 def test_other_options(tmp_path, more):
     cloud = scene()
