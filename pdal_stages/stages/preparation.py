@@ -19,7 +19,9 @@ from . import registry
 from .options import Option, split_list
 
 #: The stage that makes the dimensions a model is trained on by default.
-PREPARATION = ({"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},)
+PREPARATION: tuple[dict[str, Any], ...] = (
+    {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
+)
 #: PDAL's stages that heights come from; of ours, :meth:`Stage.creates` says what they make.
 OF_PDAL = (
     "filters.smrf",
