@@ -7,7 +7,6 @@ import json
 import math
 import os
 import platform
-import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from io import BytesIO
@@ -76,7 +75,6 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     """See :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
     from .network import torch  # before any work: says what to install where it is missing
 
-    started = time.perf_counter()
     names = inputs(options)
     xyz = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
     known = label_classes(clouds, options)
@@ -122,8 +120,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         },
     }
     classes = list(zip(known.classes.codes, known.classes.names, strict=True))
-    seconds = {"whole": round(time.perf_counter() - started, 3)}
-    return Model((net,), classes, info, seconds)
+    return Model((net,), classes, info)
 
 
 class _Session:

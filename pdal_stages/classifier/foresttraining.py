@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -69,7 +68,6 @@ class _ForestTraining:
     """Samples of labeled clouds and what is computed of them."""
 
     def __init__(self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> None:
-        self.started = time.perf_counter()
         self.clouds, self.options, self.base = clouds, options, options.base
         self.progress = partial(Progress, enabled=progress)
         if options.groups and required((options.groups,)) != (options.groups,):
@@ -168,11 +166,8 @@ class _ForestTraining:
     def model(self) -> Model:
         """Score, grow, and put together."""
         o, base = self.options, self.base
-        timed = {"features": time.perf_counter() - self.started}
         validation, notes = self._validate()
-        started = time.perf_counter()
         forests, importances = self._passes()
-        timed["trees"] = time.perf_counter() - started
         priors = (
             None if self.factors is None else {"weight": o.prior_weight, "factors": self.factors.tolist()}
         )
@@ -201,11 +196,11 @@ class _ForestTraining:
             info["sureness"] = self.sureness.to_dict()
         names = dict(zip(self.codes, self.labeled.classes.names, strict=True))
         if base is None:
-            return Model(tuple(forests), list(names.items()), info, timed)
+            return Model(tuple(forests), list(names.items()), info)
         codes = self._codes_after(o.passes - 1)
         names |= dict(base.classes)
         classes = [(code, names[code]) for code in codes]
-        return Model((*base.passes, *forests), classes, on_top(base, info, names, codes), timed)
+        return Model((*base.passes, *forests), classes, on_top(base, info, names, codes))
 
     def _codes_after(self, number: int) -> Sequence[int]:
         """The classes of a pass."""

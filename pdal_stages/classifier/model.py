@@ -41,14 +41,11 @@ class Model:
         In the order of the columns of probabilities.
     info : dict
         The rest of the manifest: how it was trained, scores; ``info["passes"]`` has the importances of each pass.
-    seconds : dict
-        What training took, by part; not stored.
     """
 
     passes: tuple[Any, ...]
     classes: list[tuple[int, str]]
     info: dict[str, Any] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def algorithm(self) -> Any:

@@ -268,7 +268,7 @@ classes.
             model.info["by_hand"] = self._by_hand
         model.save(self.filename)
         shown = {key: model.info[key] for key in _SHOWN if key in model.info}
-        report.figures |= {"model": self.filename, **shown, "seconds": model.seconds}
+        report.figures |= {"model": self.filename, **shown}
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
                 f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "

@@ -37,35 +37,17 @@ MOST = 20_000_000
 
 @dataclass(frozen=True)
 class AdaptTask:
-    """What a model is made for.
+    """What a model is made for."""
 
-    Attributes
-    ----------
-    inputs : sequence of str
-        Files, folders, patterns, tile indexes of one survey; of the classes they have noise and overlap alone count.
-    model : str
-        The file to write.
-    teacher : str
-        The model that says what it sees.
-    sure : float
-        Its least ``Reliability`` that counts.
-    options : TilingOptions
-    """
-
+    #: files, folders, patterns, tile indexes of one survey; of the classes they have noise and overlap alone count
     inputs: Sequence[str]
-    model: str
-    teacher: str = "standard"
-    sure: float = SURE
+    model: str  #: the file to write
+    teacher: str = "standard"  #: the model that says what it sees
+    sure: float = SURE  #: its least ``Reliability`` that counts
     options: TilingOptions = field(default_factory=TilingOptions)
 
     def run(self) -> list[str]:
-        """Write the model; what is to be told.
-
-        Raises
-        ------
-        StageError
-            Where an input cannot be read, or the teacher is sure of fewer than two classes.
-        """
+        """Write the model; what is to be told. StageError where the teacher is sure of fewer than two classes."""
         sure = checks.number("'--sure'", self.sure, 0.0, 1.0)
         teacher, files = load_model(self.teacher), input_files(self.inputs)
         check_outputs([Output(self.model, "model", MODEL)], files)
@@ -122,17 +104,11 @@ class AdaptTask:
 
 def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:
     """Every so many-th file, so that they have about `most` points; and what is to be told."""
-    if not all(map(is_las, files)):
-        return list(files), []
-    points = 0
-    for name in files:
-        try:
-            header = las.read_header(name)
-        except OSError:
-            header = None
-        if header is None:
-            return list(files), []  # what is wrong is said when it is read
-        points += header.count
+    try:
+        headers = [las.read_header(name) for name in files] if all(map(is_las, files)) else []
+        points = sum(header.count for header in headers if header)
+    except OSError:  # said when it is read
+        points = 0
     step = min(max(1, round(points / most)), len(files))
     if step == 1:
         return list(files), []
