@@ -63,7 +63,7 @@ class Finding:
 def examine() -> Iterator[Finding]:
     """Everything, one after the other; each looks by itself, so that one fault does not hide the next."""
     looks: tuple[Callable[[], Iterator[Finding]], ...] = (
-        _package, _bindings, _program, _plugin, _machine, _kernels, _extras
+        _package, _bindings, _program, _plugin, _machine, _extras
     )  # fmt: skip
     for look in looks:
         try:
@@ -117,33 +117,24 @@ def _python_of(what: str, run: Callable[[list], object]) -> Finding:
         script = {"source": _SCRIPT, "function": "look", "module": "pdal_stages_doctor"}
         run([points, {"type": "filters.python", **script, "pdalargs": {"answer": str(answer)}}])
         if not answer.is_file():
-            return Finding(
-                what, "the script did not run", "Install pdal-plugins again, for this PDAL and this Python"
-            )
+            cure = "Install pdal-plugins again, for this PDAL and this Python"
+            return Finding(what, "the script did not run", cure)
         prefix, found = answer.read_text().splitlines()[:2]
+    python = f"Python of {prefix}"
     if not os.path.isabs(found):
-        return Finding(
-            what, f"Python of {prefix}; {found}", f"{prefix}/bin/python -m pip install pdal-stages"
-        )
+        return Finding(what, f"{python}; {found}", f"{prefix}/bin/python -m pip install pdal-stages")
     if Path(found).resolve().parent != Path(__file__).resolve().parents[1]:
-        return Finding(
-            what,
-            f"Python of {prefix}, which has another pdal_stages: {found}",
-            "Keep one of them, or one version",
-        )
-    return Finding(what, f"Python of {prefix}")
+        other = f"{python}, which has another pdal_stages: {found}"
+        return Finding(what, other, "Keep one of them, or one version")
+    return Finding(what, python)
 
 
 def _plugin() -> Iterator[Finding]:
     good, bad = building.check()
     if bad:
+        cure = "pdal-stages plugin --check; not needed by pdal-stages"
         what = "native stages (pdal pipeline knows our names)"
-        yield Finding(
-            what,
-            bad[-1].split(". ")[0],
-            "pdal-stages plugin --check; not needed by pdal-stages",
-            needed=False,
-        )
+        yield Finding(what, bad[-1].split(". ")[0], cure, needed=False)
     else:
         yield Finding("native stages", good[-1])
 
@@ -151,12 +142,8 @@ def _plugin() -> Iterator[Finding]:
 def _machine() -> Iterator[Finding]:
     yield Finding("cores", str(available_threads()))
     free = free_memory()
-    enough = free >= _LITTLE_MEMORY
-    cure = "" if enough else "Work in tiles (--tile), or close other programs"
+    cure = "" if free >= _LITTLE_MEMORY else "Work in tiles (--tile), or close other programs"
     yield Finding("free memory", f"{free / 2**30:.1f} GB", cure, needed=False)
-
-
-def _kernels() -> Iterator[Finding]:
     count = kept_kernels()
     cure = "" if count else "pdal-stages warmup, once; otherwise the first job waits for the compiler"
     yield Finding("compiled kernels", str(count) if count else "none yet", cure, needed=False)
