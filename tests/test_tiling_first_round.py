@@ -9,10 +9,10 @@ from test_terrain_morphological import town
 
 import pdal_stages as ps
 from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain.cells import lowest_of_cells
 from pdal_stages.terrain.decks import level_points
 from pdal_stages.terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
-from pdal_stages.terrain.lowest import lowest_of_cells
 from pdal_stages.terrain.morphological import reach_of_cells
 from pdal_stages.tiling import run_tiled, tile
 from pdal_stages.tiling.ground import FirstRoundTask

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError
+from ..terrain.cells import lowest_of_cells
 from ..terrain.decks import level_points
 from ..terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
-from ..terrain.lowest import lowest_of_cells
 from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells
-from ..terrain.profile import opening_names
+from ..terrain.openings import opening_names
 from .base import HEIGHTS_OUTSIDE, Blocks, Left, Stage
 from .options import ignore_option, option
 from .points import Points

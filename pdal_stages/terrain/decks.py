@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
+from .cells import cell_numbers
 from .deckrims import REACH as RIMS_REACH
 from .deckrims import deck_levels
 from .levels import levels
 from .linked import sums_around
-from .minima import cell_numbers
 from .patches import patches
 from .walkable import AHEAD, FAR, ROUGH, SOLID, STEP, distance
 

@@ -24,10 +24,9 @@ from ..base.errors import StageError
 from ..base.jit import device, njit
 from .belowground import AROUND, ENOUGH, below_ground
 from .belowground import reach as below_reach
+from .cells import cell_numbers, columns
 from .clusters import BITS, BLOCK, CLUSTER_REACH, SCALES, SIDE, Voxels, small_clusters, surroundings
-from .columns import columns
 from .linked import sums_around
-from .minima import cell_numbers
 from .patches import patches
 
 LOW, HIGH = NOISE

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import begins_run
+from .cells import HIGHEST, cell_numbers
 from .decks import decks_of_levels, levels_near_decks
 from .groundcells import (
     BLOCK_SIDE,
@@ -19,14 +20,13 @@ from .groundcells import (
     FilterOptions,
     GroundCells,
     GroundRaster,
+    add_ground,
     ground_raster,
+    means_of,
 )
-from .groundmeans import add_ground, around, heights_above, means_of
-from .lowest import HIGHEST
-from .minima import cell_numbers
 from .patches import connected
+from .planes import around, heights_above, surface
 from .planes import reach as planes_reach
-from .planes import surface
 
 #: Cells beyond its reach that points may lie in without being left out.
 _FEW = 4

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ..base.arrays import begins_run
 from ..base.jit import njit
 from .belowground import pits, pits_reach
+from .cells import heights_of, lowest_points, places_of
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
-from .lowest import heights_of, lowest_points, places_of
 from .openings import HOLE, objects_of, opening_radius
 from .patches import SIDE
 from .planes import from_parents, planes_of_blocks
@@ -98,6 +98,8 @@ class FilterOptions:
         return max(pits_reach(self.cell), self.largest_radius, planes_reach(self.levels(FAR))) + 2
 
 
+#: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
+_PARTS = 2.0**20
 #: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`GroundRaster.place`.
 CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
@@ -191,9 +193,9 @@ def ground_raster(
         return (slice(None), slice(None)) if wanted is None else wanted.grown(by).on(left, bottom, *shape)
 
     part = grown(plateaus + ROUNDS * step)
-    lowest, raster, objects, floor, wide = (
-        np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor, wide)
-    )
+    cut_out: list = [np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor, wide)]
+    lowest, raster, objects, floor, wide = cut_out
+    del cut_out
     opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
     left, bottom, shape = left + (part[1].start or 0), bottom + (part[0].start or 0), raster.shape
     place = places_of(x, y, z, cell, lowest)
@@ -241,6 +243,26 @@ def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, 
         x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
         gradient = np.sqrt(across * across + along * along) / cell
         out[k] = abs(z - height - x * across - y * along) <= threshold + scalar * gradient
+
+
+@njit
+def add_ground(x, y, z, is_ground, column, row, cell, left, bottom, sums):
+    """Add points that are ground to the sums (h, w, 4) of their cells: number, place, height; in whole numbers, so order is
+    free."""
+    for p in range(len(x)):
+        if is_ground[p]:
+            total = sums[row[p] - bottom, column[p] - left]
+            total[0] += 1
+            total[1] += int(np.rint((x[p] / cell - column[p] - 0.5) * _PARTS))
+            total[2] += int(np.rint((y[p] / cell - row[p] - 0.5) * _PARTS))
+            total[3] += int(np.rint(z[p] * _PARTS))
+
+
+def means_of(sums: NDArray[np.int64], ground: NDArray[np.bool_], place: NDArray[np.float64]) -> None:
+    """Whether cells (h, w) hold ground, and its mean (h, w, 3): from the cell's center, in cells, and its height."""
+    ground[:] = sums[..., 0] > 0
+    held = sums[ground]
+    place[ground] = held[:, 1:] / _PARTS / held[:, :1]
 
 
 #: Arrays of :class:`GroundCells` that have rows for some of the cells, or for none.

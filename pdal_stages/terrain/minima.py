@@ -21,11 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
 from ..base.arrays import begins_run
-from ..base.errors import NoTerrainError, OptionError, StageError
-from .columns import columns
-
-#: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
-_INDEX_LIMIT = 2**31 - 2
+from ..base.errors import NoTerrainError, OptionError
+from .cells import bounded, cell_numbers, columns
 
 
 @dataclass
@@ -98,7 +95,7 @@ class MinimaTerrain:
         v = (fine_y + 0.5) * (self.resolution / self.cell) - 0.5
         i, j = np.floor(u), np.floor(v)
         wu, wv = u - i, v - j
-        i, j = _bounded(i), _bounded(j)
+        i, j = bounded(i), bounded(j)
         corners = [_key(i + a, j + b) for b in (0, 1) for a in (0, 1)]
         keys = np.unique(np.concatenate([np.unique(k) for k in corners]))
         values = self._filled(keys)
@@ -229,23 +226,6 @@ def check_sizes(cell: float, resolution: float) -> None:
             found=f"resolution {resolution:g}, cell {cell:g}",
             cure="Swap them, or lower 'resolution'",
         )
-
-
-def _bounded(index: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Cell numbers as integers; refuses coordinates no survey has (they would wrap round)."""
-    if index.size and max(-index.min(), index.max()) > _INDEX_LIMIT - 1:
-        raise StageError(
-            "coordinates are too large for the grid",
-            found=f"a cell index of {float(np.abs(index).max()):.3g}",
-            cure="Remove stray points, e.g. with filters.crop or filters.range, or use a larger 'cell'",
-        )
-    return index.astype(np.int64)
-
-
-def cell_numbers(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
-    """Which cell coordinates fall in, counted from the origin; StageError beyond what any survey has."""
-    index = np.asarray(coordinate / cell)
-    return _bounded(np.floor(index, out=index))
 
 
 def _key(column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int64]:

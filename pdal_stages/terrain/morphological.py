@@ -11,7 +11,7 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface, and
   from farther away what only wide ones took: they have no room above a scarp that the rim of the cloud cuts off;
 * what is higher than all around it on every side is no ground (:mod:`.plateaus`), nor are bridges (:mod:`.decks`);
-* low outliers are told from ground under a canopy (:mod:`.lowest`).
+* low outliers are told from ground under a canopy (:mod:`.belowground`).
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
 airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30.
@@ -27,16 +27,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import OptionError, StageError
 from ..base.resources import map_blocks
-from .columns import columns
+from .cells import HIGHEST, cell_numbers, columns
 from .decks import decks_of_levels, find_decks
-from .groundcells import FAR, NEAR, CellMeans, FilterOptions, GroundCells, GroundRaster, ground_raster
-from .groundmeans import add_ground, around, heights_above, means_of
-from .lowest import HIGHEST
-from .minima import cell_numbers
+from .groundcells import (
+    FAR,
+    NEAR,
+    CellMeans,
+    FilterOptions,
+    GroundCells,
+    GroundRaster,
+    add_ground,
+    ground_raster,
+    means_of,
+)
+from .openings import above_opening, opening_names
 from .patches import patches
+from .planes import around, heights_above, surface
 from .planes import reach as planes_reach
-from .planes import surface
-from .profile import above_opening, opening_names
 
 #: The most cells a window's radius may have.
 _MOST_CELLS = 300

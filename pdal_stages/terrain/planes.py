@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 
@@ -253,3 +254,29 @@ def surface(
     _finer(blocks.values, blocks.left, blocks.bottom, 1.0, left, bottom, needed, planes)
     _through_ground(ground, place, planes)
     return planes
+
+
+@njit
+def heights_above(x, y, z, cell, left, bottom, planes, height, gradient):
+    """Height above the surface, and its slope, at points."""
+    for p in range(len(x)):
+        u, v = x[p] / cell - 0.5, y[p] / cell - 0.5
+        i, j = np.floor(u), np.floor(v)
+        level, across, along = blend(planes, int(i) - left, int(j) - bottom, u - i, v - j, 1.0)
+        height[p] = z[p] - level
+        gradient[p] = np.sqrt(across * across + along * along) / cell
+
+
+def around(
+    column: NDArray, row: NDArray, left: int, bottom: int, shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose planes points blend."""
+    held = np.zeros(shape, bool)
+    held[row - bottom, column - left] = True
+    needed = held.copy()
+    needed[1:] |= held[:-1]
+    needed[:-1] |= held[1:]
+    held = needed.copy()
+    needed[:, 1:] |= held[:, :-1]
+    needed[:, :-1] |= held[:, 1:]
+    return needed

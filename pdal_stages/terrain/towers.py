@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .minima import cell_numbers
+from .cells import cell_numbers
 from .patches import patches
 
 #: Side of the cells, meters.

@@ -14,8 +14,8 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
+from .cells import cell_numbers
 from .linked import longest_sides
-from .minima import cell_numbers
 from .patches import patches
 
 #: Side of the cells, and how far apart in height the levels of a cell are at least, meters.
