@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,9 @@ def locations(path: str, column: str = "location") -> list[str]:
     """
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")
     try:
-        names = [*pyogrio.raw.read(path, columns=[column], read_geometry=False)[3], None][0]
+        with warnings.catch_warnings():  # GDAL's, of files that it reads nevertheless
+            warnings.simplefilter("ignore")
+            names = [*pyogrio.raw.read(path, columns=[column], read_geometry=False)[3], None][0]
         if names is None:
             raise ValueError(f"it has no column '{column}'")
         if odd := [name for name in names if not (isinstance(name, str) and name) or "\0" in name]:
