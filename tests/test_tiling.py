@@ -419,7 +419,7 @@ def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, wh
         )
         assert done.returncode == 0, done.stderr
         assert locations(str(tmp_path / name)) == [str(town_file)]
-        with pytest.raises(StageError, match="names no file"):
+        with pytest.raises(StageError, match="cannot be read"):
             locations(str(tmp_path / name), "nothing")
     pipeline = clouds.stages([town_file], tmp_path / "out.laz", model_file)
     pipeline[0] = {"type": "readers.tindex", "filename": str(tmp_path / "b.gpkg")}
