@@ -319,79 +319,52 @@ def test_parameters_are_the_commands_own(session, capsys):
     assert heights["WINDOW"][2] == "75.0" and heights["WINDOW"][3].startswith("Radius of the largest window")
 
 
+@pytest.fixture
+def algorithm(qgis):
+    """Run one of ours with parameters; what was printed."""
+
+    def run(name, code=0, **parameters):
+        given = [f"{key}={value}" for key, value in parameters.items()]
+        return qgis("run", f"pdalstages:{name}", "--", *given, code=code)
+
+    return run
+
+
 @pytest.mark.pdal
 @needs_qgis
-def test_the_way_of_a_tile(qgis, session, town, tmp_path):
+def test_the_way_of_a_tile(algorithm, session, town, tmp_path):
     """Classified, with heights, as rasters, as objects, judged: the same bytes as the commands give."""
     out = tmp_path / "with blanks ü"
     out.mkdir()
-    said = qgis(
-        "run",
-        "pdalstages:classify",
-        "--",
-        f"INPUT={town}",
-        f"OUTPUT={out / 'c.laz'}",
-        f"MAP={out / 'c.tif'}",
-        "NOISE=0",
-    )
+    cloud, heights = out / "c.laz", out / "h.laz"
+    said = algorithm("classify", INPUT=town, OUTPUT=cloud, MAP=out / "c.tif", NOISE=0)
     assert "pdal-stages classify --no-noise" in said and "6 Building" in said
     assert main(["classify", str(town), str(tmp_path / "c.laz"), "--no-noise"]) == 0
-    assert (out / "c.laz").read_bytes() == (tmp_path / "c.laz").read_bytes()
-    qgis(
-        "run",
-        "pdalstages:heights",
-        "--",
-        f"INPUT={town}",
-        f"OUTPUT={out / 'h.laz'}",
-        f"MAP={out / 'h.tif'}",
-        "WINDOW=40",
-    )
+    assert cloud.read_bytes() == (tmp_path / "c.laz").read_bytes()
+    algorithm("heights", INPUT=town, OUTPUT=heights, MAP=out / "h.tif", WINDOW=40)
     job = [str(town), {"type": "filters.hag_morphological", "window": 40}, str(tmp_path / "h.laz")]
     (tmp_path / "job.json").write_text(json.dumps(job))
-    assert (
-        main(
-            [
-                "pipeline",
-                str(tmp_path / "job.json"),
-                "--writers.las.extra_dims=all",
-                "--writers.las.forward=all",
-            ]
-        )
-        == 0
-    )
-    ours, theirs = (laspy.read(path)["HeightAboveGround"] for path in (tmp_path / "h.laz", out / "h.laz"))
+    kept = ["--writers.las.extra_dims=all", "--writers.las.forward=all"]
+    assert main(["pipeline", str(tmp_path / "job.json"), *kept]) == 0
+    ours, theirs = (laspy.read(path)["HeightAboveGround"] for path in (tmp_path / "h.laz", heights))
     assert np.array_equal(ours, theirs) and ours.max() > 3
-    qgis(
-        "run", "pdalstages:terrainmodels", "--", f"INPUT={out / 'c.laz'}", "GROUND_FROM=1", f"TERRAIN={out / 't.tif'}",
-        f"SURFACE={out / 's.tif'}", f"HEIGHTS={out / 'a.tif'}",
-    )  # fmt: skip
-    said = qgis(
-        "run",
-        "pdalstages:accuracy",
-        "--",
-        f"INPUT={out / 'c.laz'}",
-        f"REFERENCE={town}",
-        f"PAGE={out / 'a.html'}",
-    )
+    rasters = {"TERRAIN": out / "t.tif", "SURFACE": out / "s.tif", "HEIGHTS": out / "a.tif"}
+    algorithm("terrainmodels", INPUT=cloud, GROUND_FROM=1, **rasters)
+    said = algorithm("accuracy", INPUT=cloud, REFERENCE=town, PAGE=out / "a.html")
     assert "Overall accuracy" in said and (out / "a.html").read_text().startswith("<!")
     pytest.importorskip("pyogrio")
-    said = qgis("run", "pdalstages:objects", "--", f"INPUTS={out / 'c.laz'}", f"OUTPUT={out / 'o.gpkg'}")
-    assert " buildings, " in said
-    shown = session("styles", out / "o.gpkg", out / "t.tif", out / "h.tif", out / "c.tif")
-    assert shown["building"] == [214, 78, 60]
-    assert (
-        shown["layers"] | {"terrain": "hillshade", "heights": "singlebandpseudocolor", "classes": "paletted"}
-        == shown["layers"]
-    )
+    assert " buildings, " in algorithm("objects", INPUTS=cloud, OUTPUT=out / "o.gpkg")
+    shown = session("styles", out / "o.gpkg", out / "t.tif", heights.with_suffix(".tif"), out / "c.tif")
+    layers = {"terrain": "hillshade", "heights": "singlebandpseudocolor", "classes": "paletted"}
+    assert shown["building"] == [214, 78, 60] and shown["layers"] | layers == shown["layers"]
     assert shown["layers"]["buildings"] == "categorizedSymbol"
-    review = [f"INPUTS={out / 'c.laz'}", f"OUTPUT={out / 'r.gpkg'}", f"PAGE={out / 'r.html'}"]
-    said = qgis("run", "pdalstages:review", "--", *review)
+    said = algorithm("review", INPUTS=cloud, OUTPUT=out / "r.gpkg", PAGE=out / "r.html")
     assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), said
-    marked = [f"BEFORE={out / 'c.laz'}", f"AFTER={town}", f"OUTPUT={out / 'k.laz'}", "AROUND=2"]
-    said = qgis("run", "pdalstages:corrections", "--", *marked, f"AREA={out / 'r.gpkg'}", code=1)
+    marked = {"BEFORE": cloud, "AFTER": town, "OUTPUT": out / "k.laz", "AROUND": 2}
+    said = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
     assert "no patch is marked as looked at" in said and not (out / "k.laz").exists()
-    said = qgis("run", "pdalstages:corrections", "--", *marked)
-    words = ["corrections", str(out / "c.laz"), str(town), "--around", "2"]
+    said = algorithm("corrections", **marked)
+    words = ["corrections", str(cloud), str(town), "--around", "2"]
     assert main([*words, "--out", str(tmp_path / "k.laz")]) == 0
     assert (out / "k.laz").read_bytes() == (tmp_path / "k.laz").read_bytes()
     assert np.count_nonzero(laspy.read(out / "k.laz")["Checked"]), said
@@ -399,28 +372,13 @@ def test_the_way_of_a_tile(qgis, session, town, tmp_path):
 
 @pytest.mark.pdal
 @needs_qgis
-def test_many_files_and_training(qgis, town, tmp_path):
-    second = tmp_path / "in" / "b.laz"
-    second.parent.mkdir()
-    shutil.copy(town, second)
-    shutil.copy(town, second.with_name("a.laz"))
-    said = qgis(
-        "run", "pdalstages:classifysurvey", "--", f"FOLDER={second.parent}", f"OUTPUT={tmp_path / 'out'}",
-        f"REPORT={tmp_path / 'r.html'}", "WORKERS=0",
-    )  # fmt: skip
-    assert sorted(path.name for path in (tmp_path / "out").glob("*.laz")) == ["a.laz", "b.laz"], said
+def test_many_files_and_training(algorithm, ready_halves, town, tmp_path):
+    out, model = tmp_path / "out", tmp_path / "m.model"
+    said = algorithm("classifysurvey", FOLDER=ready_halves, OUTPUT=out, REPORT=tmp_path / "r.html", WORKERS=0)
+    assert sorted(path.name for path in out.glob("*.laz")) == ["east.laz", "west.laz"], said
     assert (tmp_path / "r.html").is_file()
-    qgis(
-        "run", "pdalstages:train", "--", f"INPUTS={town}", "COUNT=50", "TREES=5", "NEIGHBORHOODS=k10",
-        f"MODEL={tmp_path / 'm.model'}",
-    )  # fmt: skip
-    assert (tmp_path / "m.model").is_file()
-    qgis(
-        "run",
-        "pdalstages:classify",
-        "--",
-        f"INPUT={town}",
-        f"MODEL={tmp_path / 'm.model'}",
-        f"OUTPUT={tmp_path / 'm.laz'}",
-    )
+    few = {"COUNT": 50, "TREES": 5, "NEIGHBORHOODS": "k10"}
+    algorithm("train", INPUTS=town, MODEL=model, PAGE=tmp_path / "m.html", **few)
+    assert (tmp_path / "m.html").is_file()
+    algorithm("classify", INPUT=town, MODEL=model, OUTPUT=tmp_path / "m.laz")
     assert (tmp_path / "m.laz").is_file()
