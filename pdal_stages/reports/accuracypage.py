@@ -70,8 +70,6 @@ def write_accuracy_report(
     subtitle: str = "",
     importances: Mapping[str, float] | None = None,
     settings: Mapping[str, Any] | None = None,
-    unit: str = "m",
-    date: str | None = None,
 ) -> Path:
     """Write an accuracy report, whole or not at all.
 
@@ -94,10 +92,6 @@ def write_accuracy_report(
         Importances of features or groups of features, given by the model.
     settings : mapping, optional
         What was compared and how (files, reference system, model, options); mappings may be nested.
-    unit : str
-        Unit of the coordinates, for scales and axes.
-    date : str, optional
-        The date to print; by default today, or ``SOURCE_DATE_EPOCH`` where the environment sets it.
 
     Returns
     -------
@@ -119,27 +113,25 @@ def write_accuracy_report(
                 found="no " + " and no ".join(missing),
                 cure="Give 'xyz', 'reference' and 'predicted', or none of them",
             )
-        scenes = [("", _maps(accuracy, xyz, reference, predicted, unit))]
+        scenes = [("", _maps(accuracy, xyz, reference, predicted))]
     for one in places[:DRAWN]:
-        drawn = _maps(accuracy, one.xyz, one.reference, one.predicted, unit)
+        drawn = _maps(accuracy, one.xyz, one.reference, one.predicted)
         scenes.append((one.name if len(places) > 1 else "", drawn))
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
     page = render(
         "accuracy.html",
-        date=date,
         title=title,
         subtitle=subtitle,
         a=accuracy,
         scenes=scenes,
         hidden=max(0, len(places) - DRAWN),
-        confidence=_confidence(accuracy),
         importances=[(name, float(share)) for name, share in ordered],
         settings=settings,
     )
     return write_whole(path, page.encode())
 
 
-def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any, unit: str) -> dict[str, Any]:
+def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, Any]:
     """Maps of reference, prediction and errors for the template; none where the points lie on one spot or in a line."""
     points = np.asarray(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -172,7 +164,7 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any, unit: str) -> d
     length = nice_step(wide * s.pixel / 6)
 
     def picture(colors: npt.NDArray[np.uint8], heading: str, alt: str) -> dict[str, Any]:
-        scale = (100 * length / (wide * s.pixel), f"{length:g} {unit}")
+        scale = (100 * length / (wide * s.pixel), f"{length:g} m")
         return {"heading": heading, "alt": alt, "scale": scale, **embedded(paint(s, colors, light))}
 
     def classes(codes: npt.NDArray[Any], heading: str, word: str) -> dict[str, Any]:
@@ -189,8 +181,8 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any, unit: str) -> d
     palette = np.array([class_color(code) for code in there], np.uint8)
     return {
         **out,
-        "caption": f"{len(points):,} points, {wide * s.pixel:,.0f} x {tall * s.pixel:,.0f} {unit}, north up; lower left "
-        f"corner: x {s.x0:.0f}, y {s.y0:.0f}. Each pixel of {s.pixel:.2g} {unit} shows its highest point; on the map of "
+        "caption": f"{len(points):,} points, {wide * s.pixel:,.0f} x {tall * s.pixel:,.0f} m, north up; lower left "
+        f"corner: x {s.x0:.0f}, y {s.y0:.0f}. Each pixel of {s.pixel:.2g} m shows its highest point; on the map of "
         "errors a wrong point lies above right ones.",
         "classes": [(class_color(code), f"{code} {a.name(code)}") for code in there],
         "verdicts": [(RIGHT, "right"), (WRONG, "wrong"), (IGNORED, "not compared")][: 2 + (n < len(points))],
@@ -201,29 +193,3 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any, unit: str) -> d
         ],
         "in_a_row": wide < 1.7 * tall,
     }
-
-
-def _confidence(a: Accuracy) -> list[dict[str, Any]]:
-    """Tables of how well reliability and margin tell where the classifier is wrong: a share of each group as a bar."""
-    out = []
-    if (g := a.reliability) is not None and g.points:
-        rows = [
-            (f"{100 * b['lower']:.0f} to {100 * b['upper']:.0f}", b["points"], b["share_right"])
-            for b in g.curve()
-            if b["points"]
-        ]
-        caption = (
-            f"Share of right points by the winning probability. Mean reliability {percent(g.mean, 1)} %, expected "
-            f"calibration error {percent(g.expected_calibration_error(), 1)} %."
-        )
-        titles = ["Reliability %", "Points", "Right %"]
-        out.append({"heading": "Reliability", "caption": caption, "titles": titles, "rows": rows})
-    if (g := a.margin) is not None and g.points:
-        rows = [
-            (f"{100 * d['lower']:.1f} to {100 * d['upper']:.1f}", d["points"], d["share_wrong"])
-            for d in g.quantiles()
-        ]
-        caption = "Share of wrong points by the winning probability minus the second."
-        titles = ["Margin %", "Points", "Wrong %"]
-        out.append({"heading": "Errors against margin", "caption": caption, "titles": titles, "rows": rows})
-    return out

@@ -16,12 +16,12 @@ from ..base.messages import plain
 from ..base.version import __version__
 
 
-def render(template: str, *, date: str | None = None, **context: Any) -> str:
+def render(template: str, **context: Any) -> str:
     """A page from a template of ``templates/``, whose every value is escaped: a `title`, maybe a `subtitle`, and its own.
 
     The date is today's by default, or ``SOURCE_DATE_EPOCH`` where the environment sets it.
     """
-    context = {"subtitle": "", "version": __version__, "date": date or _today(), **context}
+    context = {"subtitle": "", "version": __version__, "date": _today(), **context}
     page = _templates().get_template(template).render(context)
     return plain(
         page.encode(errors="backslashreplace").decode()
