@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -87,14 +87,10 @@ class TrainingCloud:
         return self.having(some, name=name, survey=self.flight, copy=copy)
 
 
-#: A training cloud, or a function that makes it when it is its turn.
-CloudSource = TrainingCloud | Callable[[], TrainingCloud]
-
-
-def prepared(sources: Iterable[CloudSource], options: TrainingOptions) -> Iterator[TrainingCloud]:
+def prepared(sources: Iterable[TrainingCloud], options: TrainingOptions) -> Iterator[TrainingCloud]:
     """The clouds without ignored points and with one point per voxel, each followed by its thinned copies."""
     for source in sources:
-        cloud = _cleaned(source() if callable(source) else source, options)
+        cloud = _cleaned(source, options)
         yield cloud
         there = density(cloud.xyz)
         for wanted in options.thin:

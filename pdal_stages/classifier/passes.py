@@ -206,7 +206,7 @@ class PassRun:
         features, mask = self._features[place], self._wanted[place]
         later = features in self._features[place + 1 :]
         context = self._context_at(place, band) if place else None
-        rows = self._strips.rows(band)
+        rows = self._strips.rows(band[0])
         rows = rows if mask is None else rows[mask[rows]]
 
         def result(values: Any, rows: npt.NDArray[np.int64]) -> Any:
@@ -236,14 +236,13 @@ class PassRun:
     def _context_at(self, place: int, band: Band) -> Callable[..., npt.NDArray[np.float32]]:
         """What gives the context of rows of a band, by what the pass before said of it and the strips beside it."""
         context, shares = self._members[place].context, self._shares[place - 1]
-        window = self._strips.window(band)
-        xyz = self._request.xyz[self._strips.rows_at(window)]
-        columns = context.columns_of(xyz, shares[window], self._request.threads)
-        return lambda rows: columns(self._strips.places(rows) - window.start)
+        xyz = self._request.xyz[self._strips.rows(band[1])]
+        columns = context.columns_of(xyz, shares[band[1]], self._request.threads)
+        return lambda rows: columns(self._strips.places(rows) - band[1].start)
 
 
-#: The first strip of a band, and the one after its last.
-Band = tuple[int, int]
+#: Places of the points of a band, and of these and the strips beside it.
+Band = tuple[slice, slice]
 
 
 class Strips:
@@ -276,25 +275,17 @@ class Strips:
 
     def bands(self) -> list[Band]:
         """Strips that are worked on together."""
-        points = self._start[1:]
-        out, first = [], 0
-        while first < len(points):
-            end = int(np.searchsorted(points, self._start[first] + BAND, side="right"))
-            out.append((first, max(end, first + 1)))
-            first = out[-1][1]
+        start, last, out, first = self._start, len(self._start) - 1, [], 0
+        while first < last:
+            end = max(first + 1, int(np.searchsorted(start, start[first] + BAND, side="right")) - 1)
+            beside = slice(start[max(first - 1, 0)], start[min(end + 1, last)])
+            out.append((slice(start[first], start[end]), beside))
+            first = end
         return out
 
-    def rows(self, band: Band) -> npt.NDArray[np.int64]:
-        """The points of a band."""
-        return self.rows_at(slice(self._start[band[0]], self._start[band[1]]))
-
-    def rows_at(self, part: slice) -> npt.NDArray[np.int64]:
+    def rows(self, part: slice) -> npt.NDArray[np.int64]:
         """The points at some places."""
         return np.arange(part.start, part.stop) if self._order is None else self._order[part]
-
-    def window(self, band: Band) -> slice:
-        """Places of the points of a band and of the strips beside it."""
-        return slice(self._start[max(band[0] - 1, 0)], self._start[min(band[1] + 1, len(self._start) - 1)])
 
     def places(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Where points lie in this order."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from .algorithms import trainer
-from .clouds import CloudSource, TiledCloud, TrainingCloud, prepared, spooled
+from .clouds import TiledCloud, TrainingCloud, prepared, spooled
 from .context import Context
 from .dimensions import ALWAYS, WHERE_THERE, preparing, required
 from .model import Model
@@ -21,7 +21,7 @@ from .trainoptions import TrainingOptions, feature_plan
 
 
 def train(
-    clouds: TrainingCloud | Iterable[CloudSource] | npt.ArrayLike,
+    clouds: TrainingCloud | Iterable[TrainingCloud] | npt.ArrayLike,
     labels: npt.ArrayLike | TrainingOptions | None = None,
     options: TrainingOptions | None = None,
     *,
@@ -32,10 +32,10 @@ def train(
 
     Parameters
     ----------
-    clouds : (n, 3) array, TrainingCloud, iterable of TrainingCloud, or of functions that make one
+    clouds : (n, 3) array, TrainingCloud, or iterable of TrainingCloud
         Coordinates in meters of points that have `labels`; or one cloud per file or view. Features see only their own
-        cloud. Where functions are given, or anything but a list or tuple, one cloud at a time is in memory; all are
-        kept in a temporary folder while training lasts.
+        cloud. Of anything but a list or tuple one cloud at a time is in memory; all are kept in a temporary folder while
+        training lasts.
     labels : (n,) int, optional
         Class codes, with coordinates; the options may stand here otherwise.
     options : TrainingOptions
@@ -60,9 +60,8 @@ def train(
             dimensions, options, preparation = _prepared(xyz, labels, options)
         sources = [TrainingCloud(xyz, labels, dimensions)]
     with tempfile.TemporaryDirectory(prefix="pdal-stages-") as folder:
-        at_hand = isinstance(sources, list | tuple) and not any(callable(one) for one in sources)
         each = prepared(sources, options)
-        made = list(each) if at_hand else spooled(each, Path(folder))
+        made = list(each) if isinstance(sources, list | tuple) else spooled(each, Path(folder))
         if not made:
             raise OptionError("no training cloud was given")
         model = trainer(options.algorithm).train(made, options, progress)
