@@ -152,7 +152,9 @@ class AdaptiveNeighborhoods:
         shapes = shapes_of(self.chosen, points, seed, None)
         for search in self.searches:
             self.choose(search, points, copt_threshold, shapes)
-        return {} if shapes is None else _values(self.chosen, shapes)
+        if shapes is None:
+            return {}
+        return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes}
 
     def fill(
         self,
@@ -234,10 +236,6 @@ def _searches(chosen: list[Columns], least: int) -> list[Search]:
         found.append(search)
     around = any(name in columns.at for columns in chosen for name in SURFACES)
     return ([_by_number(ranges, around)] if ranges else []) + found
-
-
-def _values(chosen: list[Columns], shapes) -> dict[str, np.ndarray]:
-    return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(chosen) if c.shapes}
 
 
 @njit

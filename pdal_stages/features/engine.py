@@ -290,18 +290,16 @@ class Run:
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)
-        found = self._dimensions_at(positions)
+        if callable(self.dimensions):
+            found = self.dimensions(positions if self.indices is None else self.indices[positions])
+        else:
+            found = {name: given[positions] for name, given in self.dimensions.items()}
         for column, name in enumerate(plan.dimensions, width - len(plan.dimensions)):
             given = found.get(name)
             values[:, column] = (
                 {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last] if given is None else given
             )
         return positions, values, tally
-
-    def _dimensions_at(self, positions: np.ndarray) -> Mapping[str, np.ndarray]:
-        if callable(self.dimensions):
-            return self.dimensions(positions if self.indices is None else self.indices[positions])
-        return {name: values[positions] for name, values in self.dimensions.items()}
 
     def blocks(
         self, progress: Progress | bool | None, apply: Callable[[np.ndarray, np.ndarray], Any] | None = None

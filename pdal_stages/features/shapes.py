@@ -273,24 +273,12 @@ def pull(record, n, gx, gy, gz, seed, work):
 @device(fastmath={"reassoc", "nsz"})  # sums of ones, exact in any order: what lets LLVM vectorize them
 def count_above(values, t, above):
     """How many of each metric's values lie above each of nine thresholds (no scatter: compare and add)."""
-    one, zero = np.float32(1.0), np.float32(0.0)
     for m in range(5):
-        t0, t1, t2, t3, t4 = t[m, 0], t[m, 1], t[m, 2], t[m, 3], t[m, 4]
-        t5, t6, t7, t8 = t[m, 5], t[m, 6], t[m, 7], t[m, 8]
-        c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = zero
-        for i in range(ROOM):
-            v = values[m * ROOM + i]
-            c0 += one if v > t0 else zero
-            c1 += one if v > t1 else zero
-            c2 += one if v > t2 else zero
-            c3 += one if v > t3 else zero
-            c4 += one if v > t4 else zero
-            c5 += one if v > t5 else zero
-            c6 += one if v > t6 else zero
-            c7 += one if v > t7 else zero
-            c8 += one if v > t8 else zero
-        above[m, 0], above[m, 1], above[m, 2], above[m, 3], above[m, 4] = c0, c1, c2, c3, c4
-        above[m, 5], above[m, 6], above[m, 7], above[m, 8] = c5, c6, c7, c8
+        for b in range(9):
+            threshold, count = t[m, b], np.float32(0.0)
+            for i in range(ROOM):
+                count += np.float32(1.0) if values[m * ROOM + i] > threshold else np.float32(0.0)
+            above[m, b] = count
 
 
 @njit
