@@ -50,8 +50,12 @@ class Prediction:
     #: (n,) variance of a class's probability over a network's batches, mean over the classes
     variance: npt.NDArray[np.float32] | None
     classified: int  #: points looked at
-    rejected: int  #: those of them that were not reliable enough
+    unsure: npt.NDArray[np.int64]  #: (m,) those of them that were not reliable enough, and so rejected
     report: Report  #: counts, notes and warnings for the metadata
+
+    @property
+    def rejected(self) -> int:
+        return len(self.unsure)
 
 
 def decide(
@@ -114,4 +118,4 @@ def judged(
     )
     whole.merge(report)
     more = {name: out.get(name) for name in ("margin", "probabilities", "variance")}
-    return Prediction(code, out["reliability"], **more, classified=count, rejected=len(low), report=whole)
+    return Prediction(code, out["reliability"], **more, classified=count, unsure=low, report=whole)

@@ -12,7 +12,7 @@ from ..base.asprs import HIGH as HIGH_VEGETATION
 from ..base.asprs import LOW, MEDIUM, bands, by_height
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
-from ..classifier import Model, Prediction
+from ..classifier import Model
 from ..classifier.deciding import UNCLASSIFIED
 from ..classifier.modelfile import find
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
@@ -145,9 +145,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     @cached_property
     def limits(self) -> dict[int, Limit] | None:
         """How sure points of each class must be to keep it, with `keep_sure`."""
-        if self.keep_sure is None:
-            return None
-        return self.sureness.limits(self.keep_sure)
+        return None if self.keep_sure is None else self.sureness.limits(self.keep_sure)
 
     @property
     def sureness(self) -> Sureness:
@@ -246,13 +244,14 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 variance=self.variance,
                 reject_below=self.reject_below,
                 rejected_code=self._rejected,
-                limits=None
-                if self.limits is None
-                else {c: one.reliability for c, one in self.limits.items()},
+                limits={code: one.reliability for code, one in (self.limits or {}).items()},
                 progress=progress,
             )
+        rejected = np.zeros(points.count, np.bool_)
+        rejected[found.unsure] = True
         if self.bands:
-            self._split_vegetation(points, found, wanted, self.bands)
+            by_height(found.classification, wanted & ~rejected, self.take(points, HEIGHT), self.bands)
+            found.report.figures["classes"] = class_counts(found.classification[wanted])
         values: dict[str, NDArray] = {
             "Classification": found.classification,
             "Reliability": found.reliability,
@@ -275,26 +274,11 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 if name != "Classification":
                     values[name] = np.where(points.mask, values[name], points.arrays[name])
         values["Classification"] = points.with_codes(values["Classification"])
-        if self.reject_below is not None:
-            low = wanted & (found.reliability < np.float32(self.reject_below))
-            points.report.figures["rejected"] = points.counted(low)
-        elif self.limits is not None and self._rejected not in dict(self.model.classes):
-            points.report.figures["rejected"] = points.counted(
-                wanted & (found.classification == self._rejected)
-            )
+        if self.reject_below is not None or self.limits is not None:
+            points.report.figures["rejected"] = points.counted(rejected)
         points.report.merge(found.report)
         points.report.figures["outside_where"] = points.counted(~inside)
         return values
-
-    def _split_vegetation(
-        self, points: Points, found: Prediction, wanted: NDArray[np.bool_], limits: tuple[float, float]
-    ) -> None:
-        """Low and medium vegetation by height, where the model called a point vegetation."""
-        given = wanted
-        if self.reject_below is not None:
-            given = wanted & (found.reliability >= np.float32(self.reject_below))
-        by_height(found.classification, given, self.take(points, HEIGHT), limits)
-        found.report.figures["classes"] = class_counts(found.classification[wanted])
 
     def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
         """Before any work: codes that points keep must fit the file, as those do that the model gives."""
