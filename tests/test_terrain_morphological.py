@@ -222,7 +222,7 @@ def slow_plateaus(ground, raster, cell):
     return taken
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_plateaus_equal_the_slow_reference(seed):
     rng = np.random.default_rng(seed)
     h, w = 40, 44
@@ -282,19 +282,17 @@ def forest_on_a_slope(slope, turn=0.0, scarp=0.0, seed=0):
     return x, y, z + np.where(hit, crowns[at] * share, 0.0), ~hit
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_steep_wooded_slope_is_no_plateau(seed):
+def test_a_steep_wooded_slope_is_no_plateau():
     """From cells of ground that are not linked to the others it goes down in all directions, but up as well."""
-    x, y, z, ground = forest_on_a_slope(1.0, seed=seed)
+    x, y, z, ground = forest_on_a_slope(1.0)
     found = filtered_ground(x, y, z)
     assert found["Ground"][ground].mean() > 0.99
     assert np.abs(found["HeightAboveGround"][ground]).mean() < 0.2
 
 
-@pytest.mark.parametrize("slope", [0.46, 0.7])
-def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground(slope):
+def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground():
     """All windows round it reach below the scarp, as there is nothing uphill to center others on."""
-    x, y, z, ground = forest_on_a_slope(slope, 0.5, 12.0)
+    x, y, z, ground = forest_on_a_slope(0.46, 0.5, 12.0)
     found = filtered_ground(x, y, z)
     assert (found["Ground"][ground] == 0).mean() < 0.03
     assert (np.abs(found["HeightAboveGround"][ground]) > 1).mean() < 0.02
@@ -334,7 +332,7 @@ def test_a_hall_of_150_meters_and_a_ridge():
     assert (np.abs(filtered_ground(x, y, ridge)["HeightAboveGround"]) < 1).mean() > 0.98
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.integers(-40, 40))
 def test_order_and_shifts_by_whole_cells_change_nothing(seed, n, cells):
     rng = np.random.default_rng(seed)
@@ -346,8 +344,8 @@ def test_order_and_shifts_by_whole_cells_change_nothing(seed, n, cells):
     same(filtered_ground(x + 32 * cells, y - 32 * cells, z, **SMALL), found)
 
 
-@pytest.mark.parametrize("origin", [(0.0, 0.0), (-47.0, -200.0), (770_500.0, 6_277_550.0)])
-def test_a_tile_with_its_halo_gives_the_same_bits(origin):
+def test_a_tile_with_its_halo_gives_the_same_bits():
+    origin = -47.0, -200.0
     x, y, z, _ = town(2, side=1240, density=0.2, origin=origin)
     options = {**SMALL, "window": 6.0}
     halo = reach(window=6.0, openings=(5, 9))
@@ -388,12 +386,12 @@ def test_pieces_and_threads_change_nothing(monkeypatch):
     assert again == figures
 
 
-@pytest.mark.parametrize("spacing", [40, 110, 250])
+@pytest.mark.parametrize("spacing", [40, 250])
 def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spacing):
     """Groups of points that no step of the filter sees across are worked on apart: as on one raster."""
     rng = np.random.default_rng(spacing)
-    n = 3000
-    cluster = rng.uniform(0, 15 * spacing, (2, 60))[:, rng.integers(0, 60, n)]
+    n = 800
+    cluster = rng.uniform(0, 8 * spacing, (2, 16))[:, rng.integers(0, 16, n)]
     x, y = np.round(cluster + rng.normal(0, 4, (2, n)) - 700.0, 2)
     z = np.round(0.1 * x + rng.choice([0.0, 6.0, -20.0], n, p=[0.7, 0.29, 0.01]) + rng.normal(0, 0.1, n), 2)
     mask = rng.random(n) < 0.95
@@ -419,8 +417,8 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
         same(filtered_ground(x, y, z, figures=again, **options), whole)
         assert again == figures
         if spacing == 250:
-            assert len(shapes) > 20
-            assert sum(shapes) < 0.1 * 15**2 * spacing**2
+            assert len(shapes) > 5
+            assert sum(shapes) < 0.1 * 8**2 * spacing**2
 
 
 def test_cost_of_strays_follows_their_number():
@@ -504,7 +502,7 @@ def test_sizes_and_shapes_are_checked():
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("name", ["samp12", "samp21", "samp31", "samp54"])
+@pytest.mark.parametrize("name", ["samp12", "samp31"])
 def test_ground_of_real_clouds(data_dir, name):
     import laspy
 
