@@ -21,8 +21,8 @@ from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.classify import ClassifyTask, one_format
 from pdal_stages.tiling.grid import TileGrid, inside, touching
-from pdal_stages.tiling.inputs import InputSource, find_sources, las_extent
-from pdal_stages.tiling.pieces import CloudIndex, cut_all, sort_points
+from pdal_stages.tiling.inputs import CloudIndex, InputSource, find_sources, las_extent
+from pdal_stages.tiling.pieces import cut_all, sort_points
 
 pytestmark = pytest.mark.pdal
 

@@ -21,8 +21,8 @@ import numpy as np
 from ..stages import registry
 from ..stages.base import Stage
 from .grid import Box, TileGrid
-from .inputs import InputSource
-from .pieces import CloudIndex, Piece, cut_all
+from .inputs import CloudIndex, InputSource
+from .pieces import Piece, cut_all
 from .plan import FirstRound, TilePlan
 from .store import load_arrays, save_arrays, written
 from .tile import Changed, FromBefore, RunContext, run_first

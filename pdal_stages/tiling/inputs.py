@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base import las, lascheck, strictjson
 from ..base.errors import OptionError, PipelineError, StageError
@@ -26,7 +27,6 @@ from .settings import Density, Extent, TilingOptions, block_bytes, settled
 from .store import fingerprint
 
 if TYPE_CHECKING:
-    from .pieces import CloudIndex
     from .plan import TilePlan
 
 #: Bytes of an EPT source's description at most.
@@ -196,6 +196,24 @@ def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
 
 
 # ---- all of them ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CloudIndex:
+    """Where the points of a file lie."""
+
+    count: int
+    box: Box  #: of all points
+    tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
+    cells: NDArray[np.int64]  #: (n, 4): column, row, place of the first point in the copy, number of points
+    copy: str  #: the file with the points
+
+    @classmethod
+    def of(cls, record: dict[str, Any], copy: str) -> CloudIndex:
+        """From what :func:`sort_points` found."""
+        cells = np.array(record["cells"], np.int64).reshape(-1, 4)
+        tiles = [(i, j, n) for i, j, n in record["tiles"]]
+        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, copy)
 
 
 class Survey:

@@ -21,7 +21,7 @@ from ..base.arrays import begins_run
 from ..base.errors import StageError
 from ..pipeline.parts import las_chunks
 from .grid import Box, TileGrid, check_number
-from .inputs import InputSource, fetch_ept
+from .inputs import CloudIndex, InputSource, fetch_ept
 
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
     import laspy
@@ -71,24 +71,6 @@ def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]
 
 
 # ---- the copy, sorted by place -------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class CloudIndex:
-    """Where the points of a file lie."""
-
-    count: int
-    box: Box  #: of all points
-    tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
-    cells: NDArray[np.int64]  #: (n, 4): column, row, place of the first point in the copy, number of points
-    copy: str  #: the file with the points
-
-    @classmethod
-    def of(cls, record: dict[str, Any], copy: str) -> CloudIndex:
-        """From what :func:`sort_points` found."""
-        cells = np.array(record["cells"], np.int64).reshape(-1, 4)
-        tiles = [(i, j, n) for i, j, n in record["tiles"]]
-        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, copy)
 
 
 def _copy_type(header: laspy.LasHeader) -> np.dtype:

@@ -26,9 +26,9 @@ from ..pipeline.run import Pipeline
 from ..pipeline.workers import run_tasks
 from .cluster import open_workers
 from .ground import BlockTask, FirstRoundTask, block_file, blocks_around, from_before, left_file, tiles_around
-from .inputs import InputSource, Survey
+from .inputs import CloudIndex, InputSource, Survey
 from .outputs import FileTask
-from .pieces import CloudIndex, sort_points
+from .pieces import sort_points
 from .plan import TilePlan, make_plan, outputs_for
 from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .settings import TilingOptions, worker_bytes

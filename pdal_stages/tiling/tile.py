@@ -24,9 +24,9 @@ from ..stages.base import Left
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import TOUCH_NONE
 from .grid import Box, TileGrid, inside
-from .inputs import InputSource
+from .inputs import CloudIndex, InputSource
 from .outputs import PieceResults, changed_in, class_counts, flags_in_classes, save_results, write_tile
-from .pieces import CloudIndex, Piece, cut_all
+from .pieces import Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
 from .report import left_alone
 from .store import written
