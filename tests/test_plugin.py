@@ -16,7 +16,6 @@ from pathlib import Path
 
 import laspy
 import pytest
-from conftest import QUICK
 
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
@@ -172,7 +171,12 @@ def test_objects_are_written(pipeline, town, tmp_path):
 
 
 READY = {
-    "train": ["--stage.model.filename=m.model", *QUICK],
+    "train": [
+        "--stage.model.filename=m.model",
+        "--stage.model.neighborhoods=c2,s2",
+        "--stage.model.count=300",
+        "--stage.model.trees=10",
+    ],
     "evaluate": ["--stage.classifier.model=MODEL", "--stage.output.filename=o.laz", "--stage.accuracy.json=a.json",
                  "--stage.accuracy.html=a.html"],
     "classify-on-smrf-ground": ["--stage.classifier.model=SMRF", "--stage.output.filename=o.laz"],
