@@ -10,12 +10,11 @@ are whole numbers and all reaches are bounded (:data:`REACH`), so neither the or
 from __future__ import annotations
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 from .cells import cell_numbers
-from .linked import longest_sides
+from .linked import longest_sides, number_sets
 from .patches import patches
 
 #: Side of the cells, and how far apart in height the levels of a cell are at least, meters.
@@ -105,8 +104,8 @@ def _find(xyz, cell, every, high, h, w) -> NDArray[np.bool_]:
     )
     near = (along <= HOP) & good[one]
     linked = near & good[other]
-    pairs = scipy.sparse.coo_array((np.ones(linked.sum()), (one[linked], other[linked])), (count, count))
-    parts, part = scipy.sparse.csgraph.connected_components(pairs, directed=False)
+    part = np.empty(count, np.int64)
+    parts = number_sets(one[linked], other[linked], part)
     good &= (longest_sides(part, np.divmod(cells, w), parts) * CELL >= LONG)[part]
     good[other[near & good[one]]] = True
     return good[level]
