@@ -38,9 +38,8 @@ class TrainingCloud:
     #: name to (n,) values, as the options' `dimensions` need
     dimensions: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
     name: str = "cloud"  #: for messages and the model file; a path is cut to its last part
-    mask: npt.ArrayLike | None = (
-        None  #: (n,) bool, points samples may be drawn from; all points serve as neighbors
-    )
+    #: (n,) bool, points samples may be drawn from; all points serve as neighbors
+    mask: npt.ArrayLike | None = None
     survey: str | None = None  #: the flight it belongs to; by default it is one of its own
     copy: str = ""  #: which of the survey's copies it is, where there are several
     own: npt.ArrayLike | None = None  #: (n,) bool, of a tile its own points; the others are only neighbors

@@ -27,9 +27,8 @@ class PredictionOptions:
     variance: bool = False  #: only a network has it
     reject_below: float | None = None  #: points less reliable do not get the winning class, and are counted
     rejected_code: int | None = None  #: class of rejected points, instead of their old one
-    limits: Mapping[int, float] | None = (
-        None  #: as `reject_below`, for points of each class; the larger one counts
-    )
+    #: as `reject_below`, for points of each class; the larger one counts
+    limits: Mapping[int, float] | None = None
 
     def __post_init__(self) -> None:
         checks.number("'memory_mb'", self.memory_mb, 1, unit="MB")

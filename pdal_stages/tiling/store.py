@@ -50,9 +50,8 @@ class Store:
             for folder in (self.folder, self.kept, self.scratch.parent):
                 with contextlib.suppress(FileExistsError):
                     folder.mkdir()
-                if (
-                    folder.is_symlink() or not folder.is_dir()
-                ):  # nothing is written or removed where a link leads
+                # Nothing is written or removed where a link leads.
+                if folder.is_symlink() or not folder.is_dir():
                     raise StageError(
                         "the run's own folder beside the outputs is a link or a file",
                         found=str(folder),
@@ -60,9 +59,8 @@ class Store:
                     )
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
             lock = os.open(self.folder / "lock", flags, 0o622)
-            if hasattr(
-                os, "fchmod"
-            ):  # who can read a lock can hold it, so those may who can write, and nobody else
+            # Who can read a lock can hold it, so those may who can write, and nobody else.
+            if hasattr(os, "fchmod"):
                 writers = os.fstat(lock).st_mode & 0o022
                 with contextlib.suppress(OSError):  # of another user, whose folder this is
                     os.fchmod(lock, 0o600 | writers | writers << 1)

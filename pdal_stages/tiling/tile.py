@@ -89,9 +89,8 @@ def run_head(
         for mark, changed in zip(marks, before.changed, strict=True):
             mark.changed = changed
     from_afar = None
-    reaches: dict[
-        int, float
-    ] = {}  # numbers of open-ended stages: meters outside the tile that their results are used
+    # Numbers of open-ended stages: meters outside the tile within which their results are used.
+    reaches: dict[int, float] = {}
     needs = [0.0]
     views: list[dict[str, NDArray]] = []  # of the tile's own points: far less than all arrays of all points
     places: list[NDArray[np.float64]] = []  # of all: X, Y, Z and how far outside the tile
