@@ -261,8 +261,11 @@ def write_las():
 
 # ---- what the ready pipelines read and apply ---------------------------------------------------------------
 
-#: Smaller than the files say; the stages are the same.
-QUICK = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stage.model.trees=10"]
+
+@pytest.fixture(scope="session")
+def quick() -> list[str]:
+    """Words for those that train: a smaller model than the files say; the stages are the same."""
+    return ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stage.model.trees=10"]
 
 
 @pytest.fixture(scope="session")
@@ -290,7 +293,7 @@ def ready_halves(ready_town, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def ready_models(ready_town, tmp_path_factory) -> Path:
+def ready_models(ready_town, quick, tmp_path_factory) -> Path:
     """A folder with the models that ready pipelines apply, trained by those that train."""
     from pdal_stages.pipeline.overrides import parse_overrides
     from pdal_stages.pipeline.run import Pipeline
@@ -300,7 +303,7 @@ def ready_models(ready_town, tmp_path_factory) -> Path:
         words = [
             f"--stage.input.filename={ready_town}",
             f"--stage.model.filename={folder / file}.model",
-            *QUICK,
+            *quick,
         ]
         Pipeline(ROOT / "pipelines" / f"{name}.json", parse_overrides(words)[0]).execute()
     return folder

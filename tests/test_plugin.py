@@ -171,12 +171,7 @@ def test_objects_are_written(pipeline, town, tmp_path):
 
 
 READY = {
-    "train": [
-        "--stage.model.filename=m.model",
-        "--stage.model.neighborhoods=c2,s2",
-        "--stage.model.count=300",
-        "--stage.model.trees=10",
-    ],
+    "train": ["--stage.model.filename=m.model"],
     "evaluate": ["--stage.classifier.model=MODEL", "--stage.output.filename=o.laz", "--stage.accuracy.json=a.json",
                  "--stage.accuracy.html=a.html"],
     "classify-on-smrf-ground": ["--stage.classifier.model=SMRF", "--stage.output.filename=o.laz"],
@@ -186,12 +181,12 @@ READY = {
 
 @pytest.mark.parametrize("name", READY)
 def test_a_ready_pipeline_gives_the_same_bytes(
-    pipeline, town, ready_halves, ready_models, tmp_path, name, monkeypatch
+    pipeline, town, quick, ready_halves, ready_models, tmp_path, name, monkeypatch
 ):
     for door in ("stock", "ours"):
         (tmp_path / door).mkdir()
         source = ready_halves / "*.laz" if name == "tiles-to-tiles" else town
-        words = [f"--stage.input.filename={source}", *READY[name]]
+        words = [f"--stage.input.filename={source}", *READY[name], *(quick if name == "train" else ())]
         names = {"MODEL": ready_models / "classes.model", "SMRF": ready_models / "smrf.model"}
         for word, path in names.items():
             words = [one.replace(word, str(path)) for one in words]
