@@ -57,9 +57,8 @@ class Level(_Checked):
     samples: int = _whole(1, 1024)  #: points taken from a ball
     #: widths of the shared perceptron over a ball's points; the maximum over the points follows
     mlp: tuple[int, ...] = _checked(_widths)
-    up: tuple[int, ...] = _checked(
-        _widths
-    )  #: of the shared perceptron after interpolation to the level above
+    #: of the shared perceptron after interpolation to the level above
+    up: tuple[int, ...] = _checked(_widths)
 
 
 @dataclass(frozen=True)
@@ -239,9 +238,8 @@ class NetworkOptions(_Checked):
     #: batches whose class shares have a standard deviation of this or more (per cent) are not trained on: they hold next
     #: to nothing but one class [WM19: 20 %]; 100: all are used
     histogram_threshold: float = _number(0.0, 100.0, default=20.0)
-    augment: bool = _checked(
-        checks.flag, default=True
-    )  #: turn, move, shake and thin each batch, anew in each epoch
+    #: turn, move, shake and thin each batch, anew in each epoch
+    augment: bool = _checked(checks.flag, default=True)
     #: share of the ground held out, in whole blocks, to choose the best epoch; 0: none
     validation: float = _number(0.0, 0.5, default=0.2)
     block_size: float = _number(0.1, 1e6, default=25.0)  #: side of those blocks, meters

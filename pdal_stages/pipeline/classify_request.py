@@ -122,9 +122,7 @@ class ClassifyRequest:
                 cure="Write a pipeline: the reader, these stages with their options of training, "
                 "filters.modelclassifier, and the writer",
             )
-        prepared = self.loaded.info.get("preparation") or preparation.preparation_of(
-            self.loaded.required_dimensions
-        )
+        prepared = self._prepared
         if self._with_bridges:
             # The last one's heights and flags are those that stay.
             at = max(n for n, stage in enumerate(prepared) if stage["type"] == _DECKS)
@@ -132,14 +130,17 @@ class ClassifyRequest:
         noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
         return [*noise, *prepared, self._classifier, *self._mending]
 
+    @property
+    def _prepared(self) -> list[dict[str, Any]]:
+        """The stages before the classifier, as the model says or its dimensions need."""
+        needed = self.loaded.required_dimensions
+        return self.loaded.info.get("preparation") or preparation.preparation_of(needed)
+
     @cached_property
     def _with_bridges(self) -> bool:
         """Whether decks are looked for: not where the model knows bridges itself, or heights are made otherwise."""
         known = {code for code, _ in self.loaded.classes}
-        made = self.loaded.info.get("preparation") or preparation.preparation_of(
-            self.loaded.required_dimensions
-        )
-        there = any(stage["type"] == _DECKS for stage in made)
+        there = any(stage["type"] == _DECKS for stage in self._prepared)
         return self.bridges and there and known >= {2, 6} and BRIDGE not in known and not self._by_class
 
     @property

@@ -25,7 +25,7 @@ from .las_output import check_copc, check_writers, files_with_flags_to_split, fl
 from .read import PipelineSource
 from .runtime import TRAMPOLINE, made, place, python_filter
 
-#: Options of every PDAL stage that a expanded stage hands on.
+#: Options of every PDAL stage that an expanded stage hands on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
 #: Stages after which several views are what the user asked for.
 _SPLITS = {f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns")}

@@ -1,4 +1,4 @@
-"""Where a expanded stage arrives inside PDAL: from ``filters.python``'s globals to a stage's run().
+"""Where an expanded stage arrives inside PDAL: from ``filters.python``'s globals to a stage's run().
 
 The script that PDAL executes is a few lines that call :func:`run_stage`; everything else
 lives here, in the installed package, where compiled code can be cached.
@@ -26,7 +26,7 @@ from ..stages.points import Points
 from . import interrupts
 from . import pdal as pdal_env
 
-#: What ``source`` of a expanded stage holds. PDAL sets the globals before each call.
+#: What ``source`` of an expanded stage holds. PDAL sets the globals before each call.
 TRAMPOLINE = """\
 def stage(ins, outs):
     try:
@@ -122,7 +122,7 @@ def points_of_views(
 
 
 def _made_again(arguments: Mapping[str, Any]) -> Stage:
-    """The stage of a expanded pipeline that runs in another process than the one that expanded it."""
+    """The stage of an expanded pipeline that runs in another process than the one that expanded it."""
     kind = registry.get(arguments["stage"])
     stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
     stage.makes_again = arguments.get("makes_again", False)
@@ -234,7 +234,7 @@ def _redirected() -> bool:
 
 
 def collect(label: str) -> tuple[list[Report], StageError | None]:
-    """Reports (one per point view) and the failure of a expanded stage, which are then forgotten."""
+    """Reports (one per point view) and the failure of an expanded stage, which are then forgotten."""
     return _reports.pop(label, []), _failures.pop(label, None)
 
 
