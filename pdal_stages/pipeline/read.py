@@ -156,7 +156,7 @@ def _check_values(stage: Any, where: str) -> None:
     try:
         text = json.dumps(stage, allow_nan=False, ensure_ascii=False, default=str)
         text.encode()
-        if "\\u0000" in text:
+        if "\\u0000" in text.replace("\\\\", ""):  # a backslash before it makes it a text
             raise ValueError("a text holds a NUL character")
     except UnicodeEncodeError as error:
         found = ascii(error.object[max(0, error.start - 40) : error.end])

@@ -129,3 +129,9 @@ def test_comments_between_change_nothing(texts, data):
     read = parse_pipeline("".join(data.draw(comment) + part for part in parts) + data.draw(comment) + "]")
     assert read.stages == texts
     assert read.lines == sorted(read.lines)
+
+
+def test_an_escape_that_is_written_out_is_a_text():
+    assert parse_pipeline(json.dumps(["\\u0000", "\\\\u0000"])).stages == ["\\u0000", "\\\\u0000"]
+    with pytest.raises(StageError, match="NUL"):
+        parse_pipeline(json.dumps(["\\\0"]))
