@@ -1,12 +1,10 @@
-"""Run by QGIS's own Python, for what `qgis_process` cannot do: cancel, styles, parameters. Prints one JSON object.
+"""Run by QGIS's own Python, for what `qgis_process` cannot do: styles, parameters. Prints one JSON object.
 
-python3 qgis_session.py FOLDER_OF_THE_PLUGIN cancel|styles|parameters ARGUMENT...
+python3 qgis_session.py FOLDER_OF_THE_PLUGIN styles|parameters ARGUMENT...
 """
 
 import json
 import sys
-import threading
-import time
 
 from qgis.core import QgsApplication, QgsProcessingContext, QgsProcessingFeedback, QgsProject
 
@@ -42,23 +40,6 @@ def start(folder):
     plugin = pdal_stages.classFactory(None)
     plugin.initProcessing()
     return app, plugin
-
-
-def cancel(source, target):
-    """Begin to classify, cancel when the program works."""
-    algorithm = QgsApplication.processingRegistry().algorithmById("pdalstages:classify")
-    feedback, context = Feedback(), QgsProcessingContext()
-
-    def watch():
-        while not any(line.startswith("pdal-stages classify") for line in feedback.lines):
-            time.sleep(0.05)
-        time.sleep(2.0)
-        feedback.cancel()
-
-    threading.Thread(target=watch, daemon=True).start()
-    begun = time.monotonic()
-    _, good = algorithm.run({"INPUT": source, "OUTPUT": target, "MAP": None}, context, feedback)
-    return {"good": good, "seconds": time.monotonic() - begun, "lines": feedback.lines}
 
 
 def styles(objects, terrain, heights, classes):
@@ -105,6 +86,6 @@ def parameters(name):
 if __name__ == "__main__":
     folder, what, *rest = sys.argv[1:]
     app, plugin = start(folder)
-    print(json.dumps({"cancel": cancel, "styles": styles, "parameters": parameters}[what](*rest)), flush=True)
+    print(json.dumps({"styles": styles, "parameters": parameters}[what](*rest)), flush=True)
     plugin.unload()
     app.exitQgis()

@@ -268,6 +268,7 @@ def test_manifests_that_are_no_manifest(good):
         (b"{", "JSON"),
         (b"[1, 2]", "something else"),
         (b'{"a": NaN}', "NaN"),
+        (b'{"a": 1e999}', "too large"),
         (b'{"a": 1, "a": 2}', "duplicate key"),
         (b"[" * 200_000 + b"]" * 200_000, "deep"),
         (b'{"format": "pdal-stages model", "version": 2, "x": ' + b"[" * 900 + b"]" * 900 + b"}", "manifest"),
