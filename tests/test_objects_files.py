@@ -303,7 +303,7 @@ def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path,
     told = json.loads((tmp_path / "run.json").read_text())["objects"]
     assert told["trees"]["objects"] == len(shapes) and told["files"] == [str(target)]
     page = html.read_text()
-    assert "To be checked" in page and "data:image/png" in page and f"<td>{len(shapes)}</td>" in page
+    assert "To be checked" in page and f"<td>{len(shapes)}</td>" in page
     assert not list(tmp_path.glob(".town*"))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..base.errors import StageError
 from ..base.messages import print_messages
-from ..base.outputs import HTML, JSON, Output, check_outputs
+from ..base.outputs import JSON, Output, check_outputs
 from ..tiling.command import add_tile_arguments
 from .parser import INPUTS, OVERRIDES, Parser
 
@@ -174,27 +174,21 @@ def _accuracy(options: argparse.Namespace) -> None:
 def _compare_objects(options: argparse.Namespace) -> None:
     """``accuracy town.gpkg --objects reference.gpkg``."""
     from ..base.files import write_whole
-    from ..reports import objectaccuracy
+    from ..objects.compare import compare_objects, remarks, table, to_json
 
-    if len(options.inputs) != 1 or options.reference or options.overrides:
+    if len(options.inputs) != 1 or options.reference or options.overrides or options.html:
         raise StageError(
-            "--objects compares one vector file with another, and takes --area, --json and --html alone",
-            found=", ".join(options.inputs),
+            "--objects compares one vector file with another, and takes --area and --json alone",
+            found=options.html or ", ".join(options.inputs),
         )
     found, reference = options.inputs[0], options.objects
-    pages = {"json": JSON, "html": HTML}
-    outputs = [Output(path, k, kind) for k, kind in pages.items() if (path := getattr(options, k))]
+    outputs = [Output(options.json, "json", JSON)] if options.json else []
     check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
-    figures, one, two = objectaccuracy.compare_objects(found, reference, options.area)
-    print(objectaccuracy.table(figures), end="")
-    print_messages(*objectaccuracy.remarks(one, two))
+    figures, one, two = compare_objects(found, reference, options.area)
+    print(table(figures), end="")
+    print_messages(*remarks(one, two))
     if options.json:
-        text = json.dumps(objectaccuracy.to_json(figures), indent=1) + "\n"
-        write_whole(options.json, text.encode(), "json")
-    if options.html:
-        write_whole(
-            options.html, objectaccuracy.page(figures, one, two, "Accuracy of objects").encode(), "html"
-        )
+        write_whole(options.json, (json.dumps(to_json(figures), indent=1) + "\n").encode(), "json")
 
 
 def _model(options: argparse.Namespace) -> None:

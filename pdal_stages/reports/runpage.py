@@ -7,13 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..base.asprs import class_name
 from ..base.files import write_whole
 from .page import duration, render
-from .views import embedded
 
 #: Most rows of the table of times.
 ROWS = 200
@@ -36,15 +32,13 @@ _SETTINGS = {
 }
 
 
-def write_run_report(
-    path: str | os.PathLike[str], run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None
-) -> Path:
+def write_run_report(path: str | os.PathLike[str], run: Mapping[str, Any]) -> Path:
     """Write the page of :func:`run_page`, whole or not at all; StageError if it cannot be written."""
-    return write_whole(path, run_page(run, objects).encode())
+    return write_whole(path, run_page(run).encode())
 
 
-def run_page(run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None) -> str:
-    """The page about a tiled run, of which `run` is what ``TiledRun.to_dict`` gives, and `objects` a map of those found."""
+def run_page(run: Mapping[str, Any]) -> str:
+    """The page about a tiled run, of which `run` is what ``TiledRun.to_dict`` gives."""
     done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
     pipeline = f"{Path(run['pipeline']).name}, " if run.get("pipeline") else ""
@@ -59,7 +53,6 @@ def run_page(run: Mapping[str, Any], objects: NDArray[np.uint8] | None = None) -
         slowest=[(t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:ROWS]],
         done=len(done),
         objects={k: one for k, one in (run.get("objects") or {}).items() if k != "files" and one["objects"]},
-        object_map=None if objects is None else embedded(objects),
     )
 
 

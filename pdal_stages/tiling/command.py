@@ -169,7 +169,7 @@ def _end(options: argparse.Namespace, run: TiledRun, again: str) -> int:
         else:
             from ..reports.runpage import write_run_report
 
-            write_run_report(name, run.to_dict(), run.objects.picture if run.objects else None)
+            write_run_report(name, run.to_dict())
     if not again:
         return 1 if run.failures else 0
     states = run.summary["states"]

@@ -87,7 +87,7 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
 def objects_of_outputs(task: ClassifyTask, stage: ObjectsWriter) -> FoundObjects:
     """What ``classify --objects`` does when all is classified."""
     workers = max(1, task.options.local_workers)
-    return _write(outputs_of(task.files, task.output), stage, workers, draw=True)
+    return _write(outputs_of(task.files, task.output), stage, workers)
 
 
 def _write(
@@ -95,9 +95,8 @@ def _write(
     stage: ObjectsWriter,
     workers: int = 1,
     metadata: str | None = None,
-    draw: bool = False,
 ) -> FoundObjects:
-    """Find objects, write them, say what was found; `draw`: also a map."""
+    """Find objects, write them, say what was found."""
     check_target(stage.filename)
     found, units, wkt = _objects_of_files(inputs, stage, workers)
     found, refused = found.without(stage.refuse)
@@ -122,12 +121,7 @@ def _write(
             "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
         write_whole(metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
-    picture = None
-    if draw:
-        from ..reports.objectmap import object_map
-
-        picture = object_map(layers)
-    return FoundObjects(files, summary, picture)
+    return FoundObjects(files, summary)
 
 
 def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:

@@ -7,9 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..base.version import __version__
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import TOUCH_NONE
@@ -77,11 +74,10 @@ class InterruptedRun(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class FoundObjects:
-    """Objects that were found in the outputs: the files they were written to, counts by kind, and a map (h, w, 3)."""
+    """Objects that were found in the outputs: the files they were written to, and counts by kind."""
 
     files: list[str]
     kinds: dict[str, dict[str, Any]]
-    picture: NDArray[np.uint8] | None = None
 
 
 @dataclass
