@@ -18,7 +18,7 @@ import numpy as np
 
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.dimensions import preparing
-from pdal_stages.stages.loading import load_model
+from pdal_stages.classifier.model import load_model
 
 #: File, what its labels become, codes that are dropped.
 SURVEYS = {

@@ -29,7 +29,7 @@ _WHERE = {
     "find_objects": "objects",
     "filtered_ground": "terrain",
     "hag_minima": "terrain",
-    "load_model": "stages.loading",
+    "load_model": "classifier",
     "make_town": "synthetic",
     "object_frames": "reports.objectlayers",
     "object_layers": "reports.objectlayers",
@@ -47,7 +47,7 @@ __all__ = [*_WHERE, "__version__"]
 if TYPE_CHECKING:
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
-    from .classifier import Model, TrainingCloud, TrainingOptions, train
+    from .classifier import Model, TrainingCloud, TrainingOptions, load_model, train
     from .classifier.estimator import PointClassifier
     from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from .pipeline.native import Filter, Writer
     from .reports.accuracypage import write_accuracy_report
     from .reports.objectlayers import object_frames, object_layers
-    from .stages.loading import load_model
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima
     from .tiling import run_tiled

@@ -88,7 +88,7 @@ def test_averages_equal_a_hand_computation():
     xyz, _, dimensions = scene(1500, 20.0)
     net = net_with()
     request = PredictRequest(xyz, dimensions)
-    (found,) = net.predict(request, lambda p: p)
+    ((_, found),) = net.predict(request, lambda p: p)
     columns = scaled(xyz, dimensions, net.inputs, net.mean, net.scale)
     np.testing.assert_allclose(columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5)
     circles = Circles(xyz, TINY.points, net.spacing, columns)
@@ -100,33 +100,27 @@ def test_averages_equal_a_hand_computation():
             each[row].append(p)
     assert [len(part) for part in each] == coverage(circles).tolist()
     for i, part in enumerate(each):
-        np.testing.assert_allclose(found.result[i], np.mean(part, axis=0), rtol=1e-9)
-        np.testing.assert_allclose(found.variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(found[i], np.mean(part, axis=0), rtol=1e-9)
     assert request.report.figures["batches"] == len(circles)
     assert request.report.figures["batches_per_point"]["least"] == coverage(circles).min()
-    assert found.variance[coverage(circles) > 1].max() > 0
 
 
 def test_order_of_points_threads_and_rows_do_not_matter():
     xyz, _, dimensions = scene(2500, 20.0)
     model = model_of(net_with())
-    whole = model.predict(xyz, dimensions, threads=1, probabilities=True, variance=True, margin=True)
+    whole = model.predict(xyz, dimensions, threads=1, probabilities=True, margin=True)
     shuffled = np.random.default_rng(5).permutation(len(xyz))
     other = model.predict(
         xyz[shuffled],
         {k: v[shuffled] for k, v in dimensions.items()},
         threads=2,
         probabilities=True,
-        variance=True,
     )
     assert np.array_equal(whole.probabilities[shuffled], other.probabilities)
-    assert np.array_equal(whole.variance[shuffled], other.variance)
     where = xyz[:, 0] < 7
-    part = model.predict(
-        xyz, dimensions, where, current=np.full(len(xyz), 9), probabilities=True, variance=True
-    )
+    part = model.predict(xyz, dimensions, where, current=np.full(len(xyz), 9), probabilities=True)
     assert np.array_equal(part.probabilities[where], whole.probabilities[where])
-    assert not part.probabilities[~where].any() and not part.variance[~where].any()
+    assert not part.probabilities[~where].any()
     assert (part.classification[~where] == 9).all()
     assert part.report.figures["batches"] < whole.report.figures["batches"]
     top = np.sort(whole.probabilities, axis=1)
@@ -136,23 +130,22 @@ def test_order_of_points_threads_and_rows_do_not_matter():
 def test_a_tile_with_its_halo_gets_the_labels_of_the_whole():
     xyz, _, dimensions = scene(12_000, 60.0, origin=(620000.0, 6270000.0, 100.0))
     model = model_of(net_with())
-    whole = model.predict(xyz, dimensions, probabilities=True, variance=True)
+    whole = model.predict(xyz, dimensions, probabilities=True)
     assert model.halo_m == pytest.approx((3.0 + 0.5**0.5) * 3.0)
     low = xyz.min(axis=0)[:2] + 20.0
     own = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 12.0)).all(axis=1)
     near = ((xyz[:, :2] >= low - model.halo_m) & (xyz[:, :2] < low + 12.0 + model.halo_m)).all(axis=1)
     tile = model.predict(
-        xyz[near], {k: v[near] for k, v in dimensions.items()}, own[near], probabilities=True, variance=True
+        xyz[near], {k: v[near] for k, v in dimensions.items()}, own[near], probabilities=True
     )
     assert np.array_equal(tile.probabilities[own[near]], whole.probabilities[own])
-    assert np.array_equal(tile.variance[own[near]], whole.variance[own])
 
 
 def test_small_and_empty_clouds():
     model = model_of(random_net(("Z",)))
     assert len(model.predict(np.zeros((0, 3)), {}).classification) == 0
-    one = model.predict(np.array([[5.0, 5.0, 5.0]]), {}, variance=True)
-    assert one.classified == 1 and one.variance[0] == 0.0
+    one = model.predict(np.array([[5.0, 5.0, 5.0]]), {})
+    assert one.report.figures["classified"] == 1
     same = model.predict(np.ones((700, 3)), {})  # more than a batch at one place
     assert same.report.figures["batches_per_point"]["least"] >= 1
 

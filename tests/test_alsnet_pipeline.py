@@ -42,7 +42,7 @@ def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
     ps.run_pipeline(
         [
             str(path),
-            {"type": "filters.modelclassifier", "model": str(model), "margin": True, "variance": True},
+            {"type": "filters.modelclassifier", "model": str(model), "margin": True},
             {
                 "type": "writers.las",
                 "filename": str(out),
@@ -54,11 +54,8 @@ def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
     )
     las = laspy.read(out)
     read = np.column_stack([las.x, las.y, las.z])
-    found = load_model(model).predict(
-        read, {"Intensity": np.asarray(las.intensity)}, variance=True, margin=True
-    )
+    found = load_model(model).predict(read, {"Intensity": np.asarray(las.intensity)}, margin=True)
     assert np.array_equal(np.asarray(las.classification), found.classification)
-    assert np.array_equal(np.asarray(las["Variance"]), found.variance)
     assert np.array_equal(np.asarray(las["Margin"]), found.margin)
     assert len(np.unique(found.classification)) > 1
 
@@ -79,7 +76,7 @@ def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
         return [
             str(path),
             {"type": "filters.hag_minima"},
-            {"type": "filters.modelclassifier", "model": str(model), "variance": True},
+            {"type": "filters.modelclassifier", "model": str(model)},
             {
                 "type": "writers.las",
                 "filename": str(out),
@@ -102,7 +99,6 @@ def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
             las.intensity,
             las.classification,
             las["Reliability"],
-            las["Variance"],
         ]
         table = np.column_stack([np.asarray(c, np.float64) for c in columns])
         return table[np.lexsort(table.T[::-1])]
@@ -144,8 +140,7 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
 
 def test_stage_options(model, tmp_path):
     classifier, writer = registry.get("filters.modelclassifier"), registry.get(WRITER)
-    made = classifier({"model": str(model), "variance": True})
-    assert made.creates()["Variance"] == "float"
+    made = classifier({"model": str(model)})
     assert made.halo_m() == load_model(model).halo_m
     given = {"filename": str(tmp_path / "m"), "algorithm": "alsnet", "alsnet": {"coordinates": "XYZ"}}
     assert writer(given).reads() == ["Classification", "HeightAboveGround"]

@@ -158,7 +158,7 @@ def test_a_tiny_network_overfits_a_tiny_scene():
         learning_rate=0.01,
         augment=False,
     )
-    found = model.predict(xyz, {}, variance=True)
+    found = model.predict(xyz, {})
     assert np.mean(found.classification == labels) > 0.97
     curve = model.info["training"]["curve"]
     assert len(curve) == 25 and curve[-1]["loss"] < 0.3 * curve[0]["loss"]

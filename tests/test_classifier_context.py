@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import passes
-from pdal_stages.classifier.algorithms import Block, PredictRequest
+from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.context import OWN, WHOLE, Context, around, count_shares
 from pdal_stages.classifier.passes import PassRun, Strips
 
@@ -68,7 +68,7 @@ class Said:
         self.context, self.blocks = context, blocks
 
     def predict(self, request, finish):
-        return (Block(rows, finish(p)) for rows, p in self.blocks)
+        return ((rows, finish(p)) for rows, p in self.blocks)
 
 
 @settings(max_examples=10, deadline=None)

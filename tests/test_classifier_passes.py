@@ -118,15 +118,13 @@ def test_where_and_tiles_change_nothing(three, other):
     tile = everything(model, xyz[near], {k: v[near] for k, v in dimensions.items()}, inner[near])
     same(whole, tile, inner, inner[near])
     none = everything(model, xyz, dimensions, np.zeros(len(xyz), bool))
-    assert none.classified == 0 and not none.classification.any()
+    assert none.report.figures["classified"] == 0 and not none.classification.any()
 
 
 def test_empty_and_lone(two):
     assert len(two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}).classification) == 0
     lone = two.predict(np.array([[1e6, 2e6, 3.0]]), {"HeightAboveGround": np.zeros(1)})
-    assert lone.classified == 1
-    with pytest.raises(OptionError, match="variance"):
-        two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}, variance=True)
+    assert lone.report.figures["classified"] == 1
 
 
 def test_binary():
@@ -187,7 +185,6 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.classifier.algorithms import Block
     from pdal_stages.classifier.passes import predict
 
     first = two.passes[0]
@@ -198,11 +195,11 @@ def test_a_pass_may_come_from_elsewhere(two, other):
 
         def predict(self, request, finish):
             p = np.zeros((len(request.xyz), 3))
-            for block in predict((first,), (3,), (None,), request, lambda p: p):
-                p[block.rows] = block.result
+            for found, result in predict((first,), (3,), (None,), request, lambda p: p):
+                p[found] = result
             rows = slice(None) if request.rows is None else request.rows
             request.report.figures["batches"] = 1
-            yield Block(rows, finish(p[rows]))
+            yield rows, finish(p[rows])
 
     xyz, _, dimensions = other
     model = type(two)((Whole(), two.passes[1]), two.classes, two.info)

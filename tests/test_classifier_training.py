@@ -84,7 +84,7 @@ def test_another_place_is_classified(trained, other):
     assert np.array_equal(result.reliability, p[:, -1])
     assert np.allclose(result.margin, p[:, -1] - p[:, -2], atol=1e-6)
     assert np.array_equal(trained.codes[result.probabilities.argmax(axis=1)], result.classification)
-    assert result.classified == len(xyz) and result.rejected == 0
+    assert result.report.figures["classified"] == len(xyz) and not len(result.unsure)
     assert sum(result.report.figures["classes"].values()) == len(xyz)
 
 
@@ -101,7 +101,10 @@ def test_where_keeps_the_rest_which_still_are_neighbors(trained, other):
     assert np.array_equal(part.reliability[where], whole.reliability[where])
     assert np.array_equal(part.classification[~where], current[~where])
     assert not part.reliability[~where].any() and not part.probabilities[~where].any()
-    assert part.classified == where.sum() and part.report.figures["outside_where"] == (~where).sum()
+    assert (
+        part.report.figures["classified"] == where.sum()
+        and part.report.figures["outside_where"] == (~where).sum()
+    )
     # Without them as neighbors the result near the line is another one.
     alone = trained.predict(xyz[where], {k: v[where] for k, v in dimensions.items()})
     assert not np.array_equal(alone.reliability, whole.reliability[where])
@@ -119,7 +122,7 @@ def test_reject(trained, other):
         ({"current": np.full(len(xyz), 9), "rejected_code": 30}, 30),
     ):
         result = trained.predict(xyz, dimensions, reject_below=0.7, **keywords)
-        assert result.rejected == low.sum() == result.report.figures["rejected"]
+        assert len(result.unsure) == low.sum() == result.report.figures["rejected"]
         assert (result.classification[low] == expected).all()
         assert np.array_equal(result.classification[~low], whole.classification[~low])
         assert np.array_equal(result.reliability, whole.reliability)

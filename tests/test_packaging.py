@@ -87,7 +87,7 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
     zipfile.ZipFile(wheel).extractall(target)
     code = (
         "import pdal_stages, pdal_stages.plugin.building as building\n"
-        "from pdal_stages.stages.loading import loaded_model\n"
+        "from pdal_stages.classifier.model import loaded_model\n"
         "print(pdal_stages.__file__, building.SOURCE, len(loaded_model('standard').classes))"
     )
     said = subprocess.run(

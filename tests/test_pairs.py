@@ -18,10 +18,10 @@ import pytest
 from alsnet_scenes import model_of, random_net
 
 import pdal_stages as ps
+from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.modelfile import find
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.stages.loading import load_model
 
 allpairs = pytest.importorskip("allpairspy").AllPairs
 

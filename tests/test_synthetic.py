@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier.model import load_model
 from pdal_stages.stages import registry
-from pdal_stages.stages.loading import load_model
 from pdal_stages.synthetic import Town, make_town, write_town
 from pdal_stages.synthetic.demo import pipelines
 from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene, first_hit

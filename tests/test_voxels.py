@@ -95,7 +95,7 @@ def test_members_get_the_same(model, how, tmp_path):
     inside = where[points] & where[stands[place]]
     assert np.array_equal(found.reliability[points][inside], found.reliability[stands[place]][inside])
     assert found.report.figures["representatives"] == len(few.rows)
-    assert found.classified == where.sum()
+    assert found.report.figures["classified"] + len(found.unsure) == where.sum()
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
     assert again.voxel == 0.25

@@ -24,8 +24,8 @@ from pdal_stages.classifier.context import Context, count_shares
 from pdal_stages.classifier.featureforest import CloudFeatures, Features
 from pdal_stages.classifier.forest import grow_forest
 from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
+from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.sampling import draw_samples
-from pdal_stages.stages.loading import load_model
 
 #: Of a forest of a model that misses a survey, by default: what the card's and the review's figures are of.
 TREES = 20

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.resources import map_blocks, resolve_threads
-from ..classifier.algorithms import ArrayRule, Block, Column, InputPlan, PredictRequest
+from ..classifier.algorithms import ArrayRule, Column, InputPlan, PredictRequest
 from ..classifier.dimensions import gather, with_returns
 from ..features.index import check_xyz
 from .circles import Circles, halo_m
@@ -40,7 +40,6 @@ class AlsNet:
     n_classes: int
 
     name: ClassVar[str] = "alsnet"
-    gives_variance: ClassVar[bool] = True
     features: ClassVar[None] = None
     context: ClassVar[None] = None
     rules: ClassVar[Mapping[str, ArrayRule]] = {
@@ -117,7 +116,7 @@ class AlsNet:
 
     def predict(
         self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
-    ) -> Iterator[Block]:
+    ) -> Iterator[tuple[Any, Any]]:
         """Mean probabilities over all batches a point is in [WM19], through `finish`, in one block.
 
         Batches are computed side by side, as many as fit into the memory, at least one.
@@ -129,14 +128,14 @@ class AlsNet:
         )
         figures = request.report.figures
         if request.count:
-            mean, variance, counted = self._means(request, values)
+            mean, counted = self._means(request, values)
             figures.update(counted)
-            yield Block(slice(None) if request.rows is None else request.rows, finish(mean), variance)
+            yield slice(None) if request.rows is None else request.rows, finish(mean)
 
     def _means(
         self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
-        """Mean probabilities over the batches, a class's variance over them (mean over the classes), counts."""
+    ) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
+        """Mean probabilities over the batches, and counts."""
         from threadpoolctl import threadpool_limits
 
         rows, progress = request.rows, request.progress
@@ -148,7 +147,6 @@ class AlsNet:
         place = np.full(len(xyz), -1)
         place[slice(None) if rows is None else rows] = np.arange(m)
         total = np.zeros((m, self.n_classes))
-        squares = np.zeros(m)
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
         side_by_side = max(1, min(resolve_threads(request.threads), int(request.memory_mb / each)))
@@ -170,21 +168,17 @@ class AlsNet:
                 at, p = at[mine], p[mine]
                 new = int(np.count_nonzero(count[at] == 0))
                 total[at] += p
-                squares[at] += (p * p).sum(axis=1)
                 count[at] += 1
                 seen += new
                 if progress is not None:
                     progress.update(new)
         if not count.all():
             raise StageError("a point is in no batch; this is a bug", found=int(np.count_nonzero(count == 0)))
-        mean = total / np.maximum(count, 1)[:, None]
-        variance = squares / np.maximum(count, 1) - (mean * mean).sum(axis=1)
-        variance = np.where(count > 1, np.maximum(variance / self.n_classes, 0.0), 0.0)
         counted = {
             "batches": len(numbers),
             "batches_per_point": {"mean": round(float(count.mean()), 2), "least": int(count.min())},
         }
-        return mean, variance, counted
+        return total / count[:, None], counted
 
 
 def scaled(

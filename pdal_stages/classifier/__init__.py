@@ -1,7 +1,7 @@
 """Classifiers: training on labeled clouds, the model file, classifying clouds. NumPy in and out; no PDAL."""
 
+from .algorithms import Prediction
 from .clouds import TrainingCloud
-from .deciding import Prediction
 from .featureforest import FeatureForest
 from .forest import Forest
 from .model import Model, load_model

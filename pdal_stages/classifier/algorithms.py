@@ -1,11 +1,11 @@
 """What kinds of classifiers of clouds share: what they are asked and answer, and the names by which they are known.
 
 A kind is a class with ``name``, ``rules`` (of its arrays in a model file; a name that ends in ``*`` stands for many),
-``gives_variance``, ``plan``, ``features`` and ``context`` (None without), ``from_file(entry, arrays, codes)``,
-``to_file(codes)``, ``arrays()`` and ``columns(codes)``. It has ``probabilities(read, rows)`` where it has features, and
-else ``predict(request, finish)``, which yields blocks. What trains it is a module with ``optional_inputs`` (each with the
-dimensions it needs), ``reports_training``, ``own_options(given)``, ``inputs(options)``, ``outputs(options)`` and
-``train(clouds, options, progress)``.
+``plan``, ``features`` and ``context`` (None without), ``from_file(entry, arrays, codes)``, ``to_file(codes)``, ``arrays()``
+and ``columns(codes)``. It has ``probabilities(read, rows)`` where it has features, and else ``predict(request, finish)``,
+which yields (rows, what `finish` made of their probabilities) block by block. What trains it is a module with
+``optional_inputs`` (each with the dimensions it needs), ``reports_training``, ``own_options(given)``, ``inputs(options)``,
+``outputs(options)`` and ``train(clouds, options, progress)``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..base import checks
 from ..base.errors import ModelError
 from ..base.report import Report
 from ..features.index import CellGrid
@@ -83,13 +84,38 @@ class PredictRequest:
         return len(self.xyz) if self.rows is None else len(self.rows)
 
 
-class Block(NamedTuple):
-    """Some of the points wanted: their rows, what the asker's function made of their probabilities (b, classes), and where
-    the kind has it the variance (b,) of a class's probability."""
+@dataclass(frozen=True)
+class PredictionOptions:
+    """How a cloud is classified."""
 
-    rows: Any
-    result: Any
-    variance: npt.NDArray[np.floating] | None = None
+    threads: int | None = None
+    memory_mb: float = 256.0  #: for the blocks of features under way
+    probabilities: bool = False  #: whether to return them
+    margin: bool = False
+    reject_below: float | None = None  #: points less reliable do not get the winning class, and are counted
+    rejected_code: int | None = None  #: class of rejected points, instead of their old one
+    #: as `reject_below`, for points of each class; the larger one counts
+    limits: Mapping[int, float] | None = None
+
+    def __post_init__(self) -> None:
+        checks.number("'memory_mb'", self.memory_mb, 1, unit="MB")
+        if self.reject_below is not None:
+            checks.number("'reject_below'", self.reject_below, 0, 1)
+        if self.rejected_code is not None:
+            checks.whole("'rejected_code'", self.rejected_code, 0, 255)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Classes given to a cloud's points, in its order; numbers are 0 for points that were not classified."""
+
+    classification: npt.NDArray[np.uint8]  #: (n,) ASPRS codes
+    reliability: npt.NDArray[np.float32]  #: (n,) probability of the winning class
+    unsure: npt.NDArray[np.int64]  #: (m,) points that were not reliable enough, and so rejected
+    report: Report  #: counts, notes and warnings for the metadata
+    margin: npt.NDArray[np.float32] | None = None  #: (n,) winning minus second probability
+    #: (n, classes) in the order of ``Model.classes``
+    probabilities: npt.NDArray[np.float32] | None = None
 
 
 def algorithm(name: str) -> Any:

@@ -12,7 +12,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from ..base.errors import OptionError
-from .deciding import Prediction
+from .algorithms import Prediction
 from .training import train
 from .trainoptions import DEFAULT_PASSES, TrainingOptions
 

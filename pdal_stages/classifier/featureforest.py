@@ -68,7 +68,6 @@ class FeatureForest:
     blend: Blend | None = None  #: of a forest on top of a base: how it changes what is said before
 
     rules: ClassVar[Mapping[str, ArrayRule]] = Forest.rules
-    gives_variance: ClassVar[bool] = False
 
     @property
     def name(self) -> str:

@@ -6,25 +6,26 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, cast
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import DimensionError, ModelError, OptionError
+from ..base.errors import DimensionError, ModelError, OptionError, suggest
 from ..base.report import Report
 from ..features import FeaturePlan
 from ..features.index import build_grid, check_xyz
 from ..features.voxels import check_side, represent
 from . import modelfile, summary
-from .algorithms import InputPlan, PredictRequest, algorithm
+from .algorithms import InputPlan, Prediction, PredictionOptions, PredictRequest, algorithm
 from .clouds import density
-from .deciding import Prediction, PredictionOptions, decide, empty, judged
 from .dimensions import known, preparing, required, welcome
 from .passes import plan_of, predict
 from .refinement import weighed
 
+#: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
+UNCLASSIFIED = 1
 #: How many times sparser or denser a cloud may be than those trained on before that is said.
 TOLERANCE = 2.0
 
@@ -175,12 +176,6 @@ class Model:
         xyz = np.asarray(xyz, dtype=np.float64)
         n = len(xyz)
         given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads)
-        if how.variance and not self.algorithm.gives_variance:
-            raise OptionError(
-                "only a network gives a variance",
-                found=f"a model of {self.algorithm.name}",
-                cure="Use 'margin'",
-            )
         asked = np.ones(n, np.bool_) if where is None else _checked("where", where, n, "b", "true or false")
         there, ignored = None, 0
         if ignore is not None and (gone := _checked("ignore", ignore, n, "b", "true or false")).any():
@@ -191,7 +186,12 @@ class Model:
         now = (
             None if current is None else _checked("current", current, n, "iu", "class code").astype(np.uint8)
         )
-        out = empty(n, len(codes), now, how)
+        out: dict[str, npt.NDArray[Any]] = {
+            "classification": np.zeros(n, np.uint8) if now is None else now.copy(),
+            "reliability": np.zeros(n, np.float32),
+            **({"margin": np.zeros(n, np.float32)} if how.margin else {}),
+            **({"probabilities": np.zeros((n, len(codes)), np.float32)} if how.probabilities else {}),
+        }
         values = known(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
         del values, there
@@ -216,22 +216,34 @@ class Model:
         request = PredictRequest(xyz, given, rows, how.threads, how.memory_mb, shown, grid)
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
-        for block in predict(*self.asked, request, lambda p: decide(weighed(p, factors), codes, how)):
-            at, place = block.rows, cast(Any, slice(None))
+        for at, decided in predict(*self.asked, request, lambda p: decide(weighed(p, factors), codes, how)):
+            place: Any = slice(None)
             if order is not None:
                 at = order[at]
             if representatives is not None:
                 at, place = representatives.members(at)
                 if progress is not None:
                     progress.update(len(at))
-            decided = block.result if block.variance is None else {**block.result, "variance": block.variance}
             for name, values in decided.items():
-                if name in out:
-                    out[name][at] = values[place]
+                out[name][at] = values[place]
         self._report_density(request.report, found, request.count)
         if len(xyz) < n - ignored:
             request.report.figures["representatives"] = len(xyz)
-        return judged(out, asked, ignored, now, how, request.report)
+        unsure = _reject(out, asked, now, how)
+        count = int(np.count_nonzero(asked))
+        number = np.bincount(out["classification"][asked], minlength=256)
+        report = Report(
+            {
+                "points": n,
+                "classified": count - len(unsure),
+                "rejected": len(unsure),
+                "outside_where": n - ignored - count,
+                **({"ignored": ignored} if ignored else {}),
+                "classes": {str(code): int(number[code]) for code in np.flatnonzero(number).tolist()},
+            }
+        )
+        report.merge(request.report)
+        return Prediction(**out, unsure=unsure, report=report)
 
     def _prepared(
         self,
@@ -276,8 +288,39 @@ class Model:
             )
 
 
+def decide(
+    p: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], options: PredictionOptions
+) -> dict[str, npt.NDArray[Any]]:
+    """The winner of each row of probabilities (n, classes), of equal ones the first class, and what is asked for."""
+    best = p.argmax(axis=1)
+    win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
+    out = {"classification": codes[best], "reliability": win}
+    if options.margin:
+        out["margin"] = win - np.partition(p, -2, axis=1)[:, -2] if p.shape[1] > 1 else win
+    return {**out, "probabilities": p} if options.probabilities else out
+
+
+def _reject(
+    out: dict[str, npt.NDArray[Any]],
+    asked: npt.NDArray[np.bool_],
+    current: npt.NDArray[np.uint8] | None,
+    options: PredictionOptions,
+) -> npt.NDArray[np.int64]:
+    """The points that were `asked` for (n,) and are not reliable enough; they do not get the winning class."""
+    code = out["classification"]
+    least = np.full(256, options.reject_below or 0.0, np.float32)
+    for one, limit in (options.limits or {}).items():
+        least[one] = max(least[one], limit)
+    if not least.any():
+        return np.zeros(0, np.int64)
+    low = np.flatnonzero(asked & (out["reliability"] < least[code]))
+    kept = UNCLASSIFIED if current is None else current[low]
+    code[low] = kept if options.rejected_code is None else options.rejected_code
+    return low
+
+
 def load_model(path: str | os.PathLike) -> Model:
-    """Read a model file. Nothing in it is executed, and nothing in it is believed unchecked.
+    """Read a model file, or a shipped model by its name. Nothing in it is executed or believed unchecked.
 
     The stages that it wants before it (``info["preparation"]``) are of a short list, with options in bounds.
 
@@ -286,17 +329,34 @@ def load_model(path: str | os.PathLike) -> Model:
     ModelError
         The file is missing, damaged, of a newer version, not what it says, or asks for what no model may ask for.
     """
-    manifest, arrays = modelfile.read(path, lambda name: algorithm(name).rules)
+    name = os.fspath(path)
+    file = modelfile.find(name)
     try:
-        model = assemble(manifest, arrays)
+        model = assemble(*modelfile.read(file, lambda name: algorithm(name).rules))
         if asked := model.info.get("preparation"):
             model.info["preparation"] = preparing().check(asked)
         return model
     except ModelError as error:
-        error.cure = error.cure or modelfile.CURE
-        raise error.at(str(path)) from None
+        near = "" if os.path.lexists(name) else suggest(name, modelfile.shipped())
+        error.cure = f"{near}{error.cure or modelfile.CURE}"
+        raise error.at(file) from error.__cause__
     except OptionError as error:  # a feature or neighborhood of another release
-        raise ModelError("the model's features are not known here", where=str(path), found=error) from error
+        raise ModelError("the model's features are not known here", where=file, found=error) from error
+
+
+def loaded_model(path: str) -> Model:
+    """The same, read once per process as long as the file stays the same."""
+    path = modelfile.find(path)
+    try:
+        stat = os.stat(path)
+    except (OSError, ValueError):  # the latter for a name that holds a null
+        return load_model(path)  # says what is wrong
+    return _loaded(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4)
+def _loaded(path: str, *stamp: int) -> Model:
+    return load_model(path)
 
 
 def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:

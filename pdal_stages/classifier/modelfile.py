@@ -67,6 +67,11 @@ def find(name: str) -> str:
     return name if path is None else str(path)
 
 
+def digest_of(name: str) -> str:
+    """SHA-256 of a model file, or of a shipped model by its name."""
+    return hashlib.sha256(Path(find(name)).read_bytes()).hexdigest()
+
+
 def write(
     path: str | os.PathLike, manifest: Mapping[str, Any], passes: Sequence[Mapping[str, npt.NDArray[Any]]]
 ) -> None:

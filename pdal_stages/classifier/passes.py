@@ -17,7 +17,7 @@ from ..base.arrays import begins_run
 from ..base.resources import map_blocks
 from ..features import FeaturePlan
 from ..features.index import cell_numbers
-from .algorithms import Block, InputPlan, PredictRequest
+from .algorithms import InputPlan, PredictRequest
 from .context import Context, around, count_shares
 from .featureforest import CloudFeatures, FeatureForest
 from .refinement import weighed
@@ -85,8 +85,8 @@ def predict(
     factors: Sequence[npt.NDArray[np.float64] | None],
     request: PredictRequest,
     finish: Callable[[npt.NDArray[np.float64]], Any],
-) -> Iterator[Block]:
-    """Classify by some passes: see :class:`PassRun`.
+) -> Iterator[tuple[Any, Any]]:
+    """Classify by some passes, see :class:`PassRun`: (rows, what `finish` made of them) block by block.
 
     `finish` makes the results of the (b, classes) float64 probabilities of a block, which it may change, in a worker's
     thread where there are any.
@@ -95,8 +95,7 @@ def predict(
         yield from passes[0].predict(request, finish)
         return
     run = PassRun(passes, classes, request, factors)
-    for rows, result in run.blocks(lambda read, rows: finish(passes[-1].probabilities(read, rows))):
-        yield Block(rows, result)
+    yield from run.blocks(lambda read, rows: finish(passes[-1].probabilities(read, rows)))
 
 
 def sample_context(
@@ -191,8 +190,8 @@ class PassRun:
         rows = None if self._wanted[0] is None else np.flatnonzero(self._wanted[0])
         inner = replace(self._request, rows=rows, progress=None, grid=None)
         every = np.arange(len(inner.xyz))
-        for block in self._members[0].predict(inner, lambda p: count_shares(weighed(p, factors))):
-            self._shares[0][self._strips.places(every[block.rows])] = block.result
+        for rows, result in self._members[0].predict(inner, lambda p: count_shares(weighed(p, factors))):
+            self._shares[0][self._strips.places(every[rows])] = result
 
     def _handing_on(self, place: int) -> Callable[..., npt.NDArray[np.uint16]]:
         """What a pass makes of a block for the next one."""

@@ -102,8 +102,8 @@ def add_commands(parser: Parser) -> None:
 
 def _models(options: argparse.Namespace) -> None:
     from ..base.asprs import class_name
+    from ..classifier.model import load_model
     from ..classifier.modelfile import shipped
-    from ..stages.loading import load_model
 
     for name, path in shipped().items():
         model = load_model(path)
@@ -112,9 +112,9 @@ def _models(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
+    from ..classifier.model import load_model
     from ..pipeline.inputs_outputs import input_files
     from ..pipeline.training import surveys_of
-    from ..stages.loading import load_model
     from ..tiling.command import interruptible, options_of
     from ..tiling.training import TrainTask
 
@@ -135,7 +135,7 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _adapt(options: argparse.Namespace) -> None:
-    from ..stages.loading import load_model
+    from ..classifier.model import load_model
     from ..tiling.adapting import AdaptTask
     from ..tiling.command import interruptible, options_of
 
@@ -192,7 +192,7 @@ def _compare_objects(options: argparse.Namespace) -> None:
 
 
 def _model(options: argparse.Namespace) -> None:
-    from ..stages.loading import load_model
+    from ..classifier.model import load_model
 
     model = load_model(options.file)
     if options.showjson:

@@ -8,9 +8,9 @@ from typing import Any
 
 from ..base.asprs import BRIDGE
 from ..base.errors import ModelError, OptionError, suggest
+from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation, registry
-from ..stages.loading import loaded_model
 from .expansion import expand_stage
 from .filenames import LAS_WRITERS
 from .inputs_outputs import overridden, reader_of, writer_of
@@ -82,11 +82,7 @@ class ClassifyRequest:
             stage["keep_sure"] = self.keep_sure
         if self.vegetation_heights:
             stage["vegetation_heights"] = self.vegetation_heights
-        for option, name in (
-            ("margin", "Margin"),
-            ("variance", "Variance"),
-            ("probabilities", "Probability_"),
-        ):
+        for option, name in (("margin", "Margin"), ("probabilities", "Probability_")):
             if any(one.startswith(name) for one in self.dimensions):
                 stage[option] = True
         return stage

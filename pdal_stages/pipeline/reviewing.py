@@ -21,11 +21,11 @@ from ..base.messages import print_messages
 from ..base.outputs import HTML, JSON, Output, check_outputs
 from ..base.progress import Progress
 from ..base.version import __version__
+from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, write_layers
 from ..reports.reviewpage import review_page, styles
-from ..stages.loading import loaded_model
 from ..stages.preparation import PREPARATION, made_of_coordinates
 from .inputs_outputs import input_files
 from .parts import Part, parts_of, reads_in_parts

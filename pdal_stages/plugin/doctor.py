@@ -15,9 +15,9 @@ from ..base.errors import PipelineError, StageError, how_to_add
 from ..base.jit import kept_kernels
 from ..base.resources import available_threads, free_memory
 from ..base.version import __version__
+from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..pipeline import pdal as pdal_env
-from ..stages.loading import loaded_model
 from . import building
 
 #: Extra -> the package that it brings, and what for.

@@ -21,8 +21,8 @@ from ..base.messages import plain
 from ..base.outputs import HTML, JSON, Output
 from ..base.report import Report
 from ..base.units import name_of_wkt
+from ..classifier.model import loaded_model
 from .base import Stage, files_read
-from .loading import loaded_model
 from .modelclassifier import ModelClassifier
 from .options import option
 from .points import Points

@@ -20,11 +20,11 @@ from ..classifier.algorithms import ALGORITHMS, trainer
 from ..classifier.classes import ClassMap
 from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
 from ..classifier.foresttraining import SHORT
-from ..classifier.modelfile import find
+from ..classifier.model import loaded_model
+from ..classifier.modelfile import digest_of, find
 from ..classifier.sureness import of_the_base
 from .base import Stage, files_read
 from .checked import SURE, CheckedChoice, Looked
-from .loading import digest_of, loaded_model
 from .options import option
 from .points import Points
 from .preparation import check

@@ -13,11 +13,10 @@ from ..base.asprs import LOW, MEDIUM, bands, by_height
 from ..base.errors import DimensionError, OptionError
 from ..base.progress import Progress
 from ..classifier import Model
-from ..classifier.deciding import UNCLASSIFIED
+from ..classifier.model import UNCLASSIFIED, loaded_model
 from ..classifier.modelfile import find
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from .base import Stage
-from .loading import loaded_model
 from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts
 from .preparation import as_json, same
@@ -44,11 +43,6 @@ class ModelClassifier(Stage):
     )
     margin: bool = option(
         "boolean", False, "Also write Margin: the winning probability minus the second highest"
-    )
-    variance: bool = option(
-        "boolean",
-        False,
-        "Also write Variance: how much the probabilities vary over a network's batches (networks only)",
     )
     reject_below: float | None = option(
         "number",
@@ -105,20 +99,14 @@ With LAS 1.0-1.3 the synthetic, key-point and withheld flags of each point stay.
 need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before any work is done.
 """
     dimensions_help = """- Reads: X, Y, Z, `Classification`, and what the model names (`pdal-stages model FILE`)
-- Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin`, `Variance` and `Probability_<code>` (float)
+- Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin` and `Probability_<code>` (float)
 - Halo: that of the model's neighborhoods"""
     before = ({"type": "filters.hag_minima"},)
     after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
     def check(self) -> None:
-        able = self.model.algorithm.gives_variance  # reads the file in any case
-        if self.variance and not able:
-            raise OptionError(
-                "option 'variance' is for networks; this model is another",
-                found=self.model.algorithm.name,
-                cure="Use 'margin'",
-            )
+        self.model  # noqa: B018  said before any work where it cannot be read
         self.bands  # noqa: B018  refused here where it means nothing
         self.limits  # noqa: B018  and here where nothing is known of the model
 
@@ -191,7 +179,7 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         return list(dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.bands else [])]))
 
     def creates(self) -> dict[str, str]:
-        more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
+        more = ["Margin"] if self.margin else []
         if self.probabilities:
             more += [f"Probability_{code}" for code, _ in self.model.classes]
         return {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
@@ -241,7 +229,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
                 memory_mb=self.memory,
                 probabilities=self.probabilities,
                 margin=self.margin,
-                variance=self.variance,
                 reject_below=self.reject_below,
                 rejected_code=self._rejected,
                 limits={code: one.reliability for code, one in (self.limits or {}).items()},
@@ -256,9 +243,8 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             "Classification": found.classification,
             "Reliability": found.reliability,
         }
-        for name in ("margin", "variance"):
-            if (value := getattr(found, name)) is not None:
-                values[name.capitalize()] = value
+        if found.margin is not None:
+            values["Margin"] = found.margin
         if found.probabilities is not None:
             columns = zip(self.model.codes, found.probabilities.T, strict=True)
             values |= {f"Probability_{code}": column for code, column in columns}

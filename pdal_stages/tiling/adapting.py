@@ -18,9 +18,10 @@ import numpy as np
 from ..base import checks, las
 from ..base.errors import StageError
 from ..base.outputs import MODEL, Output, check_outputs
+from ..classifier.model import load_model
+from ..classifier.modelfile import digest_of
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_las
-from ..stages.loading import digest_of, load_model
 from .classify import ClassifyTask
 from .settings import TilingOptions
 from .training import TrainTask
