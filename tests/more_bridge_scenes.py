@@ -11,17 +11,6 @@ import numpy as np
 from bridge_scenes import BUILDING, DECK, GROUND, LEAF, OTHER, WATER, Scene, Slab, _cars, _deck, _road
 
 
-def _valley(s, reach, deep, grade=0.5):
-    """A terrain level with the deck's ends, and so deep between them."""
-    return -np.clip((reach - np.abs(s)) * grade, 0.0, deep)
-
-
-def _masts(slabs, top, reach, sides, step, tall, code=OTHER):
-    for s in np.arange(-reach + step / 2, reach, step):
-        for t in sides:
-            slabs.append(Slab(s, s + 0.3, t - 0.15, t + 0.15, lambda a: top(a) + tall, tall, code))
-
-
 def _piers(slabs, top, reach, half, step, foot):
     for s in np.arange(-reach + step, reach - 1, step):
         slabs.append(Slab(s - 0.8, s + 0.8, -half + 1, half - 1, lambda a: top(a) - 1.4, -foot + 12.0, OTHER))
@@ -35,46 +24,24 @@ def _trees(rng, ends, sides, count, tall):
     ]
 
 
-def deep_valley(seed=0, half=7.0, reach=130.0, deep=30.0, bend=0.0, grade=0.0, turn=0.4, trees=80):
+def deep_valley(seed=0, half=7.0, reach=130.0, deep=30.0, bend=260.0, turn=0.1):
     """Level with the land at both ends, over a wooded valley whose trees come up to the deck."""
     rng = np.random.default_rng(seed)
 
     def top(s):
-        return 0.3 + grade * s
+        return 0.3 + 0.0 * s
 
     def terrain(s, t):
-        z = _valley(s, reach, deep, 0.6) + grade * s + 0.3 * np.sin(s / 13.0) * np.cos(t / 17.0)
+        z = -np.clip((reach - np.abs(s)) * 0.6, 0.0, deep) + 0.3 * np.sin(s / 13.0) * np.cos(t / 17.0)
         return np.where((np.abs(s) > reach) & (np.abs(t) < half + 2), top(s), z), np.full(len(s), GROUND)
 
     slabs: list[Slab] = []
     _deck(slabs, -reach, reach, -half, half, top, 2.5)
     _cars(slabs, rng, -reach - 30, reach + 30, (-half + 3, half - 3), top, 25.0)
     _piers(slabs, top, reach, half, 40.0, -deep)
-    plants = _trees(rng, (-reach - 20, reach + 20), (half + 1, 60), trees, (8, 30))
+    plants = _trees(rng, (-reach - 20, reach + 20), (half + 1, 60), 80, (8, 30))
     plants = [p for p in plants if abs(p[0]) < reach or abs(p[1]) > half + p[2] + 1]
     return Scene(terrain, slabs, plants, turn, 2 * reach + 140.0, 150.0, bend)
-
-
-def wide_river(seed=0, half=10.0, reach=180.0, clear=9.0, turn=0.9, water=np.nan, arch=4.0):
-    """A long arched deck over water without returns, between flood plains with trees."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return clear + arch * np.cos(np.clip(s / reach, -1.6, 1.6) * np.pi / 2)
-
-    def terrain(s, t):
-        land = np.clip((np.abs(s) - (reach - 40)) * 0.3, 0.0, 3.0) - 2.0
-        z = np.where(np.abs(s) > reach, np.maximum(_road(t, top(s), land, half + 1.0, 0.5), land), land)
-        wet = np.abs(s) < reach - 40
-        return np.where(wet, water, z), np.where(wet, WATER, GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -reach, reach, -half, half, top, 1.8)
-    _cars(slabs, rng, -reach, reach, np.arange(-half + 2.5, half - 2, 3.5), top, 30.0)
-    _masts(slabs, top, reach, (-half + 0.5, half - 0.5), 35.0, 10.0)
-    plants = _trees(rng, (reach + 5, reach + 70), (half + 8, 65), 25, (6, 18))
-    plants += [(-s, t, r, h) for s, t, r, h in plants]
-    return Scene(terrain, slabs, plants, turn, 2 * reach + 150.0, 150.0)
 
 
 @dataclass
@@ -109,24 +76,6 @@ def skewed(seed=0, half=6.0, reach=35.0, skew=1.2, turn=0.5):
         slabs.append(Skewed(-reach, reach, low, high, lambda s: top(s) + 1.0, 1.0, DECK, skew))
     _cars(slabs, rng, -reach - 40, reach + 40, (-3.0, 3.0), top, 22.0)
     return Scene(terrain, slabs, _trees(rng, (-90, 90), (22, 60), 25, (6, 15)), turn, 260.0, 140.0)
-
-
-def very_long(seed=0, half=8.0, reach=300.0, deep=35.0, turn=0.25):
-    """600 m over a valley on piers, its ends seen."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return 0.2 + 0.01 * s
-
-    def terrain(s, t):
-        z = _valley(s, reach, deep, 0.5) + 0.01 * s + 0.3 * np.sin(s / 19.0) * np.cos(t / 23.0)
-        return np.where((np.abs(s) > reach) & (np.abs(t) < half + 2), top(s), z), np.full(len(s), GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -reach, reach, -half, half, top, 2.5)
-    _cars(slabs, rng, -reach, reach, (-5.0, 5.0), top, 40.0)
-    _piers(slabs, top, reach, half, 50.0, -deep)
-    return Scene(terrain, slabs, _trees(rng, (-280, 280), (half + 2, 50), 60, (8, 28)), turn, 730.0, 130.0)
 
 
 def beside_roofs(seed=0, half=7.0, reach=80.0, height=8.0, turn=0.6, side=3.0):
@@ -188,10 +137,8 @@ def walled_road(seed=0, turn=0.6):
     return Scene(_flat, slabs, [], turn, 300.0, 110.0)
 
 
-def upright(
-    density=16.0, seed=0, reach=100.0, half=6.0, high=8.0, bank=16.0, raised=False, wet=None, below=True
-):
-    """A deck over a valley of such banks (0: upright ones), or `raised` on banks above a plain; points and true classes.
+def upright(density=16.0, seed=0, reach=100.0, half=6.0, high=8.0, bank=16.0, wet=None, below=True):
+    """A deck over a valley of such banks; points and true classes.
 
     With `wet` there is water between the banks, and it is its share that answers.
     """
@@ -199,9 +146,7 @@ def upright(
     long, wide = 2 * reach + 100.0, 120.0
     s, t = rng.uniform((-long / 2, -wide / 2), (long / 2, wide / 2), (int(density * long * wide), 2)).T
     over = np.clip(reach - np.abs(s), 0, None)
-    rise = np.minimum(over * high / bank, high) if bank else high * (over > 0)
-    ground = np.clip(high - rise - 0.6 * np.clip(np.abs(t) - half - 1, 0, None), 0, None) if raised else -rise
-    top = np.full(len(s), high if raised else 0.0)
+    ground = -np.minimum(over * high / bank, high)
     code = np.full(len(s), GROUND)
     deck = (np.abs(s) < reach) & (np.abs(t) < half)
     seen = ~deck | below
@@ -210,7 +155,7 @@ def upright(
         code[water] = WATER
         seen &= ~water | (rng.random(len(s)) < wet)
     ground = ground + 0.04 * np.sin(s / 7) * np.cos(t / 9)
-    xyz = [np.column_stack([s, t, ground])[seen], np.column_stack([s, t, top])[deck]]
+    xyz = [np.column_stack([s, t, ground])[seen], np.column_stack([s, t, 0.0 * s])[deck]]
     codes = [code[seen], np.full(int(deck.sum()), DECK)]
     for _ in range(40):
         a, b, radius = (
@@ -273,10 +218,8 @@ def levee(seed=0, turn=0.5):
 
 
 MORE_SCENES = {
-    "deep valley, bent": lambda seed=0: deep_valley(seed, bend=260.0, turn=0.1),
-    "wide river": wide_river,
+    "deep valley, bent": deep_valley,
     "skewed": skewed,
-    "600 m long": very_long,
     "walled ramps": walled_ramps,
 }
 #: As simple simulators make them: points and classes.

@@ -62,26 +62,6 @@ def test_pipeline_with_overrides(job, tmp_path, capsys):
     assert "meters were assumed" in err
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--stage.hieght.cell=10"], "Did you mean 'height'?"),
-        (["--stage.height.cell=ten"], "option 'cell' must be a number"),
-        (["--stage.height.resolution=50"], "must not be larger than 'cell'"),
-        (["--filters.hag_minima.cel=10"], "Did you mean 'cell'?"),
-        (["--stage.height.cell"], "has no value"),
-        (["--stage.height.where=Z >"], "'where' expression cannot be read"),
-    ],
-)
-def test_mistakes_are_named(job, tmp_path, capsys, words, message):
-    code, out, err = run(capsys, "pipeline", job, *words)
-    assert code == 1
-    assert message in err
-    assert "Traceback" not in err
-    assert out == ""
-    assert not (tmp_path / "out.las").exists()
-
-
 def test_stdin_and_expand(job, capsys, monkeypatch, tmp_path):
     import io
 
@@ -175,17 +155,6 @@ def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
     assert (tmp_path / "a.html").stat().st_size > 10_000
 
 
-def test_wrong_usage(capsys, tmp_path):
-    with pytest.raises(SystemExit) as stop:
-        main(["pipelin"])
-    assert stop.value.code == 2
-    assert run(capsys, "pipeline")[0] == 1
-    code, _, err = run(capsys, "pipeline", tmp_path / "no.json")
-    assert code == 1 and "cannot be read" in err
-    code, _, err = run(capsys, "model", tmp_path / "no.model", "--filters.x.y=1")
-    assert code == 1 and "takes no stage options" in err
-
-
 @pytest.mark.parametrize(
     ("words", "inputs", "output"),
     [
@@ -198,42 +167,3 @@ def test_wrong_usage(capsys, tmp_path):
 def test_names_may_stand_behind_flags(words, inputs, output):
     seen = parsed(words.split(), is_program=False)
     assert seen.inputs == inputs and getattr(seen, "output", None) == output
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["pipline", "{job}"], "Did you mean 'pipeline'?"),
-        (["classify", "{job}", "out", "--per", "fil"], "Did you mean 'file'?"),
-    ],
-)
-def test_choices_are_suggested(job, capsys, words, message):
-    with pytest.raises(SystemExit):
-        main([word.format(job=job) for word in words])
-    assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (
-            ["pipeline", "{job}", "--writers.las.skale_x=1"],
-            "Did you mean 'scale_x'? List its options with: pdal-stages",
-        ),
-        (["accuracy", "{cloud}", "{cloud2}"], "--reference FILE, of the same points"),
-        (
-            ["accuracy", "{cloud}", "{cloud2}", "--reference-dimension", "Clasification"],
-            "Did you mean 'Classification'?",
-        ),
-        (
-            ["classify", "{cloud}", "{folder}/o", "--scheduler", "localhost"],
-            "For example tcp://localhost:8786",
-        ),
-    ],
-)
-def test_what_to_do_is_said(job, tmp_path, write_las, capsys, words, message):
-    rng = np.random.default_rng(0)
-    clouds = [write_las(tmp_path / f"{n}.las", {axis: rng.random(50) for axis in "XYZ"}) for n in "ab"]
-    names = {"job": job, "cloud": clouds[0], "cloud2": clouds[1], "folder": tmp_path}
-    code, _, err = run(capsys, *(word.format(**names) for word in words))
-    assert code == 1 and message in err, err

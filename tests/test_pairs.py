@@ -163,6 +163,7 @@ def scenes(tmp_path_factory, write_las):
         "las 1.2": [write_las(folder / "old.las", arrays, **plain)],
         "las 1.4": [write_las(folder / "new.las", arrays, **modern)],
         "laz 1.4": [write_las(folder / "new.laz", arrays, **modern)],
+        # made by tests/data/make_copc.py of commit b10145c
         "copc": [Path(__file__).parent / "data" / "town.copc.laz"],
         "feet": [write_las(folder / "feet.laz", feet, wkt=FEET, minor_version=4, **modern)],
         "several": [write_las(folder / f"part{k}.laz", part((x > 25) == k), **plain) for k in (False, True)],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 
 import laspy
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from corridor_scenes import CORRIDORS
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from pdal_stages.cli import main
 from pdal_stages.stages.wires import Wires
 from pdal_stages.terrain import towers
 from pdal_stages.terrain import wires as lines
@@ -110,26 +108,3 @@ def test_the_stage_gives_towers_their_class():
     assert points.report.figures["towers"] == tower.sum() > 1000
     assert points.report.figures["left"]["5"] == (after != before).sum() - (tower & (before != 5)).sum()
     assert stage.halo_m() == lines.REACH + towers.REACH and stage.largest_class() == 65
-
-
-@pytest.mark.pdal
-def test_in_tiles_as_in_one_piece_through_pdal(tmp_path, capfd):
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = [0.001] * 3, [85_000.0, 447_000.0, 0.0]
-    las = laspy.LasData(header)
-    xyz, *_ = scene("low voltage along a street", 4.0)
-    las.x, las.y, las.z = xyz.T
-    las.classification = np.full(len(xyz), 5, np.uint8)
-    las.write(str(tmp_path / "in.las"))
-    counted = {}
-    for name, words in (("whole", []), ("tiled", ["--tile", "150", "--workers", "0"])):
-        job = [
-            str(tmp_path / "in.las"),
-            {"type": "filters.hag_morphological", "window": 20},
-            {"type": "filters.wires", "towers": True},
-        ]
-        (tmp_path / "job.json").write_text(json.dumps([*job, str(tmp_path / f"{name}.las")]))
-        assert main(["pipeline", str(tmp_path / "job.json"), "--no-progress", *words]) == 0
-        counted[name] = np.asarray(laspy.read(tmp_path / f"{name}.las").classification)
-    assert (counted["whole"] == 15).sum() > 20
-    assert np.array_equal(counted["whole"], counted["tiled"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 
 import laspy
 import numpy as np
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 import pdal_stages.synthetic
-from pdal_stages.cli import main
 from pdal_stages.stages.wires import Wires
 from pdal_stages.terrain import wires
 from pdal_stages.terrain.morphological import filtered_ground
@@ -190,27 +188,3 @@ def test_clouds_without_wires(name, data_dir):
     las = laspy.read(data_dir / name)
     height = filtered_ground(las.xyz)["HeightAboveGround"]
     assert find_wires(las.xyz, height, np.ones(len(las), bool)).sum() <= 0.0005 * len(las)
-
-
-@pytest.mark.pdal
-def test_in_tiles_as_in_one_piece_through_pdal(tmp_path):
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales = [0.001] * 3
-    las = laspy.LasData(header)
-    xyz, _ = scene(0, 3.0)
-    las.x, las.y, las.z = xyz.T
-    las.classification = np.full(len(xyz), 5, np.uint8)
-    las.write(str(tmp_path / "in.las"))
-    for name, words in (("whole", []), ("tiled", ["--tile", "50", "--workers", "0"])):
-        job = [
-            str(tmp_path / "in.las"),
-            {"type": "filters.hag_morphological", "window": 20},
-            {"type": "filters.wires"},
-        ]
-        (tmp_path / "job.json").write_text(json.dumps([*job, str(tmp_path / f"{name}.las")]))
-        assert main(["pipeline", str(tmp_path / "job.json"), "--no-progress", *words]) == 0
-    whole, tiled = (
-        np.asarray(laspy.read(tmp_path / f"{name}.las").classification) for name in ("whole", "tiled")
-    )
-    assert (whole == 14).sum() > 500
-    assert np.array_equal(whole, tiled)

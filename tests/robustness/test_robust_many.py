@@ -59,14 +59,3 @@ def test_lists_of_files(command, tmp_path, case):
     kind = "readers.ept" if name == "ept.json" else "readers.tindex"
     read = {"type": kind, "filename": str(tmp_path / name)}
     command.refused(["pipeline", job(tmp_path, read, HAG, tmp_path / "o_#.las"), *TILES], *says)
-
-
-# ---- many files, one output each ------------------------------------------------------------------------------
-
-
-def test_an_output_that_is_another_input(command, tmp_path, cloud, model):
-    for name in ("a.las", "c_a.las"):
-        (tmp_path / name).write_bytes(cloud.read_bytes())
-    words = ["classify", tmp_path / "a.las", tmp_path / "c_a.las", tmp_path / "c_#.las", "--model", model]
-    command.refused(words, "the output file is one of the inputs", "c_a.las")
-    assert (tmp_path / "c_a.las").read_bytes() == cloud.read_bytes()

@@ -92,17 +92,25 @@ def test_wrong_stages(command, tmp_path, monkeypatch, cloud, case):
 
 OVERRIDES = {
     "--stage.hite.cell=5": "no stage of the pipeline has the tag 'hite'",
+    "--stage.tt.cell=5": "Did you mean 't'?",
+    "--stage.t.cel=5": "Did you mean 'cell'?",
+    "--writers.las.skale_x=1": "Did you mean 'scale_x'? List its options with: pdal-stages",
     "--filters.hag_nn.count=5": "has the type 'filters.hag_nn'",
     "--stage.t.cell": "Write --stage.t.cell=VALUE",
     f"--{FEATURES}.neighborhoods=": "is an empty list",
 }
 USAGE = {
     "no command": ([], "the following arguments are required"),
-    "unknown command": (["pipelines"], "invalid choice"),
+    "unknown command": (["pipelines"], "Did you mean 'pipeline'?"),
+    "unknown choice": (["classify", "a.las", "out", "--per", "fil"], "Did you mean 'file'?"),
+    "options of stages for a model": (["model", "no.model", "--filters.x.y=1"], "takes no stage options"),
+    "accuracy of two files": (["accuracy", "c.las", "c.las"], "--reference FILE, of the same points"),
+    "unknown dimension": (["accuracy", "c.las", "--reference-dimension", "Clasification"], "Did you mean 'Classification'?"),
+    "scheduler without its protocol": (["classify", "c.las", "o", "--scheduler", "localhost"], "For example tcp://localhost:8786"),
     "unknown flag": (["validate", "job.json", "--strict"], "unrecognized arguments: --strict"),
     "no pipeline file": (["pipeline"], "no pipeline file was given"),
     "options of a stage that is not there": (["options", "filters.hag_minimum"], "Did you mean 'filters.hag_minima'?"),
-    "classify a file that is not there": (["classify", "a.las", "b.las"], "a.las: there is no such file or folder. Check the path"),
+    "classify a file that is not there": (["classify", "nowhere.laz", "b.las"], "nowhere.laz: there is no such file or folder. Check the path"),
     "train on a mistyped file": (["train", "jbo.json", "--model", "m"], "Did you mean 'job.json'?"),
     "metadata in a folder that is not there": (["pipeline", "job.json", "--metadata", "no/m.json"], "metadata file does not exist"),
     **{word: (["pipeline", "job.json", word], says) for word, says in OVERRIDES.items()},
@@ -113,6 +121,7 @@ USAGE = {
 def test_wrong_usage(command, tmp_path, monkeypatch, cloud, case):
     monkeypatch.chdir(tmp_path)
     words, says = USAGE[case]
+    (tmp_path / "c.las").write_bytes(cloud.read_bytes())
     job(tmp_path, cloud, {**HAG, "tag": "t"}, {"type": FEATURES, "neighborhoods": "c1"}, OUT)
     command.refused(words, says)
 
