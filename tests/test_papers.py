@@ -68,7 +68,7 @@ def test_pts_round_trip(folder, town):
 @pytest.mark.pdal
 def test_pts_through_pdal(folder, tmp_path, monkeypatch):
     """The commands of docs/papers.md for clouds that cannot be had, on a stand-in with the same format."""
-    from pdal_stages.pipeline.overrides import parse_overrides
+    from pdal_stages.pipeline.read import parse_overrides
     from pdal_stages.pipeline.run import Pipeline
 
     monkeypatch.chdir(tmp_path)
@@ -104,7 +104,7 @@ def test_pts_through_pdal(folder, tmp_path, monkeypatch):
 )
 def test_alsnet_with_the_papers_inputs_through_pdal(folder, tmp_path, monkeypatch):
     from pdal_stages.classifier import load_model
-    from pdal_stages.pipeline.overrides import parse_overrides
+    from pdal_stages.pipeline.read import parse_overrides
     from pdal_stages.pipeline.run import Pipeline
 
     monkeypatch.chdir(tmp_path)

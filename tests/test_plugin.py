@@ -19,7 +19,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
+from pdal_stages.pipeline.read import apply_overrides, parse_overrides
 from pdal_stages.plugin import answers, building
 from pdal_stages.stages import registry
 

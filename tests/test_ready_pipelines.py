@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.overrides import parse_overrides
+from pdal_stages.pipeline.read import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.tiling import run_tiled
 

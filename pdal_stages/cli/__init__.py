@@ -69,7 +69,7 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
         Where a stage's option is incomplete, or the command takes none.
     """
     # Imported here, so that an environment that lacks something is told in a sentence.
-    from ..pipeline.overrides import parse_overrides
+    from ..pipeline.read import parse_overrides
     from . import files, machine, models, pipelines
     from .parser import OVERRIDES, Parser
 

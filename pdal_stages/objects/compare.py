@@ -264,7 +264,7 @@ def compare_objects(
     out: dict[str, Any] = {}
     both = one.shapes.keys() & two.shapes.keys()
     if "buildings" in both:
-        out["buildings"] = compare_buildings(one.shapes["buildings"], two.shapes["buildings"])
+        out["buildings"] = compare_buildings(*(list(things.shapes["buildings"]) for things in (one, two)))
     if "trees" in both and len(one.heights) + len(two.heights):
         out["trees"] = compare_trees(*one.trees, *two.trees)
     if not out:

@@ -20,7 +20,7 @@ from .classify_request import ClassifyRequest
 from .expansion import expand_stage
 from .filenames import stage_files
 from .inputs_outputs import in_folders, input_files, reader_of
-from .overrides import Override, apply_overrides
+from .read import Override, apply_overrides
 from .run import Pipeline
 from .runtime import points_of_views
 

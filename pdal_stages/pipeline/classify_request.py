@@ -15,7 +15,7 @@ from .expansion import expand_stage
 from .filenames import LAS_WRITERS
 from .inputs_outputs import overridden, reader_of, writer_of
 from .las_output import extra_dims_option
-from .overrides import Override
+from .read import Override
 from .run import Pipeline
 
 #: What finds bridge decks along with the heights.

@@ -19,8 +19,8 @@ from ..base.outputs import Output, check_outputs
 from ..classifier.dimensions import CHECKED
 from ..objects.outlines import vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
+from .inputs_outputs import reference_of_file
 from .parts import las_chunks, reads_in_parts
-from .references import reference_of_file
 
 #: Points without a partner beyond this share: the files are of other points.
 _MOST_LOST = 0.1

@@ -27,9 +27,8 @@ from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, write_layers
 from ..reports.reviewpage import review_page, styles
 from ..stages.preparation import PREPARATION, made_of_coordinates
-from .inputs_outputs import input_files
+from .inputs_outputs import check_one_reference, input_files, reference_of_file
 from .parts import Part, parts_of, reads_in_parts
-from .references import check_one_reference, reference_of_file
 from .workers import each_file
 
 #: What is written, in this order.

@@ -21,7 +21,6 @@ from ..base.report import Report
 from ..stages import registry
 from . import interrupts, las_output, runtime
 from . import pdal as pdal_env
-from .callbacks import Callbacks
 from .expansion import Expanded, check_dimensions, expand
 from .filenames import (
     is_reader,
@@ -32,9 +31,8 @@ from .filenames import (
     with_outputs,
     writers_outputs,
 )
-from .overrides import Override, apply_overrides
-from .read import PipelineSource, read_pipeline
-from .references import check_readers
+from .inputs_outputs import check_readers
+from .read import Override, PipelineSource, apply_overrides, read_pipeline
 
 
 class Pipeline:
@@ -45,7 +43,7 @@ class Pipeline:
     source : str, Path, list, dict or PipelineSource
         A file name, JSON text, the stages themselves, or what :func:`parse_pipeline` made of text.
     overrides : iterable of Override, optional
-        Options set from outside (see :mod:`pdal_stages.pipeline.overrides`).
+        Options set from outside (see :mod:`pdal_stages.pipeline.read`).
     whole : bool
         False: only to be run in tiles.
 
@@ -172,7 +170,7 @@ class Pipeline:
         runtime.remember_stdout()
         failure: StageError | None = None
         try:
-            with Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
+            with runtime.Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
                 run = with_outputs(stages, list(partials))
                 for number, stage in enumerate(run):
                     if is_writer(stage, run):

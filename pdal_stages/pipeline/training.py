@@ -13,9 +13,8 @@ from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
 from ..stages.preparation import preparation_of
 from .expansion import expand_stage
-from .inputs_outputs import reader_of
-from .overrides import Override
-from .references import check_readers
+from .inputs_outputs import check_readers, reader_of
+from .read import Override
 from .run import Pipeline
 from .runtime import points_of_views, python_filter
 

@@ -20,8 +20,7 @@ from ..base.errors import OptionError, PipelineError, StageError
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import LAS_READERS, named_files
-from ..pipeline.inputs_outputs import in_folders, locations
-from ..pipeline.references import Reference, check_one_reference, reference_of
+from ..pipeline.inputs_outputs import Reference, check_one_reference, in_folders, locations, reference_of
 from .grid import Box, TileGrid, check_number, touching, union
 from .settings import Density, Extent, TilingOptions, block_bytes, settled
 from .store import fingerprint

@@ -24,10 +24,9 @@ from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import refuse_unclassified
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import input_files, outputs_of
-from ..pipeline.overrides import Override
+from ..pipeline.inputs_outputs import check_one_reference, input_files, outputs_of, reference_of_file
 from ..pipeline.parts import las_chunks, reads_in_parts
-from ..pipeline.references import check_one_reference, reference_of_file
+from ..pipeline.read import Override
 from ..pipeline.workers import each_file
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter

@@ -21,8 +21,8 @@ from ..base.files import whole_files
 from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.callbacks import Callbacks
 from ..pipeline.filenames import LAS_WRITERS
+from ..pipeline.runtime import Callbacks
 from .inputs import InputSource
 from .pieces import BLOCK, Piece, header_of, record_blocks, write_records
 from .plan import TilePlan

@@ -20,8 +20,7 @@ from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
 from ..pipeline.las_output import files_with_flags_to_split
-from ..pipeline.overrides import Override
-from ..pipeline.read import PipelineSource
+from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import run_tasks
 from .cluster import open_workers

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError, StageError
-from ..pipeline.callbacks import Callbacks
+from ..pipeline.inputs_outputs import NO_REFERENCE
 from ..pipeline.las_output import check_writers, flag_splitter
-from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import points_of
+from ..pipeline.runtime import Callbacks, points_of
 from ..stages import registry
 from ..stages.base import Left
 from ..stages.points import HOLDS_NOWHERE

@@ -25,11 +25,10 @@ from ..classifier.summary import FILE_NUMBER
 from ..classifier.training import train_tiles
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.callbacks import Callbacks
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden
-from ..pipeline.overrides import Override
+from ..pipeline.read import Override
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import points_of_views
+from ..pipeline.runtime import Callbacks, points_of_views
 from ..pipeline.training import heights_for, lowered_writer, read_points
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel

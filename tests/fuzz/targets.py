@@ -30,8 +30,7 @@ from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, m
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.model import assemble
 from pdal_stages.pipeline.expansion import expand
-from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
-from pdal_stages.pipeline.read import decode, parse_pipeline
+from pdal_stages.pipeline.read import apply_overrides, decode, parse_overrides, parse_pipeline
 from pdal_stages.tiling import inputs, outputs
 from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.pieces import sort_points
