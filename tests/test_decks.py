@@ -368,7 +368,6 @@ def test_the_stage_says_what_it_makes_and_how_far_it_looks():
     plain, made = HagMorphological({}), HagMorphological({"decks": True})
     assert "Deck" not in plain.creates() and made.creates()["Deck"] == "uint8_t"
     assert plain.halo_m() <= made.halo_m() == reach(decks=True) < 820
-    assert made.near_halo_m() == plain.near_halo_m()
     assert Bridges({}).halo_m() == 0 and Bridges({}).largest_class() == 17
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -35,24 +35,6 @@ class CodeLimit(NamedTuple):
     largest: int
     what: str
     cure: str
-
-
-class Blocks(NamedTuple):
-    """Squares for which a stage makes once, of points far around, what tiles need of it; meters."""
-
-    side: float
-    reach: float  #: how far around a block points matter
-    around: float  #: how far beyond the points that are read a tile needs blocks
-    spill: float  #: how far beyond all points blocks hold something
-    cell: float = 1.0  #: side of the cells that they are rasters of
-
-
-class Left(NamedTuple):
-    """What a stage needs of points, in the rounds before the tiles; coordinates in meters."""
-
-    around: NDArray[np.float64]  #: (n, 3) of points that blocks need that are far away
-    #: (m, 3) what blocks need of points inside them alone, by block (column, row)
-    inside: dict[tuple[int, int], NDArray[np.float64]]
 
 
 class Stage(ABC):
@@ -118,8 +100,6 @@ class Stage(ABC):
         "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
     )
 
-    #: In tiles: what :meth:`made_of_blocks` gave.
-    from_blocks: Any = None
     #: In tiles: a dimension below zero for points whose results are used; only they are counted in reports.
     own_points: str = ""
     #: Whether stages before it in the pipeline make what it makes too.
@@ -171,35 +151,6 @@ class Stage(ABC):
     def halo_m(self) -> float:
         """How far beyond a tile, in meters, points can change the tile's results."""
         return 0.0
-
-    def near_halo_m(self) -> float | None:
-        """The same where a tile is given :attr:`from_blocks`, made before out of all points; None where that cannot be."""
-        return None
-
-    def blocks(self) -> Blocks:
-        """How far the rounds before the tiles reach, for a stage with a :meth:`near_halo_m`."""
-        raise NotImplementedError
-
-    def left_of(self, points: Points) -> Left:
-        """First, what blocks need of points."""
-        raise NotImplementedError
-
-    def block_of(
-        self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
-    ) -> dict[str, NDArray]:
-        """Then, of a block (column, row) of a grid anchored at zero, what tiles need.
-
-        From what was left of points around it (n, 3) and, in parts, of those inside (m, 3).
-        """
-        raise NotImplementedError
-
-    def needed_of_blocks(self, box: Sequence[float]) -> Collection[str]:
-        """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have them."""
-        raise NotImplementedError
-
-    def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]], box: Sequence[float]) -> Any:
-        """At last, :attr:`from_blocks` in a box, meters, out of these arrays of the blocks that it touches."""
-        raise NotImplementedError
 
     def largest_class(self) -> int:
         """The largest class code the stage may write to `Classification` (0: none)."""

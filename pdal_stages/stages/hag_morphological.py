@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,28 @@ from ..terrain.groundblocks import by_block, cells_of_block, reach_of_block
 from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
 from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells
 from ..terrain.openings import opening_names
-from .base import HEIGHTS_OUTSIDE, Blocks, Left, Stage
+from .base import HEIGHTS_OUTSIDE, Stage
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
 
 #: Cells along the side of squares of a block that a tile reads by themselves.
 _PART = 256
+
+
+class Blocks(NamedTuple):
+    """Squares of the grid for which the ground is made once, of points far around, before the tiles; meters."""
+
+    side: float
+    reach: float  #: how far around a block points matter
+    around: float  #: how far beyond the points that are read a tile needs blocks
+    spill: float  #: how far beyond all points blocks hold something
+    cell: float = 1.0  #: side of the cells that they are rasters of
+
+
+def inside_block(block: tuple[int, int]) -> str:
+    """What the array of the points inside a block (column, row) is called."""
+    return f"inside/{block[0]}/{block[1]}"
 
 
 class HagMorphological(Stage):
@@ -144,10 +160,11 @@ of Z.
     def halo_m(self) -> float:
         return reach(cell=self.cell, window=self.window, openings=self.windows, decks=self.decks)
 
-    def near_halo_m(self) -> float:
-        return 0.0  # all that a point's height depends on is in cells
+    #: In tiles: what :meth:`made_of_blocks` gave.
+    from_blocks: GroundCells | None = None
 
     def blocks(self) -> Blocks:
+        """How far the rounds before the tiles reach; all that a point's height depends on is in cells."""
         cell = self.cell
         reach = (reach_of_block(self._filter) + 2) * cell
         return Blocks(BLOCK_SIDE * cell, reach, reach_of_cells(cell), 2 * cell, cell)
@@ -164,7 +181,8 @@ of Z.
             self.decks,
         )
 
-    def left_of(self, points: Points) -> Left:
+    def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
+        """First, the points (n, 3) that blocks need: ``around`` them, and inside each (:func:`inside_block`)."""
         x, y, z = points.axes
         usable = points.usable(self.ignore)
         chosen = np.zeros(len(x), bool)
@@ -172,21 +190,25 @@ of Z.
         if self.decks:
             chosen[level_points(x, y, z, usable)] = True
         left = np.flatnonzero(chosen)
-        return Left(
-            np.column_stack([x[left], y[left], z[left]]),
-            by_block(x, y, z, usable, self.cell),
-        )
+        inside = by_block(x, y, z, usable, self.cell)
+        return {
+            "around": np.column_stack([x[left], y[left], z[left]]),
+            **{inside_block(block): xyz for block, xyz in inside.items()},
+        }
 
     def block_of(
         self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
     ) -> dict[str, NDArray]:
+        """Then, what tiles need of a block (column, row): from what was left around it and, in parts, inside."""
         x, y, z = around.T
         return cells_of_block(x, y, z, block, self._filter, inside).in_parts(_PART)
 
     def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
+        """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have them."""
         return GroundCells.names_within(_PART, *self._cells_in(box))
 
     def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]], box: Sequence[float]) -> GroundCells:
+        """At last, :attr:`from_blocks` in a box, meters, out of these arrays of the blocks that it touches."""
         cells = self._cells_in(box)
         parts = [part.within(*cells) for block in blocks for part in GroundCells.of_parts(block)]
         return GroundCells.joined(parts, len(self.windows))

@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ..stages import registry
-from ..stages.base import Stage
+from ..stages.hag_morphological import HagMorphological, inside_block
 from .grid import Box, TileGrid
 from .inputs import CloudIndex, InputSource
 from .pieces import Piece, cut_all
@@ -38,16 +37,12 @@ def block_file(block: tuple[int, int]) -> str:
     return f"{block[0]}_{block[1]}.block.npz"
 
 
-def _inside(block: tuple[int, int]) -> str:
-    return f"inside/{block[0]}/{block[1]}"
-
-
-def stage_of(plan: TilePlan) -> Stage:
+def stage_of(plan: TilePlan) -> HagMorphological:
     """The stage that the rounds before the tiles are for."""
     assert plan.first is not None
     given = plan.head[plan.first.at]
     options = {name: value for name, value in given.items() if name not in ("type", "tag", "inputs")}
-    return registry.get(given["type"])(options)
+    return HagMorphological(options)
 
 
 @dataclass(frozen=True)
@@ -67,11 +62,9 @@ class FirstRoundTask:
             halo = self.first.halo_m / context.unit
             cuts = cut_all(context.grid, self.tile, self.sources, halo, folder)
             left, arrays, messages = run_first(context, cuts, self.first) if cuts else ([], {}, [])
-        arrays["around"] = np.concatenate([np.empty((0, 3)), *(one.around for one in left)])
-        for block in {block for one in left for block in one.inside}:
-            arrays[_inside(block)] = np.concatenate(
-                [one.inside[block] for one in left if block in one.inside]
-            )
+        left.append({"around": np.empty((0, 3))})
+        for name in {name for one in left for name in one}:
+            arrays[name] = np.concatenate([one[name] for one in left if name in one])
         save_arrays(self.target, arrays)
         return {"outputs": written([self.target]), "messages": messages}
 
@@ -94,7 +87,7 @@ class BlockTask:
         for path in self.tiles:
             x, y, _ = points = load_arrays(path, ["around"])["around"].T
             parts.append(points[:, (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)])
-        inside = (load_arrays(path, [_inside(self.block)]) for path in self.tiles)
+        inside = (load_arrays(path, [inside_block(self.block)]) for path in self.tiles)
         mine = (points for found in inside for points in found.values())
         block = stage_of(self.plan).block_of(np.concatenate(parts, axis=1).T, mine, self.block)
         save_arrays(self.target, block)

@@ -14,7 +14,8 @@ from ..classifier.modelfile import shipped
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import writes_las
 from ..pipeline.run import Pipeline
-from ..stages.base import Blocks, Stage
+from ..stages.base import Stage
+from ..stages.hag_morphological import Blocks, HagMorphological
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
@@ -169,14 +170,14 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
 
 
 def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) -> FirstRound | None:
-    """Find the one stage that needs little of points far away; it then reaches less far, and so do the tiles."""
+    """Find the stage whose far-reaching raster is made before; it then needs no halo."""
     for at, step in enumerate(head):
         if step.ours is None:
             continue
-        if (near := step.ours.near_halo_m()) is not None:
+        if isinstance(step.ours, HagMorphological):
             kept = _kept(readers, head[:at])
             found = FirstRound(at, sum(reaches[:at]), sum(reaches[at:]), step.ours.blocks(), kept)
-            reaches[at] = min(near, reaches[at])
+            reaches[at] = 0.0
             if kept is not None:
                 reaches[:at] = [0.0] * at
             return found

@@ -12,7 +12,7 @@ import numpy as np
 from ..base import checks
 from ..base.errors import OptionError
 from ..base.resources import available_threads, free_memory
-from ..stages.base import Blocks
+from ..stages.hag_morphological import Blocks
 from .grid import Box
 
 #: Ways to cut the output.

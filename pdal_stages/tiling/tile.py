@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from ..pipeline.las_output import check_writers, flag_splitter
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of
 from ..stages import registry
-from ..stages.base import Left
+from ..stages.hag_morphological import HagMorphological
 from ..stages.points import HOLDS_NOWHERE
 from ..stages.polygons import TOUCH_NONE
 from .grid import Box, TileGrid, inside
@@ -128,7 +128,7 @@ def run_head(
         )
         for one in ours.values():
             one.stage.own_points = OUTSIDE
-            if before is not None and one.number == from_afar:
+            if before is not None and one.number == from_afar and isinstance(one.stage, HagMorphological):
                 one.stage.from_blocks = before.blocks
         most = max((one.stage.most_neighbors() for one in ours.values()), default=0)
         pipeline.execute(arrays=False)
@@ -143,7 +143,7 @@ def run_head(
 
 def run_first(
     context: RunContext, cuts: list[Piece], first: FirstRound
-) -> tuple[list[Left], dict[str, NDArray], list[str]]:
+) -> tuple[list[dict[str, NDArray]], dict[str, NDArray], list[str]]:
     """Run the stages before the one that looks far, on a tile and the surroundings that they need.
 
     What that stage needs of the tile's own points, view by view; new values that the stages before it gave, as arrays named
@@ -151,7 +151,7 @@ def run_first(
     """
     marks = _marks(cuts, context, first.kept or () if first.at else ())
     views: list[dict[str, NDArray]] = []
-    found: list[Left] = []
+    found: list[dict[str, NDArray]] = []
 
     def left(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         mine = ins[OUTSIDE] < 0
@@ -163,7 +163,7 @@ def run_first(
         stages = _marked(callbacks, marks)
         head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
         head[0] |= _after(marks)
-        stage = Pipeline([*stages, *head], whole=False).expanded.ours[-1].stage
+        stage = cast(HagMorphological, Pipeline([*stages, *head], whole=False).expanded.ours[-1].stage)
         run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
         pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
         pipeline.execute(arrays=False)
