@@ -45,7 +45,7 @@ class PlainStream:
         self.stream.write(plain(text))
         return len(text)
 
-    def writelines(self, lines: Any) -> None:
+    def writelines(self, lines: Iterable[str]) -> None:
         for line in lines:
             self.write(line)
 
@@ -106,23 +106,17 @@ class RunLog:
                 self._stderr.write(f"pdal-stages: the log cannot be written any more: {error.strerror}\n")
 
 
-class LoggedStream:
-    """A text stream whose lines go to a log as well."""
+class LoggedStream(PlainStream):
+    """The same, whose lines go to a log as well."""
 
     def __init__(self, stream: Any, log: RunLog) -> None:
-        self.stream, self.log = stream, log
+        super().__init__(stream)
+        self.log = log
         self._begun = threading.local()  # a line may come in parts; those of threads are not mixed
 
     def write(self, text: str) -> int:
-        self.stream.write(text)
+        super().write(text)
         *lines, self._begun.line = (getattr(self._begun, "line", "") + text).split("\n")
         for line in lines:
             self.log.add(line)
         return len(text)
-
-    def writelines(self, lines: Iterable[str]) -> None:
-        for line in lines:
-            self.write(line)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.stream, name)

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import ctypes
 import math
+import multiprocessing
+import os
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,7 +22,6 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.errors import StageError, optional_import
-from ..base.ownprocess import in_own_process
 from .found import Table
 
 #: Holes smaller than this are closed, m2.
@@ -64,7 +66,20 @@ def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
     linked = sys.platform.startswith("linux") and any(
         hasattr(ctypes.CDLL(None), name) for name in ("GEOSversion", "GDALVersionInfo")
     )
-    return in_own_process(function, *arguments) if linked else function(*arguments)
+    if not linked:
+        return function(*arguments)
+    context = multiprocessing.get_context("spawn")
+    context.set_executable(_interpreter())
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def _interpreter() -> str:
+    """The program of the Python that this is, inside a program that embeds it."""
+    names = (f"python3.{sys.version_info.minor}", "python3")
+    inside = (os.path.join(prefix, "bin", name) for prefix in (sys.prefix, sys.base_prefix) for name in names)
+    given = [sys.executable] if os.path.basename(sys.executable or "").startswith("python") else []
+    return next((path for path in (*given, *inside) if os.access(path, os.X_OK)), "python3")
 
 
 def raw_outlines(table: Table, size: float, *, hole: float = SMALLEST_HOLE) -> list[Any]:
