@@ -144,6 +144,8 @@ def run_on_view(
     for name in stage.reads():
         if name not in ins:
             stage.take(points, name)  # raises, naming the stage that makes it
+    if not points.count:
+        return run_on_nothing(stage)
     points.lent_by_pdal = isinstance(ins, dict)
     for name, values in stage.run(points).items():
         target = ins[name].dtype
@@ -155,15 +157,15 @@ def run_on_view(
     return points.report
 
 
-def run_on_nothing(stage: Stage, where: str) -> Report:
+def run_on_nothing(stage: Stage, where: str | None = None) -> Report:
     """A stage's report on no points at all."""
-    names = ("X", "Y", "Z", *stage.reads(), *stage.creates())
-    points = stage.points({name: np.empty(0) for name in names})
-    try:
-        stage.run(points)
-    except StageError as error:
-        raise error.at(where) from None
-    return points.report
+    if stage.needs_points:
+        raise StageError(
+            f"there are no points to {stage.needs_points}",
+            where=where,
+            cure="Check the reader's file and the filters before this stage",
+        )
+    return Report({"points": 0})
 
 
 def as_stage_error(error: BaseException, where: str) -> StageError:

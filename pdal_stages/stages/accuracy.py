@@ -49,6 +49,7 @@ class AccuracyStage(Stage):
         "Write the files first, then compare them: pdal-stages accuracy FILE --reference-dimension Reference"
     )
     where_help = "Only points inside are compared."
+    needs_points = "compare"
     dimension: str = option("string", "Classification", "The classes to judge")
     reference: str = option("string", "Reference", "The true classes, e.g. kept with filters.ferry")
     classes: list[int] = option(
@@ -128,11 +129,6 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         return [self.dimension, self.reference]
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            raise StageError(
-                "there are no points to compare",
-                cure="Check the reader's file and the filters before this stage",
-            )
         self.compare([("", points)], points.report)
         return {}
 

@@ -77,6 +77,8 @@ class Stage(ABC):
     where_help: ClassVar[str] = ""
     #: Whether `where` only chooses what to compute, so that tiles may narrow it down to what is seen.
     where_chooses: ClassVar[bool] = False
+    #: What a stage that cannot run without points does with them, as a message says it.
+    needs_points: ClassVar[str] = ""
     #: For a stage that needs all points at once: what to do instead of running it in tiles.
     instead_of_tiles: ClassVar[str] = ""
     #: For a stage that a model file may carry, to be run by whoever applies it: the options that the file may give. Model
@@ -192,7 +194,7 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, points: Points) -> dict[str, NDArray]:
-        """Do the work; return the dimensions that change, one value per point."""
+        """Do the work on points, of which there are some; return the dimensions that change, one value per point."""
 
     @classmethod
     def schema(cls) -> dict[str, Any]:

@@ -50,8 +50,6 @@ they leave (`left`).
         return self.code
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            return {}
         free = points.inside & ~points.ignored(self.ignore) & ~points.chosen(self.keep)
         before, deck = points.class_codes, points.dimension("Deck")
         parts = free & (deck == PARTS) & np.isin(before, _MISTAKEN)

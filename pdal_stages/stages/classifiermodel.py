@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import ModelError, OptionError, StageError
+from ..base.errors import ModelError, OptionError
 from ..base.files import check_writable
 from ..base.outputs import MODEL, Output
 from ..base.report import Report
@@ -58,6 +58,7 @@ class ClassifierModel(Stage):
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
     instead_of_tiles = "Train with the command pdal-stages train, which takes surveys of any size"
     where_help = "Samples are drawn from the points inside; all points are neighbors."
+    needs_points = "train on"
     filename: str = option("filename", None, "The model file to write", required=True)
     label: str = option("string", "Classification", "Dimension that holds the labels")
     base: str | None = trained("base")
@@ -220,11 +221,6 @@ classes.
         return [self.label, *own, *required(self.training.inputs)]
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            raise StageError(
-                "there are no points to train on",
-                cure="Check the reader's file and the filters before this stage",
-            )
         training = self.training_on(points)
         clouds = [cloud for _, cloud in self.surveys(self.cloud_of(points, training))]
         self.finish(train(clouds, training), points.report)

@@ -68,8 +68,6 @@ cloud. The feet of walls stay what they are: surveys label them building as ofte
         return 6
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            return {}
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         change = points.inside & ~ignored & ~kept
         names = {"height": "HeightAboveGround", "ground": "Ground"}

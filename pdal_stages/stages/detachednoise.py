@@ -76,8 +76,6 @@ marks of the whole cloud. The counts are in the metadata as `low` and `high`.
         return max(self.low_class, self.high_class)
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            return {}
         ignored = points.ignored(self.ignore)
         found = detached_noise(
             *points.axes,

@@ -74,8 +74,6 @@ the unit of Z.
         return terrain_reach(x, y, points.usable(self.ignore), wanted, box, self.cell, self.resolution)
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            return {"HeightAboveGround": np.empty(0)}
         x, y, z = points.xyz.T
         forms = points.usable(self.ignore)
         if points.mask is not None and not points.mask.any():  # which the report says

@@ -209,8 +209,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             raise
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            return {}
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
         points.report.figures["kept"] = points.counted(inside & kept & ~ignored)

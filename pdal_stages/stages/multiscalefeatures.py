@@ -139,8 +139,6 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
 
     def run(self, points: Points) -> dict[str, NDArray]:
         plan, names = self.plan, self.columns
-        if points.count == 0:
-            return {name: np.empty(0, np.float32) for name in self.creates()}
         bins, threshold = _read_bins(self.bins)
         ignored = points.ignored(self.ignore)
         there = np.flatnonzero(~ignored)  # rows of the points that are seen

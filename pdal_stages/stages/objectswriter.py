@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from numpy.typing import NDArray
 
-from ..base.errors import StageError
 from ..base.outputs import Output
 from ..objects import find_objects
 from ..objects.outlines import with_vector
@@ -22,6 +21,7 @@ class ObjectsWriter(ObjectOptions, Stage):
     summary = "Write buildings, trees, spans of wires and bridge decks to a vector file"
     instead_of_tiles = "Write the points first, then: pdal-stages objects FILES town.gpkg"
     where_help = "Points outside form no object."
+    needs_points = "find objects in"
     filename: str = option(
         "filename",
         None,
@@ -71,10 +71,6 @@ tell what is to be checked; beside other files lies a `.qml`. Needs the extra `v
         return ["Classification"]
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            raise StageError(
-                "there are no points", cure="Check the reader's file and the filters before this stage"
-            )
         from ..reports.objectlayers import write_objects
 
         found, refused = find_objects(self.cells(points), self.settings).without(self.refuse)

@@ -63,8 +63,6 @@ class a point has.
         return max((overlay.code for overlay in self.overlays), default=0)
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            return {}
         change = points.inside & ~points.ignored(self.ignore) & ~points.chosen(self.keep)
         x, y = (np.asarray(points.arrays[name], np.float64) for name in "XY")
         box = float(x.min()), float(y.min()), float(x.max()), float(y.max())

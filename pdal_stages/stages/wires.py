@@ -61,8 +61,6 @@ that they leave as `left`.
         return max(self.code, self.tower_code) if self.towers else self.code
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        if points.count == 0:
-            return {}
         ignored = points.ignored(self.ignore)
         height = np.asarray(points.dimension("HeightAboveGround"), np.float64)
         free = points.inside & ~ignored & ~points.chosen(self.keep)
