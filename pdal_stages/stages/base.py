@@ -14,7 +14,7 @@ from ..base.outputs import Output
 from ..base.units import named_unit
 from .options import Option, option, parse_options
 from .points import Points
-from .where import Expression
+from .selection import Expression
 
 #: What `where` means to stages of heights.
 HEIGHTS_OUTSIDE = (
@@ -68,7 +68,9 @@ class Stage(ABC):
     example: ClassVar[dict[str, Any]] = {}
     #: Stages shown round the example in the docs.
     before: ClassVar[tuple[dict[str, Any], ...]] = ()
-    after: ClassVar[tuple[Any, ...]] = ("output.laz",)
+    after: ClassVar[tuple[Any, ...]] = (
+        {"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},
+    )
     #: Paragraphs of the docs page (Markdown).
     details: ClassVar[str] = ""
     #: Dimensions, for the docs of a stage whose example cannot be made without a file.
@@ -212,3 +214,15 @@ class Stage(ABC):
             "required": ["type"] + [o.name for o in cls.all_options() if o.required],
             "additionalProperties": False,
         }
+
+
+class ClassStage(Stage):
+    """Base of the stages that give points another class, and change nothing else."""
+
+    where_chooses = True
+
+    def reads(self) -> list[str]:
+        return ["Classification"]
+
+    def creates(self) -> dict[str, str]:
+        return {"Classification": "uint8_t"}

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import BRIDGE
 from ..terrain.decks import PARTS, SURFACE
-from .base import Stage
+from .base import ClassStage
 from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
 from .selection import Selection
@@ -16,10 +16,9 @@ from .selection import Selection
 _MISTAKEN = (2, 6)
 
 
-class Bridges(Stage):
+class Bridges(ClassStage):
     type = "filters.bridges"
     summary = "Give bridge decks their class, which leave ground and buildings"
-    where_chooses = True
     where_help = "Points outside keep their class."
     code: int = option("integer", BRIDGE, "Class code of bridge decks", minimum=0, maximum=255)
     ignore: Selection = ignore_option("Points that keep their class")
@@ -37,14 +36,10 @@ they leave (`left`).
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "decks": True},
         {"type": "filters.modelclassifier", "model": "standard"},
     )
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
     example = {"type": "filters.bridges"}
 
     def reads(self) -> list[str]:
         return ["Classification", "Deck"]
-
-    def creates(self) -> dict[str, str]:
-        return {"Classification": "uint8_t"}
 
     def largest_class(self) -> int:
         return self.code

@@ -6,16 +6,15 @@ from numpy.typing import NDArray
 
 from ..base.asprs import bands
 from ..objects.consistency import RULES, consistent, reach
-from .base import Stage
+from .base import ClassStage
 from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts
 from .selection import Selection
 
 
-class Consistency(Stage):
+class Consistency(ClassStage):
     type = "filters.consistency"
     summary = "Mend classes that contradict their surroundings, by named rules that count what they change"
-    where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors."
     ground: bool = option(
         "boolean",
@@ -48,7 +47,6 @@ cloud. The feet of walls stay what they are: surveys label them building as ofte
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
         {"type": "filters.modelclassifier", "model": "standard"},
     )
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
     example = {"type": "filters.consistency"}
 
     def check(self) -> None:
@@ -57,9 +55,6 @@ cloud. The feet of walls stay what they are: surveys label them building as ofte
     @property
     def _rules(self) -> list[str]:
         return [rule for rule in RULES if self.options[rule]]
-
-    def creates(self) -> dict[str, str]:
-        return {"Classification": "uint8_t"}
 
     def halo_m(self) -> float:
         return reach(self._rules)

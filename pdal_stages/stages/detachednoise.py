@@ -7,16 +7,15 @@ from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
 from ..terrain.detached import REACH, detached_noise
-from .base import Stage
+from .base import ClassStage, Stage
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
 
 
-class DetachedNoise(Stage):
+class DetachedNoise(ClassStage):
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
-    where_chooses = True
     where_help = "Points outside are not marked but still serve as neighbors."
     cluster: int = option(
         "integer", 60, "The most points of a cluster of noise", minimum=1, maximum=1_000_000
@@ -57,17 +56,8 @@ what is some 15 m above everything is marked.
 Nothing depends on the order of points, and the grid is anchored to absolute coordinates: a tile with its halo gets the
 marks of the whole cloud. The counts are in the metadata as `low` and `high`.
 """
-    after = (
-        {"type": "filters.hag_morphological"},
-        {"type": "writers.las", "filename": "output.laz", "forward": "all"},
-    )
+    after = ({"type": "filters.hag_morphological"}, *Stage.after)
     example = {"type": "filters.detachednoise"}
-
-    def reads(self) -> list[str]:
-        return ["Classification"]
-
-    def creates(self) -> dict[str, str]:
-        return {"Classification": "uint8_t"}
 
     def halo_m(self) -> float:
         return REACH

@@ -51,7 +51,6 @@ errors. Where heights themselves matter use `filters.hag_morphological`, or `fil
 [the comparison](../benchmarks.md) says how far apart they are. Lengths are meters; `HeightAboveGround` is in
 the unit of Z.
 """
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}
 
     def check(self) -> None:

@@ -132,7 +132,6 @@ is a roof.
 Lengths are meters, whatever the unit of the points; `HeightAboveGround` and the heights above openings are in the unit
 of Z.
 """
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.hag_morphological", "ground": True}
 
     def check(self) -> None:

@@ -102,7 +102,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
 - Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin` and `Probability_<code>` (float)
 - Halo: that of the model's neighborhoods"""
     before = ({"type": "filters.hag_minima"},)
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
     def check(self) -> None:

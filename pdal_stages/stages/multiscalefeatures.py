@@ -75,7 +75,6 @@ name one when several files must have comparable features. Features are 32-bit f
 features inside and need no dimensions at all. In clouds of hundreds of points per square meter `voxel` keeps the
 time per point bounded, whatever the radius: see [dense clouds](../features.md#dense-clouds).
 """
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {
         "type": "filters.multiscalefeatures",
         "neighborhoods": "c1,c2,c3,c5,kopt",

@@ -61,7 +61,6 @@ Tiles see what it takes: crowns and ground end within 150 m, and where a buildin
 the tile is read wider. To write objects as polygons and points use `pdal-stages objects` or `writers.objects`.
 """
     before = ({"type": "filters.modelclassifier", "model": "town.model"},)
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},)
     example = {"type": "filters.objects", "judged": True}
 
     def reads(self) -> list[str]:

@@ -15,8 +15,7 @@ from ..base.errors import DimensionError, StageError
 from ..base.report import Report
 from ..base.resources import give_back
 from ..base.units import Units, reprojection_cure, units_of_wkt
-from .selection import Selection
-from .where import Expression
+from .selection import Expression, Selection
 
 #: Which stage makes a dimension that a user may lack.
 MAKERS = {

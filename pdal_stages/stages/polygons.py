@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..objects.outlines import with_vector
 from ..objects.overlay import Overlay, inside_of
-from .base import Stage
+from .base import ClassStage
 from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
 from .selection import Selection
@@ -16,10 +16,9 @@ from .selection import Selection
 TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
 
 
-class Polygons(Stage):
+class Polygons(ClassStage):
     type = "filters.polygons"
     summary = "Give points inside the polygons of any OGR file a class, such as water inside lakes"
-    where_chooses = True
     where_help = "Points outside keep their class."
     polygons: list = option(
         "list",
@@ -45,7 +44,6 @@ class a point has.
     dimensions_help = (
         "- Reads: X, Y, `Classification`\n- Writes: `Classification` (uint8_t)\n- Halo: 0 m round a tile"
     )
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
     example = {"type": "filters.polygons", "polygons": ["lakes.gpkg=9"]}
 
     def check(self) -> None:
@@ -55,9 +53,6 @@ class a point has.
 
     def inputs(self) -> list[str]:
         return [overlay.file for overlay in self.overlays if "://" not in overlay.file]
-
-    def creates(self) -> dict[str, str]:
-        return {"Classification": "uint8_t"}
 
     def largest_class(self) -> int:
         return max((overlay.code for overlay in self.overlays), default=0)

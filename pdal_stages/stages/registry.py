@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections import UserDict
+from collections.abc import Mapping
 
 from ..base.errors import PipelineError, suggest
 from .base import Stage
@@ -20,27 +20,20 @@ _MODULES = {
 }  # fmt: skip
 
 
-class _Stages(Mapping[str, type[Stage]]):
+class _Stages(UserDict):
     def __getitem__(self, name: str) -> type[Stage]:
-        module = importlib.import_module(f"{__package__}.{_MODULES[name]}")
+        module = importlib.import_module(f"{__package__}.{self.data[name]}")
         return next(
             v for v in vars(module).values() if isinstance(v, type) and getattr(v, "type", "") == name
         )
 
-    def __contains__(self, name: object) -> bool:
-        return name in _MODULES
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(_MODULES)
-
-    def __len__(self) -> int:
-        return len(_MODULES)
+_stages = _Stages(_MODULES)
 
 
-@cache
 def stages() -> Mapping[str, type[Stage]]:
     """All stages, by type name, in alphabetical order."""
-    return _Stages()
+    return _stages
 
 
 def get(type_name: str) -> type[Stage]:

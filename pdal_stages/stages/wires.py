@@ -9,16 +9,15 @@ from ..base.asprs import TOWER, WIRE
 from ..terrain import towers
 from ..terrain.towers import find_towers
 from ..terrain.wires import REACH, find_wires
-from .base import Stage
+from .base import ClassStage
 from .options import ignore_option, keep_option, option
 from .points import Points, class_counts
 from .selection import Selection
 
 
-class Wires(Stage):
+class Wires(ClassStage):
     type = "filters.wires"
     summary = "Give wires their class, long thin lines that hang in the air, and the towers that hold them"
-    where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors."
     code: int = option("integer", WIRE, "Class code of wires", minimum=0, maximum=255)
     towers: bool = option(
@@ -45,14 +44,10 @@ that they leave as `left`.
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
         {"type": "filters.modelclassifier", "model": "standard"},
     )
-    after = ({"type": "writers.las", "filename": "output.laz", "forward": "all"},)
     example = {"type": "filters.wires"}
 
     def reads(self) -> list[str]:
         return ["Classification", "HeightAboveGround"]
-
-    def creates(self) -> dict[str, str]:
-        return {"Classification": "uint8_t"}
 
     def halo_m(self) -> float:
         return REACH + (towers.REACH if self.towers else 0.0)
