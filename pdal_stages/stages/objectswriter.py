@@ -8,7 +8,7 @@ from ..base.outputs import Output
 from ..objects import find_objects
 from ..objects.outlines import with_vector
 from .base import Stage
-from .objectoptions import ObjectOptions
+from .objects import ObjectOptions
 from .options import option
 from .points import Points
 
