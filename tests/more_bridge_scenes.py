@@ -78,65 +78,6 @@ def skewed(seed=0, half=6.0, reach=35.0, skew=1.2, turn=0.5):
     return Scene(terrain, slabs, _trees(rng, (-90, 90), (22, 60), 25, (6, 15)), turn, 260.0, 140.0)
 
 
-def beside_roofs(seed=0, half=7.0, reach=80.0, height=8.0, turn=0.6, side=3.0):
-    """A viaduct between flat roofs as high as its deck, 3 m beside it, with crowns in the gap."""
-    rng = np.random.default_rng(seed)
-
-    def top(s):
-        return height + 0.0 * s
-
-    def terrain(s, t):
-        bank = _road(t, top(s), 0.0, half + 1.0, 0.7)
-        front = np.clip(bank - 0.8 * np.clip(reach - np.abs(s), 0, None), 0, None)
-        return np.where(np.abs(s) > reach, bank, front), np.full(len(s), GROUND)
-
-    slabs: list[Slab] = []
-    _deck(slabs, -reach, reach, -half, half, top, 1.4, 1.0)
-    for s in np.arange(-60, 46, 26.0):
-        for sign in (-1, 1):
-            one, other = sorted((sign * (half + side), sign * (half + side + 14)))
-            slabs.append(Slab(s, s + 18, one, other, lambda a: height + 0.1 + 0 * a, height, BUILDING))
-    gap = (half + 0.8, half + side)
-    return Scene(terrain, slabs, _trees(rng, (-70, 70), gap, 25, (8, 11)), turn, 260.0, 110.0)
-
-
-def _flat(s, t):
-    return 0.05 * np.sin(s / 17), np.full(len(s), GROUND)
-
-
-def _profile(reach, rise, grade):
-    return lambda s: np.clip(rise - grade * np.clip(np.abs(s) - reach, 0, None), 0, None)
-
-
-def _massive(slabs, start, end, half, top, rise, step=0.35):
-    """Layers, so that beams hit upright faces where they meet them."""
-    for down in np.arange(0.0, rise, step):
-        slabs.append(Slab(start, end, -half, half, lambda s, d=down: top(s) - d, step, GROUND))
-
-
-def walled_ramps(seed=0, half=6.0, reach=60.0, rise=7.0, grade=0.05, turn=0.4):
-    """A bridge of 120 m whose ramps rise between upright walls on both sides."""
-    rng = np.random.default_rng(seed)
-    top, far = _profile(reach, rise, grade), reach + rise / grade
-    slabs: list[Slab] = []
-    _deck(slabs, -reach, reach, -half, half, top, 1.6)
-    for start, end in ((-far, -reach), (reach, far)):
-        _massive(slabs, start, end, half, top, rise)
-        for low, high in ((-half, -half + 0.3), (half - 0.3, half)):
-            slabs.append(Slab(start, end, low, high, lambda s: top(s) + 1.0, 1.0, OTHER))
-    _cars(slabs, rng, -reach - 90, reach + 90, (-2.5, 2.5), top, 22.0)
-    _piers(slabs, top, reach, half, 25.0, 0.0)
-    return Scene(_flat, slabs, [], turn, 2 * far + 90.0, 120.0)
-
-
-def walled_road(seed=0, turn=0.6):
-    """A road that rises to 6 m between upright walls, and falls again."""
-    top = _profile(20.0, 6.0, 0.06)
-    slabs: list[Slab] = []
-    _massive(slabs, -120, 120, 4.5, top, 6.0)
-    return Scene(_flat, slabs, [], turn, 300.0, 110.0)
-
-
 def upright(density=16.0, seed=0, reach=100.0, half=6.0, high=8.0, bank=16.0, wet=None, below=True):
     """A deck over a valley of such banks; points and true classes.
 
@@ -220,7 +161,6 @@ def levee(seed=0, turn=0.5):
 MORE_SCENES = {
     "deep valley, bent": deep_valley,
     "skewed": skewed,
-    "walled ramps": walled_ramps,
 }
 #: As simple simulators make them: points and classes.
 UPRIGHT_SCENES = {
@@ -233,5 +173,4 @@ TRAPS = {
     "terraces": terraces,
     "parking on a roof, with a ramp": parking_roof,
     "dike and mole": levee,
-    "a road between walls": walled_road,
 }

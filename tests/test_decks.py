@@ -11,15 +11,15 @@ import pytest
 from bridge_scenes import DECK, GROUND, LEAF, OTHER, SCENES, Scene, Slab, scan, viaduct
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from more_bridge_scenes import MORE_SCENES, TRAPS, UPRIGHT_SCENES, beside_roofs
+from more_bridge_scenes import MORE_SCENES, TRAPS, UPRIGHT_SCENES
 
 import pdal_stages as ps
 from pdal_stages.cli import main
 from pdal_stages.stages.bridges import Bridges
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import decks, walkable
+from pdal_stages.terrain.cells import GAP, levels
 from pdal_stages.terrain.decks import PARTS, SURFACE, find_decks, level_points
-from pdal_stages.terrain.levels import GAP, levels
 from pdal_stages.terrain.morphological import filtered_ground, reach
 from pdal_stages.terrain.walkable import ACROSS, DOWN, NOTHING, ON, ROUGH, SMOOTH, SOLID, WALLED
 
@@ -182,8 +182,12 @@ def test_the_kernels_equal_the_slow_reference(seed, water):
     xyz = small(seed, water)[0] - (85_000, 447_000, 0)
     held = slow_levels(xyz)
     column, row = np.floor(xyz[:, :2].T).astype(np.int64)
-    left, bottom, h, w = decks._raster(column, row)
-    z, lowest, start = levels(xyz[:, 2].copy(), np.ones(len(xyz), bool), column, row, left, bottom, h, w)
+    left, bottom = column.min(), row.min()
+    h, w = row.max() + 1 - bottom, column.max() + 1 - left
+    cell = (row - bottom) * w + column - left
+    order, begins = levels(xyz[:, 2], cell)
+    lowest = order[begins]
+    z, start = xyz[lowest, 2], np.searchsorted(cell[lowest], np.arange(h * w + 1))
     cells = [(k // w + bottom, k % w + left) for k in np.repeat(np.arange(h * w), np.diff(start))]
     assert sorted(zip(cells, z, strict=True)) == sorted(
         (c, q) for c, heights in held.items() for q in heights
@@ -232,13 +236,6 @@ def test_bridges_whose_ground_is_seen_or_whose_river_is_not_are_found(name):
 def test_what_is_no_bridge_is_none(name):
     xyz, codes = scan(TRAPS[name](), 8.0)
     assert (found(xyz)[codes != OTHER] > 0).mean() < 0.005
-
-
-def test_roofs_beside_a_viaduct_are_hardly_of_it():
-    """Crowns and walls fill the gap of 3 m, and roofs are as high as the deck."""
-    xyz, codes = scan(beside_roofs(), 8.0)
-    deck = found(xyz) > 0
-    assert deck[codes == DECK].mean() > 0.75 and (deck & (codes == 6)).mean() < 0.005
 
 
 def test_without_a_bridge_nothing_is_found():
@@ -303,8 +300,8 @@ def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
     xyz = np.vstack([seen("viaduct of two decks", 4.0)[0], seen("river", 4.0)[0] + (700, 300, 0)])
     whole = found(xyz)
     assert (whole > 0).sum() > 10_000
-    monkeypatch.setattr("pdal_stages.terrain.patches.LARGEST", 100)
-    monkeypatch.setattr("pdal_stages.terrain.patches.SIDE", 128)
+    monkeypatch.setattr("pdal_stages.terrain.cells.LARGEST", 100)
+    monkeypatch.setattr("pdal_stages.terrain.cells.SIDE", 128)
     assert np.array_equal(found(xyz), whole)
 
 

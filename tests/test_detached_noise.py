@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.stages.detachednoise import DetachedNoise
-from pdal_stages.terrain import belowground, clusters, detached
+from pdal_stages.terrain import belowground, detached
 from pdal_stages.terrain.detached import detached_noise
 
-SIDE = clusters.SIDE
+SIDE = detached.SIDE
 
 
 def scene(seed=0, side=90, density=6.0, origin=(0.0, 0.0, 0.0)):
@@ -54,7 +54,7 @@ def scene(seed=0, side=90, density=6.0, origin=(0.0, 0.0, 0.0)):
 
 def slow_small(count, usual, most):
     """Voxels, as a mapping to their points, in small clusters; and points of each one's cluster."""
-    strong = {k for k, n in count.items() if n > int(clusters.WEAK * usual(k))}
+    strong = {k for k, n in count.items() if n > int(detached.WEAK * usual(k))}
     around = [d for d in product((-1, 0, 1), repeat=3) if any(d)]
     near = lambda k: [(k[0] + a, k[1] + b, k[2] + c) for a, b, c in around]  # noqa: E731
     small, size, seen = {}, {}, set()
@@ -71,7 +71,7 @@ def slow_small(count, usual, most):
                     queue.append(other)
         total = sum(count[m] for m in members)
         extent = np.ptp(np.array(members), axis=0).max()
-        widest = min(clusters.EXTENT + clusters.EXTENT_GROWTH * usual(start), clusters.LARGEST_EXTENT)
+        widest = min(detached.EXTENT + detached.EXTENT_GROWTH * usual(start), detached.LARGEST_EXTENT)
         for m in members:
             small[m], size[m] = total <= most and extent < widest, total
     for k in count:
@@ -110,8 +110,8 @@ def slow_plane(base, j, i, radius):
 def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
     """From the definition, one voxel at a time, with dictionaries and searches over everything."""
     at = np.floor(xyz * (1.0 / SIDE)).astype(int)[:, [1, 0, 2]]
-    block = clusters.BLOCK
-    whole = block << clusters.SCALES
+    block = detached.BLOCK
+    whole = block << detached.SCALES
     low = (at[:, :2].min(axis=0) - 1) // whole * whole
     at[:, :2] -= low
     h, w = -(-(at[:, :2].max(axis=0) + 2) // whole) * whole
@@ -139,8 +139,8 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         return known[key]
 
     small, size = slow_small(count, lambda k: density(k)[0], most)
-    for scale in range(1, clusters.SCALES + 1):
-        thin = [k for k in count if small[k] and density(k)[1] * clusters.SPACINGS > SIDE * 2 ** (scale - 1)]
+    for scale in range(1, detached.SCALES + 1):
+        thin = [k for k in count if small[k] and density(k)[1] * detached.SPACINGS > SIDE * 2 ** (scale - 1)]
         if not thin:
             break
         wider = lambda k, s=scale: (k[0] >> s, k[1] >> s, k[2])  # noqa: E731
@@ -328,10 +328,10 @@ def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
 def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
     xyz, _ = scene(6, 200, 2.0)
     found = detached_noise(xyz)
-    from pdal_stages.terrain import patches
+    from pdal_stages.terrain import cells
 
-    monkeypatch.setattr(patches, "LARGEST", 1000)
-    monkeypatch.setattr(patches, "SIDE", 64)
+    monkeypatch.setattr(cells, "LARGEST", 1000)
+    monkeypatch.setattr(cells, "SIDE", 64)
     assert np.array_equal(detached_noise(xyz), found)
 
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import filtered_ground, groundcells, openings, patches
+from pdal_stages.terrain import cells, filtered_ground, groundcells, openings
 from pdal_stages.terrain.morphological import reach
 from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii
 from pdal_stages.terrain.planes import surface
@@ -379,8 +379,8 @@ def test_pieces_and_threads_change_nothing(monkeypatch):
     noise = np.random.default_rng(0).random(len(x)) < 0.05
     whole, figures = {}, {}
     whole = filtered_ground(x, y, z, mask=~noise, threads=1, figures=figures, **SMALL)
-    monkeypatch.setattr(patches, "LARGEST", 1000)
-    monkeypatch.setattr(patches, "SIDE", 64)
+    monkeypatch.setattr(cells, "LARGEST", 1000)
+    monkeypatch.setattr(cells, "SIDE", 64)
     again = {}
     same(filtered_ground(x, y, z, mask=~noise, threads=2, figures=again, **SMALL), whole)
     assert again == figures
@@ -403,17 +403,17 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
         return real(raster, cell)
 
     monkeypatch.setattr(groundcells, "pits", looked_at)
-    monkeypatch.setattr(patches, "_FEW", 1 << 40)
-    monkeypatch.setattr(patches, "LARGEST", 1 << 40)
+    monkeypatch.setattr(cells, "_FEW", 1 << 40)
+    monkeypatch.setattr(cells, "LARGEST", 1 << 40)
     figures, again = {}, {}
     whole = filtered_ground(x, y, z, figures=figures, **options)
     assert len(shapes) == 1
     for few, largest, side in ((0, 1 << 40, 1024), (0, 20_000, 256)):
         shapes.clear()
-        monkeypatch.setattr(patches, "_FEW", few)
-        monkeypatch.setattr(patches, "_EMPTY", 1)
-        monkeypatch.setattr(patches, "LARGEST", largest)
-        monkeypatch.setattr(patches, "SIDE", side)
+        monkeypatch.setattr(cells, "_FEW", few)
+        monkeypatch.setattr(cells, "_EMPTY", 1)
+        monkeypatch.setattr(cells, "LARGEST", largest)
+        monkeypatch.setattr(cells, "SIDE", side)
         same(filtered_ground(x, y, z, figures=again, **options), whole)
         assert again == figures
         if spacing == 250:
@@ -425,11 +425,11 @@ def test_cost_of_strays_follows_their_number():
     rng = np.random.default_rng(0)
     x, y = np.concatenate([rng.uniform(0, 200, (2, 2000)), rng.uniform(-1e6, 1e6, (2, 300))], axis=1)
     column, row = (np.floor(v).astype(np.int64) for v in (x, y))
-    pieces = list(patches.patches(column, row, 400, 100))
+    pieces = list(cells.patches(column, row, 400, 100))
     own = np.concatenate([points[mine] for points, mine in pieces])
     assert np.array_equal(np.sort(own), np.arange(len(x)))
-    cells = sum(patches._cells(column[points], row[points]) for points, _ in pieces)
-    assert cells < 201 * 201 + 300 * 100
+    area = sum(cells._cells(column[points], row[points]) for points, _ in pieces)
+    assert area < 201 * 201 + 300 * 100
 
 
 def test_one_stray_point_costs_little_memory():

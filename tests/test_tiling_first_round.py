@@ -11,8 +11,8 @@ import pdal_stages as ps
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.cells import lowest_of_cells
 from pdal_stages.terrain.decks import level_points
-from pdal_stages.terrain.groundblocks import by_block, cells_of_block, reach_of_block
-from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
+from pdal_stages.terrain.groundblocks import GroundCells, by_block, cells_of_block, reach_of_block
+from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions
 from pdal_stages.terrain.morphological import reach_of_cells
 from pdal_stages.tiling import run_tiled, tile
 from pdal_stages.tiling.ground import FirstRoundTask
@@ -162,8 +162,10 @@ def blocks_of(points, options, near):
             box = i * side - around, j * side - around, (i + 1) * side + around, (j + 1) * side + around
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
             mine = inside.get((i, j), np.empty((0, 3)))
-            found.append(cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]]))
-    return GroundCells.joined(found, len(options.openings))
+            found.append(
+                cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]]).in_parts(256)
+            )
+    return GroundCells.of_blocks(found, len(options.openings))
 
 
 @pytest.mark.parametrize(
@@ -191,8 +193,7 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         wide = 3.0 + reach_of_cells(cell)
         around = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
         around = [edge + origin[n % 2] for n, edge in enumerate(around)]
-        blocks = blocks_of(np.array([x, y, z]), made, around)
-        cells = blocks.within(*(int(edge // cell) for edge in around))
+        cells = blocks_of(np.array([x, y, z]), made, around)
         some = filtered_ground(x[near], y[near], z[near], cells=cells, **options)
         core = away[near] < 0
         assert core.any()
@@ -202,7 +203,7 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
 
 def test_a_block_without_points_has_no_cells():
     none = cells_of_block(*np.empty((3, 0)), (3, -4), FilterOptions(openings=(5,)))
-    assert none.column.size == 0 and none.opened.shape == (1, 0)
+    assert none.cells["opened"].shape == (0, 1)
 
 
 def test_decks_of_blocks_are_those_of_the_whole():
@@ -219,11 +220,11 @@ def test_decks_of_blocks_are_those_of_the_whole():
     made = FilterOptions(openings=(5,), decks=True)
     inside = by_block(x, y, z, use, 1.0)
     parts = [
-        cells_of_block(x[left], y[left], z[left], (i, j), made, [inside[i, j]])
+        cells_of_block(x[left], y[left], z[left], (i, j), made, [inside[i, j]]).in_parts(256)
         for i in (0, 1)
         for j in (1, 2)
     ]
-    assert all(len(part.decks) for part in parts)
-    some = filtered_ground(x, y, z, mask=use, cells=GroundCells.joined(parts, 1), **options)
+    assert all(len(part["decks"]) for part in parts)
+    some = filtered_ground(x, y, z, mask=use, cells=GroundCells.of_blocks(parts, 1), **options)
     for key, values in some.items():
         assert np.array_equal(values, whole[key]), key

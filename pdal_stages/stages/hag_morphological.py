@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError
 from ..terrain.cells import lowest_of_cells
 from ..terrain.decks import level_points
-from ..terrain.groundblocks import by_block, cells_of_block, reach_of_block
-from ..terrain.groundcells import BLOCK_SIDE, FilterOptions, GroundCells
+from ..terrain.groundblocks import GroundCells, by_block, cells_of_block, reach_of_block
+from ..terrain.groundcells import BLOCK_SIDE, FilterOptions
 from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells
 from ..terrain.openings import opening_names
 from .base import HEIGHTS_OUTSIDE, Stage
@@ -204,17 +204,11 @@ of Z.
 
     def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
         """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have them."""
-        return GroundCells.names_within(_PART, *self._cells_in(box))
+        return GroundCells.names_within(_PART, *(math.floor(side / self.cell) for side in box))
 
-    def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]], box: Sequence[float]) -> GroundCells:
-        """At last, :attr:`from_blocks` in a box, meters, out of these arrays of the blocks that it touches."""
-        cells = self._cells_in(box)
-        parts = [part.within(*cells) for block in blocks for part in GroundCells.of_parts(block)]
-        return GroundCells.joined(parts, len(self.windows))
-
-    def _cells_in(self, box: Sequence[float]) -> list[int]:
-        """Columns and rows of a box in meters."""
-        return [math.floor(side / self.cell) for side in box]
+    def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
+        """At last, :attr:`from_blocks` out of these arrays of the blocks that a box touches."""
+        return GroundCells.of_blocks(blocks, len(self.windows))
 
     def run(self, points: Points) -> dict[str, NDArray]:
         usable = points.usable(self.ignore)

@@ -6,8 +6,8 @@ whose own rim is no drop, as a roof's is, or the cloud ends at one of them. Of w
 viaduct, each block is judged by the rim around it, and land at one end is enough. The rule of Sithole and Vosselman [S06],
 raised in a profile across and level with the ground in the profile along, is applied to the surface instead of to profiles.
 
-Limits: a deck that the cloud cuts at both ends is none, nor is one hardly wider than 3 m of few points; of roofs as high as
-a deck that touch it, or that crowns link to it, a part may be taken for it.
+Limits: a deck that the cloud cuts at both ends is none, nor is one hardly wider than 3 m of few points; a road raised
+between upright walls is taken for one, as are parts of roofs as high as a deck that touch it, or that crowns link to it.
 
 The grid is anchored to absolute coordinates, all reaches are bounded (:data:`REACH`) and counts are whole numbers: the order
 of points does not matter, and a tile with its surroundings finds the decks of the whole cloud.
@@ -22,12 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import cell_numbers
+from .cells import cell_numbers, keys_of, levels, patches
 from .deckrims import REACH as RIMS_REACH
 from .deckrims import deck_levels
-from .levels import levels
 from .linked import sums_around
-from .patches import patches
 from .walkable import AHEAD, FAR, ROUGH, SOLID, STEP, distance
 
 #: Side of the cells, meters: what is said of cells below is said of meters.
@@ -40,6 +38,8 @@ BANK = 0.7
 #: Cells beyond those that were found, to the deck's edge and under its cars; more than `NEXT` squared cells away only among
 #: cells of a deck, whose mean is at most so many cells away.
 BESIDE, NEXT, AMONG = 2, 2, 1.5
+_SIDE = 2 * BESIDE + 1
+_SQUARE = _SIDE * _SIDE
 #: How far away points matter, in meters.
 REACH = (RIMS_REACH + 2 * BESIDE) * CELL
 #: What points are: of a deck's surface, of its parapets and flanks, or of none.
@@ -53,58 +53,48 @@ def find_decks(
 
     Coordinates in meters, finite; only points to `use` make decks, and are of them. Works from about 2 points/m2 on.
     """
-    return decks_of_levels(x, y, z, use, levels_near_decks(x, y, z, use)[0])
+    return decks_of_levels(x, y, z, use, levels_near_decks(x[use], y[use], z[use]))
 
 
 def level_points(
     x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], use: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """Numbers of the points that are all :func:`find_decks` needs of places far away, ascending."""
-    column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
-    found = [np.empty(0, np.int64)]
-    if use.any():
-        for points, own in patches(column, row, 0, AHEAD):
-            at = np.arange(len(x))[points][own]
-            raster = _raster(column[at], row[at])
-            found.append(at[levels(z[at], use[at], column[at], row[at], *raster)[1]])
-    return np.sort(np.concatenate(found))
+    mine = np.flatnonzero(use)
+    order, begins = levels(z[mine], _keys(x[mine], y[mine]))
+    return np.sort(mine[order[begins]])
 
 
-def _raster(column, row):
-    left, bottom = int(column.min()), int(row.min())
-    return left, bottom, int(row.max()) + 1 - bottom, int(column.max()) + 1 - left
+def _keys(x, y):
+    return keys_of(cell_numbers(x, CELL), cell_numbers(y, CELL))
 
 
 def levels_near_decks(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    use: NDArray[np.bool_],
-    largest: int | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least, and what these are numbers of.
+    x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least.
 
-    Levels in cells up to twice BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, its kind; and the
-    numbers of the points that are their lowest. No raster has more than `largest` cells, see :func:`.patches.patches`.
+    Levels in cells up to twice BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, its kind.
     """
-    rows, numbers = [np.empty((0, 5))], [np.empty(0, np.int64)]
+    rows = [np.empty((0, 5))]
     if len(x):
         column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
-        for points, own in patches(column, row, int(REACH), FAR + AHEAD, largest):
-            at = np.arange(len(x))[points]
-            left, bottom, h, w = _raster(column[at], row[at])
-            heights, lowest, start = levels(z[at], use[at], column[at], row[at], left, bottom, h, w)
-            kind, deck = deck_levels(heights, start, h, w, left, bottom)
-            cell = np.repeat(np.arange(h * w), np.diff(start))
+        for points, own in patches(column, row, int(REACH), FAR + AHEAD):
+            c, r = column[points], row[points]
+            left, bottom = int(c.min()), int(r.min())
+            h, w = int(r.max()) + 1 - bottom, int(c.max()) + 1 - left
+            cell = (r - bottom) * w + c - left
+            order, begins = levels(z[points], cell)
+            lowest = order[begins]
+            heights, cell = z[points][lowest], cell[lowest]
+            kind, deck = deck_levels(heights, np.searchsorted(cell, np.arange(h * w + 1)), h, w, left, bottom)
             there = np.bincount(cell[deck], minlength=h * w).reshape(h, w) > 0
             near = (sums_around(there, 2 * BESIDE) > 0).ravel()[cell]
-            mine = np.zeros(len(at), bool)
+            mine = np.zeros(len(c), bool)
             mine[own] = True
             near &= mine[lowest]
-            point = at[lowest[near]]
-            rows.append(np.column_stack([column[point], row[point], heights[near], deck[near], kind[near]]))
-            numbers.append(point)
-    return np.concatenate(rows), np.concatenate(numbers)
+            rows.append(np.column_stack([c[lowest], r[lowest], heights, deck, kind])[near])
+    return np.concatenate(rows)
 
 
 def decks_of_levels(
@@ -116,73 +106,83 @@ def decks_of_levels(
 ) -> NDArray[np.uint8]:
     """What :func:`find_decks` says of points, from the levels that :func:`levels_near_decks` found before."""
     out = np.zeros(len(x), np.uint8)
-    if not len(table) or not len(x):
+    if not len(table):
         return out
-    column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
-    columns, rows = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
-    for part, _own in patches(columns, rows, 0, 2 * BESIDE + 1, 1 << 62):
-        mine = np.arange(len(table))[part]
-        mine = mine[np.lexsort((table[mine, 2], columns[mine], rows[mine]))]
-        left, bottom, h, w = _raster(columns[mine], rows[mine])
-        left, bottom, h, w = left - BESIDE, bottom - BESIDE, h + 2 * BESIDE, w + 2 * BESIDE
-        near = np.flatnonzero((column >= left) & (column < left + w) & (row >= bottom) & (row < bottom + h))
-        place = (rows[mine] - bottom) * w + columns[mine] - left
-        start = np.searchsorted(place, np.arange(h * w + 1))
-        found = np.zeros(len(near), np.uint8)
-        kind = table[mine, 4].astype(np.int8)
-        _mark(
-            z[near], use[near], column[near], row[near], left, bottom, h, w,
-            np.ascontiguousarray(table[mine, 2]), start, kind, table[mine, 3] != 0, found,
-        )  # fmt: skip
-        out[near] = np.where(found != 0, found, out[near])
+    keys = keys_of(*table[:, :2].astype(np.int64).T)
+    order = np.lexsort((table[:, 2], keys))
+    heights, deck, kind = table[order, 2], table[order, 3] > 0, table[order, 4].astype(np.int8)
+    cells, start = np.unique(keys[order], return_index=True)
+    # Every cell near a deck that holds a point has levels.
+    cell, there = _places(cells, _keys(x, y))
+    near = np.flatnonzero(use & there)
+    steps = np.arange(-BESIDE, BESIDE + 1)
+    around, held = _places(cells, cells[:, None] + ((steps << 32)[:, None] + steps).ravel())
+    found = np.zeros(len(near), np.uint8)
+    _mark(
+        z[near],
+        cell[near],
+        np.where(held, around, -1),
+        heights,
+        np.append(start, len(keys)),
+        kind,
+        deck,
+        found,
+    )
+    out[near] = found
     return out
 
 
+def _places(cells, wanted):
+    """Where keys are among the cells' ascending ones, and whether they are."""
+    place = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
+    return place, cells[place] == wanted
+
+
 @njit
-def _mark(z, use, column, row, left, bottom, h, w, heights, start, kind, deck, out):
+def _mark(z, cell, around, heights, start, kind, deck, out):
     """Say of points whether they are on a deck, or of its parts: in cells next to those that were found, and BESIDE cells
-    away among them, as around cars.
+    away among them, as around cars. `around` (cells, 25) numbers the cells round each, -1 where there is none.
     """
     for p in range(len(z)):
-        if not use[p]:
-            continue
-        j, i = row[p] - bottom, column[p] - left
         count = across = along = 0
         nearest = (BESIDE + 1) ** 2 * 2
         level = 0.0
-        for b in range(max(j - BESIDE, 0), min(j + BESIDE + 1, h)):
-            for a in range(max(i - BESIDE, 0), min(i + BESIDE + 1, w)):
-                squared = (a - i) ** 2 + (b - j) ** 2
-                for m in range(start[b * w + a], start[b * w + a + 1]):
-                    if deck[m] and -FLANK - 1.0 <= z[p] - heights[m] <= PARAPET + 1.0:
-                        count += 1
-                        across += a - i
-                        along += b - j
-                        if squared < nearest or (squared == nearest and heights[m] > level):
-                            nearest, level = squared, heights[m]
+        for k in range(_SQUARE):
+            b, a = k // _SIDE - BESIDE, k % _SIDE - BESIDE
+            c = around[cell[p], k]
+            if c < 0:
+                continue
+            for m in range(start[c], start[c + 1]):
+                if deck[m] and -FLANK - 1.0 <= z[p] - heights[m] <= PARAPET + 1.0:
+                    count += 1
+                    across += a
+                    along += b
+                    squared = a * a + b * b
+                    if squared < nearest or (squared == nearest and heights[m] > level):
+                        nearest, level = squared, heights[m]
         if count == 0 or not -FLANK <= z[p] - level <= PARAPET:
             continue
         if nearest > NEXT and across * across + along * along > (AMONG * count) ** 2:
             continue
-        if not _on_land(z[p], j, i, h, w, heights, start, kind, deck, nearest, level):
+        if not _on_land(z[p], around[cell[p]], heights, start, kind, deck, nearest, level):
             out[p] = SURFACE if abs(z[p] - level) <= (ON_RIM if nearest else ON_DECK) else PARTS
 
 
 @device
-def _on_land(z, j, i, h, w, heights, start, kind, deck, nearest, level):
+def _on_land(z, around, heights, start, kind, deck, nearest, level):
     """Whether ground that one walks on to, or the bank below, is as near to a point as its deck is."""
     below = z < level - ON_DECK
-    for b in range(max(j - BESIDE, 0), min(j + BESIDE + 1, h)):
-        for a in range(max(i - BESIDE, 0), min(i + BESIDE + 1, w)):
-            squared = (a - i) ** 2 + (b - j) ** 2
-            if squared > max(nearest, 2 if below else 0):
+    for k in range(_SQUARE):
+        b, a = k // _SIDE - BESIDE, k % _SIDE - BESIDE
+        c = around[k]
+        if c < 0 or a * a + b * b > max(nearest, 2 if below else 0):
+            continue
+        for m in range(start[c], start[c + 1]):
+            if deck[m] or kind[m] == ROUGH:
                 continue
-            for m in range(start[b * w + a], start[b * w + a + 1]):
-                if deck[m] or kind[m] == ROUGH:
-                    continue
-                if below:
-                    if abs(heights[m] - z) <= STEP + BANK * distance(a - i, b - j):
-                        return True
-                elif kind[m] == SOLID and abs(heights[m] - level) <= 2 * ON_DECK:
+            if below:
+                if abs(heights[m] - z) <= STEP + BANK * distance(a, b):
                     return True
+            elif kind[m] == SOLID and abs(heights[m] - level) <= 2 * ON_DECK:
+                return True
     return False

@@ -3,8 +3,10 @@
 Echoes from below (multiple reflections), birds, clouds, the sun. All is decided on an absolute grid, by counts and
 extremes, so that no order of points and no tile matters:
 
-1. A point is suspect if it is of a small cluster that nothing joins to the rest (:mod:`.clusters`). What is not suspect
-   gives every column of the grid its lowest and its highest point.
+1. A point is suspect if it is of a small cluster that nothing joins to the rest: a component of voxels that touch, by a
+   corner at least, with few points and little extent. In dense clouds, voxels with next to no points do not join others;
+   in thin ones, voxels are widened until they hold several spacings of points. What is not suspect gives every column of
+   the grid its lowest and its highest point.
 2. A suspect is high noise if it lies above all that is near, by a gap. The thinner the cloud, the wider the gap and the
    way looked: a tree, or a mast, may be a single point there. What hangs in line with others, as wires do, stays.
 3. A suspect is low noise if it lies below the ground (:mod:`.belowground`).
@@ -13,7 +15,8 @@ extremes, so that no order of points and no tile matters:
 from __future__ import annotations
 
 import math
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,12 +27,24 @@ from ..base.errors import StageError
 from ..base.jit import device, njit
 from .belowground import AROUND, ENOUGH, below_ground
 from .belowground import reach as below_reach
-from .cells import cell_numbers, columns
-from .clusters import BITS, BLOCK, CLUSTER_REACH, SCALES, SIDE, Voxels, small_clusters, surroundings
-from .linked import sums_around
-from .patches import patches
+from .cells import HIGHEST, cell_numbers, columns, patches
+from .linked import longest_sides, number_sets, sums_around
 
 LOW, HIGH = NOISE
+#: Side of a voxel, meters.
+SIDE = 1.5
+#: The greatest extent of a cluster in voxels: it grows with the points in a column, as clusters touch where they are many.
+EXTENT, EXTENT_GROWTH, LARGEST_EXTENT = 3, 0.3, 10
+#: Columns along the side of a block in which the density is measured.
+BLOCK = 8
+#: Voxels with fewer points than this share of those in a column of the surroundings join nothing.
+WEAK = 0.02
+#: Voxels are doubled in width so often, until that is so many spacings of points.
+SCALES, SPACINGS = 2, 1.6
+#: Levels of voxels above and below 0, and their bits in a key.
+LEVELS, BITS = 1 << 21, 22
+#: How far away, in meters, points can decide whether a point is of a small cluster: a component in full and its density.
+CLUSTER_REACH = (LARGEST_EXTENT + 3 * BLOCK + 2) * SIDE
 #: The gap in meters grows by this with each point of a cluster, and with the spacing of points beyond DENSE meters.
 GAP_OF_POINT, GAP_GROWTH, DENSE = 0.1, 10.0, 0.55
 #: The least columns within which nothing is as high, and so many spacings of points.
@@ -43,8 +58,8 @@ FAR = 20
 STRUNG, STRUNG_SHARE = 4, 0.3
 #: More than such a share of the points and of the columns within so many around, so many columns at least, is no noise.
 TOO_MANY, COLUMNS = 0.025, 6
-#: Heights beyond this, in meters, are noise whatever else there is.
-_HIGHEST = 1e6
+#: How far away, in meters, points can change what a point is: the halo a tile needs.
+REACH = (below_reach(SIDE) + FAR + 2) * SIDE + CLUSTER_REACH
 
 
 def detached_noise(
@@ -91,8 +106,8 @@ def detached_noise(
         raise StageError("'mask' must have one value per point", found=f"{use.shape}, {len(x):,} points")
     use &= np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     codes = np.zeros(len(x), np.uint8)
-    codes[use & (z >= _HIGHEST)] = HIGH
-    codes[use & (z <= -_HIGHEST)] = LOW
+    codes[use & (z >= HIGHEST)] = HIGH
+    codes[use & (z <= -HIGHEST)] = LOW
     use &= codes == 0
     inside = slice(None) if use.all() else np.flatnonzero(use)
     x, y, z = x[inside], y[inside], z[inside]
@@ -106,10 +121,6 @@ def detached_noise(
     if figures is not None:
         figures["low"], figures["high"] = (int(np.count_nonzero(codes == code)) for code in NOISE)
     return codes
-
-
-#: How far away, in meters, points can change what a point is: the halo a tile needs.
-REACH = (below_reach(SIDE) + FAR + 2) * SIDE + CLUSTER_REACH
 
 
 def _judge(x, y, z, column, row, cluster, gap, depth):
@@ -152,6 +163,84 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     many = share[0] & share[1] & (sums_around(lows > 0, AROUND) >= COLUMNS)
     verdict[low & ~many.ravel()[place]] = LOW
     return verdict[voxel]
+
+
+class Voxels(NamedTuple):
+    """Voxels that hold points, by row, column and level."""
+
+    keys: NDArray[np.int64]  #: (n,) ascending
+    counts: NDArray[np.int64]  #: (n,) points in each
+    width: int  #: columns of the raster, whose rim is empty
+
+    @classmethod
+    def of(cls, row, column, level, width: int, counts=None) -> tuple[Voxels, NDArray[np.int64]]:
+        """Voxels of points, or of others with `counts` of them; and the number of each one's voxel."""
+        keys, voxel = np.unique(((row * width + column) << BITS) + level + LEVELS, return_inverse=True)
+        return cls(keys, np.bincount(voxel, counts).astype(np.int64), width), voxel
+
+    @property
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Rows, columns and levels."""
+        return (*np.divmod(self.keys >> BITS, self.width), (self.keys & ((1 << BITS) - 1)) - LEVELS)
+
+
+def surroundings(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Around each voxel the usual number of points in a column, and their spacing in meters, over 3 x 3 blocks."""
+    row, column, _ = voxels.places
+    wide = voxels.width // BLOCK
+    block = (row // BLOCK) * wide + column // BLOCK
+    size = -(-(int(block.max()) + 1) // wide) * wide
+    points = np.bincount(block, voxels.counts, size).astype(np.int64).reshape(-1, wide)
+    full = np.bincount(block[begins_run(voxels.keys >> BITS)], minlength=size).reshape(-1, wide)
+    points, full, blocks = (sums_around(v, 1).ravel()[block] for v in (points, full, full > 0))
+    return points / full, np.sqrt(blocks * (BLOCK * SIDE) ** 2 / points)
+
+
+def _small(voxels: Voxels, usual: NDArray[np.float64], most: int) -> tuple[NDArray[np.bool_], NDArray]:
+    """Voxels of small components, and weak ones that no large component touches; points of each one's component."""
+    keys, number = voxels.keys, len(voxels.keys)
+    strong = voxels.counts > (WEAK * usual).astype(np.int64)
+    pairs = []
+    for dj, di, dl in list(product((-1, 0, 1), repeat=3))[14:]:  # those ahead
+        wanted = keys + ((dj * voxels.width + di) << BITS) + dl
+        at = np.minimum(np.searchsorted(keys, wanted), number - 1)
+        touching = np.flatnonzero(keys[at] == wanted)
+        pairs.append([touching, at[touching]])
+    one, other = np.concatenate(pairs, axis=1)
+    both = strong[one] & strong[other]
+    label = np.empty(number, np.int64)
+    count = number_sets(one[both], other[both], label)
+    size = np.bincount(label, voxels.counts).astype(np.int64)
+    first = np.empty(count, np.int64)
+    first[label[::-1]] = np.arange(number)[::-1]  # a component's first voxel stands for it
+    widest = np.minimum(EXTENT + EXTENT_GROWTH * usual[first], LARGEST_EXTENT)
+    small = ((size <= most) & (longest_sides(label, voxels.places, count) < widest))[label]
+    large = strong & ~small
+    small[~strong] = True
+    for weak, beside in ((one, other), (other, one)):
+        small[weak[~strong[weak] & large[beside]]] = False
+    return small, size[label]
+
+
+def small_clusters(
+    voxels: Voxels, usual: NDArray[np.float64], spacing: NDArray[np.float64], most: int
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Which voxels are of clusters of at most `most` points that nothing joins to the rest, and points of each one's.
+
+    `usual` and `spacing` are what :func:`surroundings` says.
+    """
+    small, size = _small(voxels, usual, most)
+    row, column, level = voxels.places
+    for scale in range(1, SCALES + 1):
+        thin = small & (spacing * SPACINGS > SIDE * 2 ** (scale - 1))
+        if not thin.any():
+            break
+        # With one empty column on every side.
+        width = (voxels.width >> scale) + 2
+        wider, of = Voxels.of((row >> scale) + 1, (column >> scale) + 1, level, width, voxels.counts)
+        still, total = _small(wider, np.ones(len(wider.keys)), most)
+        small[thin], size[thin] = still[of[thin]], total[of[thin]]
+    return small, size
 
 
 @njit

@@ -3,33 +3,29 @@ together."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import begins_run
-from .cells import HIGHEST, cell_numbers
-from .decks import decks_of_levels, levels_near_decks
+from .cells import HIGHEST, cell_numbers, keys_of
+from .decks import CELL, decks_of_levels, levels_near_decks
 from .groundcells import (
     BLOCK_SIDE,
     NEAR,
     CellMeans,
     CellWindow,
     FilterOptions,
-    GroundCells,
     GroundRaster,
     add_ground,
     ground_raster,
     means_of,
 )
-from .patches import connected
+from .openings import HOLE
 from .planes import around, heights_above, surface
 from .planes import reach as planes_reach
-
-#: Cells beyond its reach that points may lie in without being left out.
-_FEW = 4
 
 
 def reach_of_block(options: FilterOptions) -> int:
@@ -42,26 +38,92 @@ def _beside(options: FilterOptions) -> int:
     return planes_reach(options.levels(NEAR)) + 4
 
 
+class GroundCells(NamedTuple):
+    """Cells of a :class:`.groundcells.GroundRaster`, one by one: all with a height, an opening, or ground points."""
+
+    cells: NDArray[np.void]  #: (n,) records, see `_record`
+    #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
+    decks: NDArray[np.float64]
+
+    def in_parts(self, side: int) -> dict[str, NDArray]:
+        """All by name, for files: those of squares of so many columns and rows by themselves."""
+        column, row = (self.cells[name].astype(np.int64) // side for name in ("column", "row"))
+        parts = _runs(keys_of(column, row))
+        return {"decks": self.decks} | {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
+
+    @staticmethod
+    def names_within(side: int, west: int, south: int, east: int, north: int) -> set[str]:
+        """Names of the arrays of :meth:`in_parts` that are needed for the cells of these columns and rows."""
+        columns, rows = (range(low // side, high // side + 1) for low, high in ((west, east), (south, north)))
+        return {"decks", *(f"{i}_{j}" for i in columns for j in rows)}
+
+    @staticmethod
+    def of_blocks(blocks: Iterable[Mapping[str, NDArray]], openings: int) -> GroundCells:
+        """The cells that arrays of :meth:`in_parts` hold, of filters with so many openings."""
+        cells, decks = [np.empty(0, _record(openings))], [np.empty((0, 5))]
+        for block in blocks:
+            decks.append(block["decks"])
+            cells += [part for name, part in block.items() if name != "decks"]
+        return GroundCells(np.concatenate(cells), np.concatenate(decks))
+
+    def on(self, window: CellWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
+        """The cells of a window on its raster, and what their ground points say."""
+        shape = window.height, window.width
+        cells = self.cells[window.holds(self.cells["column"], self.cells["row"])]
+        at = cells["row"] - window.bottom, cells["column"] - window.left
+
+        def filled(name: str, value: Any, *more: int) -> NDArray:
+            out = np.full((*shape, *more), value, cells[name].dtype)
+            out[at] = cells[name]
+            return out
+
+        opened = filled("opened", -np.inf, len(radii))
+        raster = GroundRaster(
+            window.left,
+            window.bottom,
+            filled("lowest", HOLE),
+            filled("place", 0.0, 3),
+            filled("ground", False),
+            filled("floor", HOLE),
+            {radius: np.ascontiguousarray(opened[..., k]) for k, radius in enumerate(radii)},
+        )
+        return raster, (filled("held", False), filled("means", 0.0, 3))
+
+
+def _record(openings: int) -> np.dtype:
+    """Of a cell: as in a :class:`.groundcells.GroundRaster`; whether it holds ground points, and their mean place."""
+    return np.dtype(
+        [
+            *((name, np.int32) for name in ("column", "row")),
+            *((name, np.float32) for name in ("lowest", "floor")),
+            *((name, np.bool_) for name in ("ground", "held")),
+            *((name, np.float64, 3) for name in ("place", "means")),
+            ("opened", np.float32, openings),
+        ]
+    )
+
+
+def _runs(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Numbers of those that have the same key, for each there is."""
+    order = np.argsort(key, kind="stable")
+    return np.split(order, np.flatnonzero(begins_run(key[order]))[1:]) if len(key) else []
+
+
 def by_block(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     z: NDArray[np.float64],
     use: NDArray[np.bool_],
     cell: float,
-    side: int = BLOCK_SIDE,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Those of points that may be ground (m, 3) by the block of `side` cells that holds them; meters."""
-    mine = use & (np.abs(z) < HIGHEST)
-    xyz = np.column_stack([x[mine], y[mine], z[mine]])
-    if not len(xyz):
-        return {}
-    column, row = (cell_numbers(xyz[:, axis], cell) // side for axis in (0, 1))
-    if (column == column[0]).all() and (row == row[0]).all():
-        return {(int(column[0]), int(row[0])): xyz}
-    order = np.lexsort((column, row))
-    starts = np.flatnonzero(begins_run(column[order]) | begins_run(row[order]))
-    blocks = zip(column[order[starts]].tolist(), row[order[starts]].tolist(), strict=True)
-    return {block: xyz[part] for block, part in zip(blocks, np.split(order, starts[1:]), strict=True)}
+    """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them; meters."""
+    mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
+    column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
+    parts = _runs(keys_of(column, row))
+    return {
+        (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[mine[p]] for axis in (x, y, z)])
+        for p in parts
+    }
 
 
 def cells_of_block(
@@ -71,140 +133,61 @@ def cells_of_block(
     block: tuple[int, int],
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
-    side: int = BLOCK_SIDE,
 ) -> GroundCells:
-    """The cells of a block, column and row of a grid of blocks of `side` cells.
+    """The cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
 
-    x, y, z are the lowest points of cells, in meters: all within :func:`reach_of_block` cells of the block, and as many more
-    as you like. `points` are all that may be ground in the block, in parts (n, 3).
+    x, y, z are the lowest points of cells, in meters: all within :func:`reach_of_block` cells of the block, and few more.
+    `points` are all that may be ground in the block, in parts (n, 3).
     """
-    column, row = cell_numbers(x, options.cell), cell_numbers(y, options.cell)
-    west, south = (side * number for number in block)
-    east, north = west + side - 1, south + side - 1
-
-    def within(column, row, away):
-        inside = (column >= west - away) & (column <= east + away)
-        return inside & (row >= south - away) & (row <= north + away)
-
-    def beyond(away):
-        """Whether any lies so far away that it is worth a copy of the others."""
-        left, right, low, high = column.min(), column.max(), row.min(), row.max()
-        return left < west - away or right > east + away or low < south - away or high > north + away
-
+    own = CellWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+    cell, openings = options.cell, options.opening_radii
     # Openings reach into cells without points.
-    spill = max([*options.opening_radii, 0]) + 2
+    spill = max([*openings, 0]) + 2
     margin = max(spill, _beside(options))
-    if len(x) and beyond(reach_of_block(options) + _FEW):
-        near = within(column, row, reach_of_block(options))
-        x, y, z, column, row = x[near], y[near], z[near], column[near], row[near]
-    levels, deck = np.empty((0, 5)), np.zeros(len(x), np.uint8)
-    own_levels = levels
-    if options.decks and len(x):
-        far = options.reach_of_decks + margin
-        seen = within(column, row, far) if beyond(far + _FEW) else slice(None)
-        use = np.ones(len(x[seen]), bool)
-        # In one piece: squares of it would each be looked at with as much around as the block has.
-        largest = (side + 2 * (far + _FEW)) ** 2
-        levels, lowest = levels_near_decks(x[seen], y[seen], z[seen], use, largest)
-        deck[seen] = decks_of_levels(x[seen], y[seen], z[seen], use, levels)
-        own_levels = levels[within(column[seen][lowest], row[seen][lowest], 0)]
-    ground = _GroundPoints(west, south, side, levels, options)
-    rasters = []
-    own = CellWindow(west, south, side, side)
-    for part, _own in connected(column, row, within(column, row, margin), options.link):
-        given = x, y, z, np.ones(len(x), bool), deck, column, row
-        if len(part) < len(x):
-            given = tuple(values[part] for values in given)  # type: ignore[assignment]
-        raster, _ = ground_raster(*given, options=options, margin=spill, wanted=own.grown(margin))
-        inside = part[within(column[part], row[part], 0)]
-        ground.look_at(raster, column[inside], row[inside])
-        rasters.append(raster.cut(own))
-        del raster
+    column, row = cell_numbers(x, cell), cell_numbers(y, cell)
+    if not own.grown(margin).holds(column, row).any():
+        return GroundCells.of_blocks([], len(openings))
+    use, deck, levels = np.ones(len(x), bool), np.zeros(len(x), np.uint8), np.empty((0, 5))
+    if options.decks:
+        levels = levels_near_decks(x, y, z)
+        deck = decks_of_levels(x, y, z, use, levels)
+    raster, _ = ground_raster(
+        x, y, z, use, deck, column, row, options, margin=spill, wanted=own.grown(margin)
+    )
+    inside = own.holds(column, row)
+    needed = around(column[inside], row[inside], raster.left, raster.bottom, raster.shape)
+    planes = surface(
+        raster.ground, raster.place, raster.floor, raster.lowest, raster.left, raster.bottom,
+        options.levels(NEAR), needed,
+    )  # fmt: skip
+    # With a ring around: points blend the four cells round them.
+    part = own.grown(1).on(raster.left, raster.bottom, *raster.shape)
+    raster, planes = raster.cut(part), planes[part].copy()
+    sums = np.zeros((*raster.shape, 4), np.int64)
     for some in points:
-        ground.add(some)
-    found = [_cells_of(raster, west, south, *ground.means_of(n), options) for n, raster in enumerate(rasters)]
-    return replace(GroundCells.joined(found, len(options.openings)), decks=own_levels)
-
-
-class _GroundPoints:
-    """Tells which of a block's points are ground, and sums them up by cell.
-
-    `levels`: see :func:`.decks.levels_near_decks`.
-    """
-
-    def __init__(
-        self, west: int, south: int, side: int, levels: NDArray[np.float64], options: FilterOptions
-    ) -> None:
-        self._west, self._south, self._levels, self._options = west, south, levels, options
-        # With a ring around: points blend the four cells round them.
-        self._planes = np.full((side + 2, side + 2, 3), np.nan)
-        self._part = np.full((side, side), -1, np.int32)
-        self._parts = 0
-        self._sums = np.zeros((side, side, 4), np.int64)
-
-    def look_at(self, raster: GroundRaster, column: NDArray[np.int64], row: NDArray[np.int64]) -> None:
-        """The next part of the block, whose cells in it are these."""
-        self._part[row - self._south, column - self._west] = self._parts
-        self._parts += 1
-        if not column.size:
-            return
-        needed = around(column, row, raster.left, raster.bottom, raster.shape)
-        planes = surface(
-            raster.ground, raster.place, raster.floor, raster.lowest, raster.left, raster.bottom,
-            self._options.levels(NEAR), needed,
-        )  # fmt: skip
-        j, i = np.nonzero(needed)
-        self._planes[j + raster.bottom - self._south + 1, i + raster.left - self._west + 1] = planes[j, i]
-
-    def add(self, points: NDArray[np.float64]) -> None:
-        """Points of the block (n, 3) that may be ground."""
-        x, y, z = np.ascontiguousarray(points.T)
-        options, cell = self._options, self._options.cell
-        height, gradient = np.empty((2, len(x)))
-        heights_above(x, y, z, cell, self._west - 1, self._south - 1, self._planes, height, gradient)
+        x, y, z = np.ascontiguousarray(some.T)
         use = np.ones(len(x), bool)
-        deck = decks_of_levels(x, y, z, use, self._levels)
-        is_ground = options.is_ground(use, deck, height, gradient)
+        height, gradient = np.empty((2, len(x)))
+        heights_above(x, y, z, cell, raster.left, raster.bottom, planes, height, gradient)
+        is_ground = options.is_ground(use, decks_of_levels(x, y, z, use, levels), height, gradient)
         column, row = cell_numbers(x, cell), cell_numbers(y, cell)
-        add_ground(x, y, z, is_ground, column, row, cell, self._west, self._south, self._sums)
-
-    def means_of(self, number: int) -> CellMeans:
-        """Of the cells of a part of the block, on a raster of all of it."""
-        held, means = np.zeros(self._part.shape, bool), np.zeros((*self._part.shape, 3))
-        means_of(self._sums, held, means)
-        return held & (self._part == number), means
-
-
-def _cells_of(
-    raster: GroundRaster,
-    west: int,
-    south: int,
-    held: NDArray[np.bool_],
-    means: NDArray[np.float64],
-    options: FilterOptions,
-) -> GroundCells:
-    """Of a raster inside a block, and what ground points say on the raster of all of it, from a column and row on."""
-    h, w = raster.shape
-    inside = (
-        slice(raster.bottom - south, raster.bottom - south + h),
-        slice(raster.left - west, raster.left - west + w),
-    )
-    held, means = held[inside], means[inside]
-    opened = [raster.opened[radius] for radius in options.opening_radii]
-    there = np.isfinite(raster.lowest) | held
-    for values in opened:
-        there |= np.isfinite(values)
+        add_ground(x, y, z, is_ground, column, row, cell, raster.left, raster.bottom, sums)
+    held, means = np.zeros(raster.shape, bool), np.zeros((*raster.shape, 3))
+    means_of(sums, held, means)
+    opened = np.empty((*raster.shape, len(openings)), np.float32)
+    for k, radius in enumerate(openings):
+        opened[..., k] = raster.opened[radius]
+    there = np.zeros(raster.shape, bool)
+    there[own.on(raster.left, raster.bottom, *raster.shape)] = True
+    there &= np.isfinite(raster.lowest) | held | np.isfinite(opened).any(axis=-1)
     j, i = np.nonzero(there)
-    ground = raster.ground[there]
-    return GroundCells(
-        i + raster.left,
-        j + raster.bottom,
-        raster.lowest[there],
-        raster.floor[there],
-        ground,
-        raster.place[there][ground],
-        np.array([values[there] for values in opened], np.float32).reshape(len(opened), len(j)),
-        held[there],
-        means[held],
-        np.empty((0, 5)),
-    )
+    cells = np.empty(len(j), _record(len(openings)))
+    for name, values in (
+        ("lowest", raster.lowest), ("floor", raster.floor), ("ground", raster.ground), ("held", held),
+        ("place", raster.place), ("means", means), ("opened", opened),
+    ):  # fmt: skip
+        cells[name] = values[there]
+    cells["column"], cells["row"] = i + raster.left, j + raster.bottom
+    # A level is of the block that holds the middle of its cell.
+    middle = np.floor((levels[:, :2] + 0.5) * (CELL / cell)).astype(np.int64)
+    return GroundCells(cells, levels[own.holds(*middle.T)])

@@ -7,21 +7,19 @@ it is done once for each block of a grid of blocks, out of the lowest points of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import begins_run
 from ..base.jit import njit
 from .belowground import pits, pits_reach
-from .cells import heights_of, lowest_points, places_of
+from .cells import SIDE, heights_of, keys_of, lowest_points, places_of
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .openings import HOLE, objects_of, opening_radius
-from .patches import SIDE
 from .planes import from_parents, planes_of_blocks
 from .planes import reach as planes_reach
 from .plateaus import reach as plateau_reach
@@ -116,6 +114,11 @@ class CellWindow(NamedTuple):
         """So many cells more on every side."""
         return CellWindow(self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by)
 
+    def holds(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which cells lie in it."""
+        inside = (column >= self.left) & (column < self.left + self.width)
+        return inside & (row >= self.bottom) & (row < self.bottom + self.height)
+
     def on(self, left: int, bottom: int, h: int, w: int) -> tuple[slice, slice]:
         """Rows and columns of what of it lies on a raster."""
         i, j = self.left - left, self.bottom - bottom
@@ -141,17 +144,13 @@ class GroundRaster(NamedTuple):
         """Rows and columns."""
         return self.ground.shape
 
-    def cut(self, window: CellWindow) -> GroundRaster:
-        """A copy of what lies in a window."""
-        part = window.on(self.left, self.bottom, *self.shape)
-        return GroundRaster(
-            self.left + part[1].start,
-            self.bottom + part[0].start,
-            self.lowest[part].copy(),
-            self.place[part].copy(),
-            self.ground[part].copy(),
-            self.floor[part].copy(),
-            {radius: values[part].copy() for radius, values in self.opened.items()},
+    def cut(self, part: tuple[slice, slice]) -> GroundRaster:
+        """A copy of some rows and columns."""
+        return self._replace(
+            left=self.left + part[1].start,
+            bottom=self.bottom + part[0].start,
+            opened={radius: values[part].copy() for radius, values in self.opened.items()},
+            **{name: getattr(self, name)[part].copy() for name in ("lowest", "place", "ground", "floor")},
         )
 
 
@@ -175,8 +174,10 @@ def ground_raster(
     """
     left, bottom = int(column.min()) - margin, int(row.min()) - margin
     shape = int(row.max()) + margin + 1 - bottom, int(column.max()) + margin + 1 - left
-    lowest = np.empty(shape, np.int64)
-    lowest_points(z, x, y, use, column, row, left, bottom, lowest)
+    mine = np.flatnonzero(use)
+    low = mine[lowest_points(x[mine], y[mine], z[mine], keys_of(column[mine], row[mine]))]
+    lowest = np.full(shape, -1)
+    lowest[row[low] - bottom, column[low] - left] = low
     cell = options.cell
     raster = heights_of(z, lowest)
     bad = pits(raster, cell)
@@ -263,138 +264,3 @@ def means_of(sums: NDArray[np.int64], ground: NDArray[np.bool_], place: NDArray[
     ground[:] = sums[..., 0] > 0
     held = sums[ground]
     place[ground] = held[:, 1:] / _PARTS / held[:, :1]
-
-
-#: Arrays of :class:`GroundCells` that have rows for some of the cells, or for none.
-_OF_SOME = ("place", "means", "decks")
-
-
-def _part(column: int, row: int) -> str:
-    """The name of a square of cells."""
-    return f"{column}_{row}"
-
-
-@dataclass(frozen=True)
-class GroundCells:
-    """Cells of :class:`GroundRaster`, one by one: all with a height, an opening, or ground points."""
-
-    column: NDArray[np.int64]  #: (n,)
-    row: NDArray[np.int64]  #: (n,)
-    lowest: NDArray[np.float32]  #: (n,)
-    floor: NDArray[np.float32]  #: (n,)
-    ground: NDArray[np.bool_]  #: (n,)
-    place: NDArray[np.float64]  #: (number of ground cells, 3), in their order
-    opened: NDArray[np.float32]  #: (number of openings, n)
-    held: NDArray[np.bool_]  #: (n,) whether it holds ground points
-    means: NDArray[
-        np.float64
-    ]  #: (number of such cells, 3), in their order: as `place`, of the mean of its ground points
-    #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
-    decks: NDArray[np.float64]
-
-    def in_parts(self, side: int) -> dict[str, NDArray]:
-        """All arrays by name, for files: those of squares of so many columns and rows by themselves."""
-        part_row, part = self.row // side, self.column // side
-        if len(part):
-            part += (part_row - part_row.min()) * (int(np.ptp(part)) + 1) - part.min()
-        if part.max(initial=0) < 2**16:
-            part = part.astype(np.uint16)  # sorted digit by digit
-        order = np.argsort(part, kind="stable")
-        starts = np.flatnonzero(begins_run(part[order]))
-        named = {name: values[..., order] for name, values in vars(self).items() if name not in _OF_SOME}
-        out = {"decks": self.decks}
-        ends = np.append(starts, len(order))[1:]
-        of_some = {}
-        for name, (which, values) in {
-            "place": (self.ground, self.place),
-            "means": (self.held, self.means),
-        }.items():
-            number = np.cumsum(which) - 1
-            taken = which[order]
-            before = np.concatenate([[0], np.cumsum(taken)])
-            of_some[name] = before, values[number[order][taken]]
-        for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
-            mark = _part(named["column"][start] // side, named["row"][start] // side)
-            out |= {f"{mark}/{name}": values[..., start:end] for name, values in named.items()}
-            out |= {f"{mark}/{name}": v[before[start] : before[end]] for name, (before, v) in of_some.items()}
-        return out
-
-    @classmethod
-    def of_parts(cls, arrays: Mapping[str, NDArray]) -> Iterator[GroundCells]:
-        """Cells of those squares that are there, out of some of the arrays of :meth:`in_parts`."""
-        decks = arrays["decks"]
-        for mark in dict.fromkeys(name.partition("/")[0] for name in arrays if "/" in name):
-            yield cls(**{name: arrays[f"{mark}/{name}"] for name in cls._of_parts()}, decks=decks)
-            decks = decks[:0]  # once
-
-    @classmethod
-    def names_within(cls, side: int, west: int, south: int, east: int, north: int) -> set[str]:
-        """Names of the arrays that :meth:`of_parts` needs for the cells of these columns and rows."""
-        columns, rows = (range(low // side, high // side + 1) for low, high in ((west, east), (south, north)))
-        return {
-            "decks",
-            *(f"{_part(i, j)}/{name}" for i in columns for j in rows for name in cls._of_parts()),
-        }
-
-    @classmethod
-    def _of_parts(cls) -> list[str]:
-        return [field.name for field in fields(cls) if field.name != "decks"]
-
-    def within(self, west: int, south: int, east: int, north: int) -> GroundCells:
-        """The cells of these columns and rows, the last ones included."""
-        mine = (self.column >= west) & (self.column <= east) & (self.row >= south) & (self.row <= north)
-        return self[mine]
-
-    def __getitem__(self, mine: NDArray) -> GroundCells:
-        """Some of the cells: a mask, or numbers in their order."""
-        chosen = np.zeros(len(self.column), bool)
-        chosen[mine] = True
-        places = self.place[chosen[self.ground]]
-        return GroundCells(
-            self.column[chosen],
-            self.row[chosen],
-            self.lowest[chosen],
-            self.floor[chosen],
-            self.ground[chosen],
-            places,
-            self.opened[:, chosen],
-            self.held[chosen],
-            self.means[chosen[self.held]],
-            self.decks,
-        )
-
-    @staticmethod
-    def joined(parts: Iterable[GroundCells], openings: int) -> GroundCells:
-        """The cells of parts that share none; with so many openings."""
-        given = [no_cells(openings), *parts]
-        names = list(vars(given[0]))
-        axes = {name: 1 if name == "opened" else 0 for name in names}
-        return GroundCells(**{n: np.concatenate([getattr(g, n) for g in given], axis=axes[n]) for n in names})
-
-    def raster(self, left: int, bottom: int, shape: tuple[int, int], radii: Sequence[int]) -> GroundRaster:
-        """The cells on a raster that holds them all."""
-        j, i = self.row - bottom, self.column - left
-        lowest, floor = np.full(shape, HOLE, np.float32), np.full(shape, HOLE, np.float32)
-        lowest[j, i], floor[j, i] = self.lowest, self.floor
-        ground, place = np.zeros(shape, bool), np.zeros((*shape, 3))
-        ground[j, i] = self.ground
-        place[j[self.ground], i[self.ground]] = self.place
-        opened = {}
-        for radius, values in zip(radii, self.opened, strict=True):
-            opened[radius] = np.full(shape, -np.inf, np.float32)
-            opened[radius][j, i] = values
-        return GroundRaster(left, bottom, lowest, place, ground, floor, opened)
-
-    def means_on(self, left: int, bottom: int, shape: tuple[int, int]) -> CellMeans:
-        """What the cells' ground points say, on a raster that holds all cells."""
-        j, i = self.row[self.held] - bottom, self.column[self.held] - left
-        held, means = np.zeros(shape, bool), np.zeros((*shape, 3))
-        held[j, i] = True
-        means[j, i] = self.means
-        return held, means
-
-
-def no_cells(openings: int) -> GroundCells:
-    number, height, no = np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, bool)
-    place, opened = np.empty((0, 3)), np.empty((openings, 0), np.float32)
-    return GroundCells(number, number, height, height, no, place, opened, no, place, np.empty((0, 5)))

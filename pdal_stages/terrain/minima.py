@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
-from ..base.arrays import begins_run
 from ..base.errors import NoTerrainError, OptionError
-from .cells import bounded, cell_numbers, columns
+from .cells import cell_numbers, columns, keys_of
 
 
 @dataclass
@@ -32,11 +31,11 @@ class MinimaTerrain:
     #: Sides of a coarse and of a fine cell, in the unit of the coordinates.
     cell: float
     resolution: float
+    keys: NDArray[np.int64]  #: of the coarse cells with points, ascending
+    minima: NDArray[np.float64]
     #: Counts: ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed), ``farthest_fill`` (distance
     #: to the nearest filled cell, the worst case), ``unused_points`` (not finite, or excluded by the mask).
     figures: dict = field(default_factory=dict)
-    _keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64), repr=False)
-    _minima: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False)
 
     @classmethod
     def fit(
@@ -51,26 +50,23 @@ class MinimaTerrain:
     ) -> MinimaTerrain:
         """Take the lowest point of each coarse cell; parameters as for :func:`hag_minima`."""
         check_sizes(cell, resolution)
-        x, y, z = (np.asarray(a, np.float64) for a in (x, y, z))
+        x, y, z = columns(x, y, z)
         usable = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
         if mask is not None:
             usable &= np.asarray(mask, bool)
-        terrain = cls(float(cell), float(resolution))
-        column, row = cell_numbers(x[usable], cell), cell_numbers(y[usable], cell)
-        key = _key(column, row)
-        order = np.argsort(key, kind="stable")
-        key = key[order]
-        starts = np.flatnonzero(begins_run(key))
-        terrain._keys = key[starts]
-        if starts.size:
-            terrain._minima = np.minimum.reduceat(z[usable][order], starts)
-        terrain.figures = {
-            "cells": int(terrain._keys.size),
+        keys, number = np.unique(
+            keys_of(cell_numbers(x[usable], cell), cell_numbers(y[usable], cell)), return_inverse=True
+        )
+        minima = np.full(len(keys), np.inf)
+        np.minimum.at(minima, number, z[usable])
+        unused = int(x.size - np.count_nonzero(usable))
+        figures = {
+            "cells": len(keys),
             "interpolated_cells": 0,
             "farthest_fill": 0.0,
-            "unused_points": int(x.size - np.count_nonzero(usable)),
+            "unused_points": unused,
         }
-        return terrain
+        return cls(float(cell), float(resolution), keys, minima, figures)
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Terrain height where points fall: bilinear, at the center of their fine cell; NaN for those not finite.
@@ -82,27 +78,18 @@ class MinimaTerrain:
         finite = np.isfinite(x) & np.isfinite(y)
         if not finite.any():
             return out
-        if self._keys.size == 0:
+        if self.keys.size == 0:
             raise NoTerrainError(
                 "no terrain: none of the points may form one",
                 found=f"{x.size:,} points, all of them not finite, noise, or outside 'where'",
                 cure="Relax 'ignore' or 'where'",
             )
-        # Distinct fine cells first: many points share one.
-        fine_x = np.floor(x[finite] / self.resolution)
-        fine_y = np.floor(y[finite] / self.resolution)
-        u = (fine_x + 0.5) * (self.resolution / self.cell) - 0.5
-        v = (fine_y + 0.5) * (self.resolution / self.cell) - 0.5
-        i, j = np.floor(u), np.floor(v)
-        wu, wv = u - i, v - j
-        i, j = bounded(i), bounded(j)
-        corners = [_key(i + a, j + b) for b in (0, 1) for a in (0, 1)]
-        keys = np.unique(np.concatenate([np.unique(k) for k in corners]))
-        values = self._filled(keys)
-        z00, z10, z01, z11 = (values[np.searchsorted(keys, k)] for k in corners)
-        lower = z00 + (z10 - z00) * wu
-        upper = z01 + (z11 - z01) * wu
-        out[finite] = lower + (upper - lower) * wv
+        corners, s, t = _corners(x[finite], y[finite], self.cell, self.resolution)
+        keys, place = np.unique(corners, return_inverse=True)
+        z00, z10, z01, z11 = self._filled(keys)[place.reshape(corners.shape)]
+        lower = z00 + (z10 - z00) * s
+        upper = z01 + (z11 - z01) * s
+        out[finite] = lower + (upper - lower) * t
         return out
 
     def _filled(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -111,26 +98,40 @@ class MinimaTerrain:
         Weights are one over the fourth power of the distance between cell centers. [W18] does not say what becomes
         of empty cells.
         """
-        place = np.minimum(np.searchsorted(self._keys, keys), self._keys.size - 1)
-        values = self._minima[place].copy()
-        empty = np.flatnonzero(self._keys[place] != keys)
+        place = np.minimum(np.searchsorted(self.keys, keys), self.keys.size - 1)
+        values = self.minima[place].copy()
+        empty = np.flatnonzero(self.keys[place] != keys)
         if empty.size:
             from scipy.spatial import cKDTree  # most clouds have no gaps: not loaded at start
 
-            filled_at = np.column_stack(_unkey(self._keys)).astype(np.float64)
-            wanted_at = np.column_stack(_unkey(keys[empty])).astype(np.float64)
+            filled_at, wanted_at = _places(self.keys), _places(keys[empty])
             tree = cKDTree(filled_at)
-            nearest = tree.query(wanted_at, k=1)[0]
+            nearest = tree.query(wanted_at)[0]
             # All filled cells within reach of the nearest one: a set, so the outcome
             # does not depend on how a search tree orders equal distances.
-            for at, center, radius in zip(empty, wanted_at, nearest + 1.5, strict=True):
+            for at, center, radius in zip(empty, wanted_at, nearest + _FILL, strict=True):
                 near = np.sort(tree.query_ball_point(center, radius))
-                squared = ((filled_at[near] - center) ** 2).sum(axis=1)
-                weight = 1.0 / squared**2  # distance to the fourth power
-                values[at] = np.dot(weight, self._minima[near]) / weight.sum()
+                weight = 1.0 / ((filled_at[near] - center) ** 2).sum(axis=1) ** 2
+                values[at] = np.dot(weight, self.minima[near]) / weight.sum()
             self.figures["interpolated_cells"] = int(empty.size)
             self.figures["farthest_fill"] = float(nearest.max() * self.cell)
         return values
+
+
+#: An empty cell is filled from those so much farther away than the nearest one, in cells.
+_FILL = 1.5
+
+
+def _corners(x, y, cell: float, resolution: float):
+    """Keys of the four coarse cells round the middle of each point's fine cell (4, n), and where between them it lies."""
+    u, v = ((np.floor(axis / resolution) + 0.5) * (resolution / cell) - 0.5 for axis in (x, y))
+    i, j = cell_numbers(u, 1.0), cell_numbers(v, 1.0)
+    return np.array([keys_of(i + a, j + b) for b in (0, 1) for a in (0, 1)]), u - i, v - j
+
+
+def _places(keys: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Columns and rows (n, 2) of keys."""
+    return np.column_stack([(keys & 0xFFFFFFFF) - 2**31, keys >> 32]).astype(np.float64)
 
 
 def hag_minima(
@@ -173,11 +174,7 @@ def hag_minima(
     [0.0, 3.5]
     """
     x, y, z = columns(x, y, z)
-    if x.size == 0:
-        check_sizes(cell, resolution)
-        return np.empty(0)
-    terrain = MinimaTerrain.fit(x, y, z, cell=cell, resolution=resolution, mask=mask)
-    return z - terrain.at(x, y)
+    return z - MinimaTerrain.fit(x, y, z, cell=cell, resolution=resolution, mask=mask).at(x, y)
 
 
 def terrain_reach(
@@ -203,14 +200,10 @@ def terrain_reach(
     if not forms.any():  # farther than what was read
         around = max(box[0] - x.min(), box[1] - y.min(), x.max() - box[2], y.max() - box[3], 0.0)
         return float(around + box[2] - box[0])
-    filled = np.unique(np.column_stack([np.floor(x[forms] / cell), np.floor(y[forms] / cell)]), axis=0)
-    fine = np.unique(
-        np.column_stack([np.floor(x[wanted] / resolution), np.floor(y[wanted] / resolution)]), axis=0
-    )
-    low = np.floor((fine + 0.5) * (resolution / cell) - 0.5)
-    cells = np.unique(np.concatenate([low + np.array([a, b]) for a in (0, 1) for b in (0, 1)]), axis=0)
+    filled = _places(np.unique(keys_of(cell_numbers(x[forms], cell), cell_numbers(y[forms], cell))))
+    cells = _places(np.unique(_corners(x[wanted], y[wanted], cell, resolution)[0]))
     nearest = cKDTree(filled).query(cells)[0]
-    radius = np.where(nearest > 0, nearest + 1.5, 0.0)[:, None] + 0.5  # whole cells around it
+    radius = np.where(nearest > 0, nearest + _FILL, 0.0)[:, None] + 0.5  # whole cells around it
     center = cells + 0.5
     below = np.asarray(box[:2]) - (center - radius) * cell
     above = (center + radius) * cell - np.asarray(box[2:])
@@ -226,11 +219,3 @@ def check_sizes(cell: float, resolution: float) -> None:
             found=f"resolution {resolution:g}, cell {cell:g}",
             cure="Swap them, or lower 'resolution'",
         )
-
-
-def _key(column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int64]:
-    return (row << 32) + (column + 2**31)
-
-
-def _unkey(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    return (key & 0xFFFFFFFF) - 2**31, key >> 32

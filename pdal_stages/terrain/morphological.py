@@ -27,21 +27,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import OptionError, StageError
 from ..base.resources import map_blocks
-from .cells import HIGHEST, cell_numbers, columns
+from .cells import HIGHEST, cell_numbers, columns, patches
 from .decks import decks_of_levels, find_decks
+from .groundblocks import GroundCells
 from .groundcells import (
     FAR,
     NEAR,
     CellMeans,
+    CellWindow,
     FilterOptions,
-    GroundCells,
     GroundRaster,
     add_ground,
     ground_raster,
     means_of,
 )
 from .openings import above_opening, opening_names
-from .patches import patches
 from .planes import around, heights_above, surface
 from .planes import reach as planes_reach
 
@@ -97,7 +97,7 @@ def filtered_ground(
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
         ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
     cells : GroundCells, optional
-        Cells whose ground was found before (:func:`.groundcells.cells_of_block`), all within :func:`reach_of_cells` of the
+        Cells whose ground was found before (:func:`.groundblocks.cells_of_block`), all within :func:`reach_of_cells` of the
         points, which then need no others around them.
 
     Returns
@@ -179,23 +179,15 @@ def _given(
     cells: GroundCells, column, row, options: FilterOptions
 ) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
     """The same with the ground that was found before, as cells."""
-    number = len(column)
-    columns = np.concatenate([column, cells.column])
-    rows = np.concatenate([row, cells.row])
-    around = planes_reach(options.levels(NEAR)) + planes_reach(options.levels(FAR)) + 4
-    for members, own in patches(columns, rows, around, options.link):
-        points: Any = slice(None)
-        chosen = cells
-        if not isinstance(members, slice):  # else no copies of all
-            mine = members < number
-            points, own = members[mine], own if isinstance(own, slice) else own[mine]
-            chosen = cells[members[~mine] - number]
-            if not points.size:
-                continue
-        left, bottom = int(columns[members].min()) - 1, int(rows[members].min()) - 1
-        shape = int(rows[members].max()) + 2 - bottom, int(columns[members].max()) + 2 - left
-        raster = chosen.raster(left, bottom, shape, options.opening_radii)
-        yield points, own, raster, chosen.means_on(left, bottom, shape)
+    away = planes_reach(options.levels(FAR)) + 4
+    for points, own in patches(column, row, 0, options.link):
+        left, bottom = int(column[points].min()), int(row[points].min())
+        width, height = int(column[points].max()) + 1 - left, int(row[points].max()) + 1 - bottom
+        yield (
+            points,
+            own,
+            *cells.on(CellWindow(left, bottom, width, height).grown(away), options.opening_radii),
+        )
 
 
 def reach(

@@ -90,18 +90,15 @@ def _add(total, m, dx, dy, weight):
     total[8] += weight * m[8] + dy * z
 
 
-@njit
 def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
     """Moments of the ground of each block of 2 x 2 cells, about its center."""
-    one = np.ones(9)
-    for j in range(ground.shape[0]):
-        for i in range(ground.shape[1]):
-            if ground[j, i]:
-                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
-                one[1], one[2], one[3], one[4], one[5] = x, y, x * x, x * y, y * y
-                one[6], one[7], one[8] = z, x * z, y * z
-                block = out[((j + bottom) >> 1) - out_bottom, ((i + left) >> 1) - out_left]
-                _add(block, one, ((i + left) & 1) - 0.5, ((j + bottom) & 1) - 0.5, 1.0)
+    j, i = np.nonzero(ground)
+    x, y, z = place[j, i].T
+    j, i = j + bottom, i + left
+    x, y = x + (i & 1) - 0.5, y + (j & 1) - 0.5
+    block = ((j >> 1) - out_bottom) * out.shape[1] + (i >> 1) - out_left
+    for k, values in enumerate((None, x, y, x * x, x * y, y * y, z, x * z, y * z)):
+        out[..., k].flat = np.bincount(block, values, out[..., k].size)
 
 
 @njit
@@ -115,27 +112,18 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
                 _add(block, fine[j, i], dx, dy, 1.0)
 
 
-@njit
 def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
     """Level planes at the mean of `floor` over the measured cells of 3 x 3 blocks."""
     h, w = out.shape[:2]
-    sums = np.zeros((h, w, 2))
-    for j in range(raster.shape[0]):
-        for i in range(raster.shape[1]):
-            if np.isfinite(raster[j, i]):
-                block = sums[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
-                block[0] += floor[j, i]
-                block[1] += 1.0
-    for j in range(h):
-        for i in range(w):
-            total, n = 0.0, 0.0
-            for b in range(max(j - 1, 0), min(j + 2, h)):
-                for a in range(max(i - 1, 0), min(i + 2, w)):
-                    weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
-                    total += weight * sums[b, a, 0]
-                    n += weight * sums[b, a, 1]
-            out[j, i, 0] = total / n if n > 0 else np.nan
-            out[j, i, 1] = out[j, i, 2] = 0.0
+    j, i = np.nonzero(np.isfinite(raster))
+    block = (((j + bottom) >> level) - out_bottom) * w + ((i + left) >> level) - out_left
+    sums = np.stack([np.bincount(block, v, h * w).reshape(h, w) for v in (floor[j, i], None)])
+    padded, weights = np.pad(sums, ((0, 0), (1, 1), (1, 1))), (0.5, 1.0, 0.5)
+    total, n = sum(
+        weights[b] * weights[a] * padded[:, b : b + h, a : a + w] for b in range(3) for a in range(3)
+    )
+    out[:] = 0.0
+    out[..., 0] = np.divide(total, n, out=np.full((h, w), np.nan), where=n > 0)
 
 
 @njit
@@ -181,16 +169,6 @@ def _fit(moments, size, planes):
             planes[j, i, 0] = height + (r - x * gx - y * gy) / n_held
             planes[j, i, 1] = across + gx
             planes[j, i, 2] = along + gy
-
-
-@njit
-def _through_ground(ground, place, planes):
-    """Shift the planes of ground cells so that they hold their cell's ground."""
-    for j in range(ground.shape[0]):
-        for i in range(ground.shape[1]):
-            if ground[j, i]:
-                x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
-                planes[j, i, 0] = z - x * planes[j, i, 1] - y * planes[j, i, 2]
 
 
 def planes_of_blocks(
@@ -252,7 +230,9 @@ def surface(
     if planes is None:
         planes = np.zeros((*ground.shape, 3))
     _finer(blocks.values, blocks.left, blocks.bottom, 1.0, left, bottom, needed, planes)
-    _through_ground(ground, place, planes)
+    # Those of ground cells hold their cell's ground.
+    through = place[..., 2] - place[..., 0] * planes[..., 1] - place[..., 1] * planes[..., 2]
+    np.copyto(planes[..., 0], through, where=ground)
     return planes
 
 

@@ -8,12 +8,13 @@ neither the order of points nor the tile matters.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import cell_numbers
-from .patches import patches
+from .cells import cell_numbers, keys_of, patches
 
 #: Side of the cells, meters.
 CELL = 1.0
@@ -49,6 +50,21 @@ _PARTS = 1 << 16
 _HIGHEST = 256
 
 
+class Cloud(NamedTuple):
+    """Points in the order of the cells of a raster."""
+
+    x: NDArray[np.float64]  #: (n,) meters from the raster's corner, as `y`
+    y: NDArray[np.float64]
+    z: NDArray[np.float64]
+    height: NDArray[np.float64]  #: above the ground
+    wire: NDArray[np.bool_]  #: whether it is a wire's
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    start: NDArray[np.int64]  #: (h * w + 1) the first point of each cell
+    h: int
+    w: int
+
+
 def find_towers(
     xyz: NDArray[np.float64], height: NDArray[np.float64], wire: NDArray[np.bool_], use: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
@@ -62,98 +78,93 @@ def find_towers(
         return out
     column, row = cell_numbers(xyz[:, 0], CELL), cell_numbers(xyz[:, 1], CELL)
     near = np.flatnonzero(use & (wire | (height > FOOT)) & _near(column, row, wires))
-    x, y, z, h = (np.ascontiguousarray(values[near]) for values in (*xyz.T, height))
-    c, r, w = column[near], row[near], wire[near]
-    for points, own in patches(c, r, int(REACH), int(REACH)):
-        at = np.arange(len(near))[points]
-        left, bottom = int(c[at].min()), int(r[at].min())
-        size = int(r[at].max()) + 1 - bottom, int(c[at].max()) + 1 - left
-        cell = (r[at] - bottom) * size[1] + c[at] - left
+    for points, own in patches(column[near], row[near], int(REACH), int(REACH)):
+        at = near[points]
+        left, bottom = int(column[at].min()), int(row[at].min())
+        h, w = int(row[at].max()) + 1 - bottom, int(column[at].max()) + 1 - left
+        cell = (row[at] - bottom) * w + column[at] - left
         order = np.argsort(cell, kind="stable")
-        start = np.searchsorted(cell[order], np.arange(size[0] * size[1] + 1))
-        cloud = (x[at], y[at], z[at], h[at], w[at], order, start, *size, left, bottom)
+        start = np.searchsorted(cell[order], np.arange(h * w + 1))
+        some = at[order]
+        x, y, z = (xyz[some] - [left * CELL, bottom * CELL, 0.0]).T.copy()
+        cloud = Cloud(x, y, z, height[some], wire[some], *np.divmod(cell[order], w), start, h, w)
         found = np.zeros(len(at), bool)
-        axes = _axes(*cloud)
-        _mark(*cloud, _best(axes), found)
-        out[near[at[own]]] = found[own]
+        for axis in _best(_axes(cloud)).tolist():
+            _mark(cloud, *axis, found)
+        mine = np.zeros(len(at), bool)
+        mine[own] = True
+        out[some[mine[order]]] = found[mine[order]]
     return out
 
 
 def _near(column: NDArray[np.int64], row: NDArray[np.int64], wires: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Points in blocks at wires, and in those around."""
     side = int(AT_TOWER * WIDEST + BESIDE) + BODY[1] + CLEAR
-    across, along = column // side, row // side
-    key = (along << 32) + across
+    key = keys_of(column // side, row // side)
     steps = np.array([(b << 32) + a for b in (-1, 0, 1) for a in (-1, 0, 1)])
     return np.isin(key, np.unique(key[wires])[:, None] + steps)
 
 
+@device
+def _around(cloud, j, i, reach):
+    """Numbers of the points in the cells up to `reach` away."""
+    low, high = max(i - reach, 0), min(i + reach, cloud.w - 1) + 1
+    rows, count = range(max(j - reach, 0), min(j + reach + 1, cloud.h)), 0
+    for b in rows:
+        count += cloud.start[b * cloud.w + high] - cloud.start[b * cloud.w + low]
+    out = np.empty(count, np.int64)
+    for b in rows:
+        for p in range(cloud.start[b * cloud.w + low], cloud.start[b * cloud.w + high]):
+            count -= 1
+            out[count] = p
+    return out
+
+
 @njit
-def _axes(x, y, z, height, wire, order, start, h, w, left, bottom):
+def _axes(cloud):
     """Cells that may be the axis of a support (m, 9): row, column, whether it is a tower, how high its wires hang, score,
     its middle, the direction of its wires as an angle, and half its width in cells.
     """
-    top = np.full(h * w, -1.0)
-    there = np.zeros(h * w, np.bool_)
-    for k in range(h * w):
-        for q in range(start[k], start[k + 1]):
-            if wire[order[q]]:
-                top[k] = max(top[k], height[order[q]])
-            else:
-                there[k] = True
-    out = np.empty((64, 9))
-    n = 0
-    filled = np.empty(_HIGHEST, np.bool_)
-    sums, rings = np.empty(4, np.int64), np.empty((BODY[1] + CLEAR + 1, 3), np.int64)
-    for j in range(h):
-        for i in range(w):
-            if not there[j * w + i]:
-                continue
-            for tall in range(2):
+    top, there = np.full((cloud.h, cloud.w), -1.0), np.zeros((cloud.h, cloud.w), np.bool_)
+    for p in range(len(cloud.x)):
+        if cloud.wire[p]:
+            top[cloud.row[p], cloud.column[p]] = max(top[cloud.row[p], cloud.column[p]], cloud.height[p])
+        else:
+            there[cloud.row[p], cloud.column[p]] = True
+    out, n = np.empty((64, 9)), 0
+    for j in range(cloud.h):
+        for i in range(cloud.w):
+            for tall in range(2 if there[j, i] else 0):
                 reach = AT_TOWER if tall else AT_POLE
-                high = -1.0
-                for b in range(max(j - reach, 0), min(j + reach + 1, h)):
-                    for a in range(max(i - reach, 0), min(i + reach + 1, w)):
-                        high = max(high, top[b * w + a])
+                high = top[max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1].max()
                 if high < (HIGH_WIRE if tall else LOW_WIRE) or high >= _HIGHEST:
                     continue
-                half = SLIM
-                if tall:
-                    half = _half_width(height, wire, order, start, h, w, j, i, high, rings)
-                    if half == 0:
-                        continue
-                score = _upright(
-                    x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, half, high, filled, sums
-                )
+                half = _half_width(cloud, j, i, high) if tall else SLIM
+                score, x, y = _upright(cloud, j, i, tall, half, high) if half else (0.0, 0.0, 0.0)
                 if score <= 0:
                     continue
-                middle_x, middle_y = sums[1] / sums[0] / _PARTS, sums[2] / sums[0] / _PARTS
-                rise, turn = _rise(x, y, z, wire, order, start, h, w, left, bottom, j, i, middle_x, middle_y)
-                if rise < RISE:
-                    continue
-                if n == len(out):
-                    out = np.concatenate((out, np.empty((n, 9))))
-                out[n, 0], out[n, 1], out[n, 2], out[n, 3] = j, i, tall, high
-                out[n, 4], out[n, 5], out[n, 6], out[n, 7] = score, middle_x, middle_y, turn
-                out[n, 8] = half
-                n += 1
+                rise, turn = _rise(cloud, j, i, x, y)
+                if rise >= RISE:
+                    if n == len(out):
+                        out = np.concatenate((out, out))
+                    axis = (float(j), float(i), float(tall), high, score, x, y, turn, float(half))
+                    for k, value in enumerate(axis):
+                        out[n, k] = value
+                    n += 1
     return out[:n].copy()
 
 
 @device
-def _half_width(height, wire, order, start, h, w, j, i, high, rings):
+def _half_width(cloud, j, i, high):
     """How many cells a tower's body reaches from its axis, below its arms; 0 where it stands among other things."""
-    rings[:] = 0
-    reach = len(rings) - 1
-    for b in range(max(j - reach, 0), min(j + reach + 1, h)):
-        for a in range(max(i - reach, 0), min(i + reach + 1, w)):
-            far = max(abs(b - j), abs(a - i))
-            for q in range(start[b * w + a], start[b * w + a + 1]):
-                p = order[q]
-                if not wire[p] and TRUNK[0] * high <= height[p] <= TRUNK[1] * high:
-                    rings[far, 0] += 1
-                    rings[far, 1] += a - i
-                    rings[far, 2] += b - j
+    rings = np.zeros((BODY[1] + CLEAR + 1, 3), np.int64)
+    for p in _around(cloud, j, i, len(rings) - 1):
+        if not cloud.wire[p] and TRUNK[0] * high <= cloud.height[p] <= TRUNK[1] * high:
+            a, b = cloud.column[p] - i, cloud.row[p] - j
+            ring = rings[max(abs(a), abs(b))]
+            ring[0] += 1
+            ring[1] += a
+            ring[2] += b
     inside = slim = around = way = across = along = 0
     for k in range(BODY[1] + 1):
         inside += rings[k, 0]
@@ -164,9 +175,7 @@ def _half_width(height, wire, order, start, h, w, j, i, high, rings):
             across += rings[k, 1]
             along += rings[k, 2]
         around += rings[k, 0] if ROUND[0] <= k <= ROUND[1] else 0
-        beyond = 0
-        for far in range(k + 1, k + CLEAR + 1):
-            beyond += rings[far, 0]
+        beyond = rings[k + 1 : k + CLEAR + 1, 0].sum()
         aside = abs(across) + abs(along) > ONE_SIDED * way  # a tree
         if k >= BODY[0] and inside > 0 and beyond <= TIDY * inside and not aside:
             return k
@@ -174,26 +183,21 @@ def _half_width(height, wire, order, start, h, w, j, i, high, rings):
 
 
 @device
-def _upright(x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, half, high, filled, sums):
-    """How well the points round a cell fill a narrow column up to the wires, 0 where they do not; fills `sums` of its middle
-    (how many, x, y, their squares).
-    """
-    filled[:] = False
-    sums[:] = 0
-    for b in range(max(j - half, 0), min(j + half + 1, h)):
-        for a in range(max(i - half, 0), min(i + half + 1, w)):
-            for q in range(start[b * w + a], start[b * w + a + 1]):
-                p = order[q]
-                if wire[p]:
-                    continue
-                if FROM <= height[p] < min(high + 1.0, float(_HIGHEST)):
-                    filled[int(height[p])] = True
-                if (0.5 * high if tall else FROM) <= height[p] <= high:
-                    dx, dy = x[p] - (left + i + 0.5) * CELL, y[p] - (bottom + j + 0.5) * CELL
-                    sums[0] += 1
-                    sums[1] += int(np.rint(dx * _PARTS))
-                    sums[2] += int(np.rint(dy * _PARTS))
-                    sums[3] += int(np.rint((dx * dx + dy * dy) * _PARTS))
+def _upright(cloud, j, i, tall, half, high):
+    """How well the points round a cell fill a narrow column up to the wires, 0 where they do not; and its middle (x, y)."""
+    filled, sums = np.zeros(_HIGHEST, np.bool_), np.zeros(4, np.int64)
+    for p in _around(cloud, j, i, half):
+        height = cloud.height[p]
+        if cloud.wire[p]:
+            continue
+        if FROM <= height < min(high + 1.0, float(_HIGHEST)):
+            filled[int(height)] = True
+        if (0.5 * high if tall else FROM) <= height <= high:
+            dx, dy = cloud.x[p] - (i + 0.5) * CELL, cloud.y[p] - (j + 0.5) * CELL
+            sums[0] += 1
+            sums[1] += int(np.rint(dx * _PARTS))
+            sums[2] += int(np.rint(dy * _PARTS))
+            sums[3] += int(np.rint((dx * dx + dy * dy) * _PARTS))
     first, last = int(FROM), int(high)
     count = lower = upper = 0
     for s in range(first, last + 1):
@@ -201,73 +205,58 @@ def _upright(x, y, height, wire, order, start, h, w, left, bottom, j, i, tall, h
             count += 1
             lower += 2 * s < high
             upper += 4 * s >= 3 * high - 4
-    share = count / (last - first + 1)
     if sums[0] == 0 or lower == 0 or (tall and upper == 0):
-        return 0.0
+        return 0.0, 0.0, 0.0
+    share = count / (last - first + 1)
+    mean = sums / (sums[0] * _PARTS)
+    x, y = mean[1], mean[2]
     if tall:  # the better, the nearer to its middle
-        away = min((sums[1] ** 2 + sums[2] ** 2) / (float(sums[0]) * _PARTS) ** 2, 100.0)
-        return half * 1000.0 - away if share >= TOWER_FILLED else 0.0
-    spread = sums[3] / sums[0] / _PARTS - (sums[1] ** 2 + sums[2] ** 2) / (float(sums[0]) * _PARTS) ** 2
-    far = max(abs(sums[1]), abs(sums[2])) / sums[0] / _PARTS
-    if far > CENTER or count < LEAST or share < POLE_FILLED or spread > SCATTER**2:
-        return 0.0
-    return share
+        return half * 1000.0 - min(x * x + y * y, 100.0) if share >= TOWER_FILLED else 0.0, x, y
+    slim = max(abs(x), abs(y)) <= CENTER and mean[3] - x * x - y * y <= SCATTER**2
+    return share if slim and count >= LEAST and share >= POLE_FILLED else 0.0, x, y
 
 
 @device
-def _rise(x, y, z, wire, order, start, h, w, left, bottom, j, i, middle_x, middle_y):
-    """How wires rise towards an axis, from both sides together, and their direction there."""
-    reach = int(FAR / CELL) + 1
-    cx, cy = (left + i + 0.5) * CELL + middle_x, (bottom + j + 0.5) * CELL + middle_y
-    step = int(PIECE / CELL) + 1
+def _rise(cloud, j, i, x, y):
+    """How wires rise towards an axis, from both sides together, and their direction there.
+
+    Of pairs of points, as of pieces of one wire: wires may lie far apart.
+    """
+    pairs, n = np.empty((256, 5)), 0
     xx = xy = yy = 0
-    for b in range(max(j - reach, 0), min(j + reach + 1, h)):
-        for a in range(max(i - reach, 0), min(i + reach + 1, w)):
-            for q in range(start[b * w + a], start[b * w + a + 1]):
-                p = order[q]
-                if not wire[p] or (x[p] - cx) ** 2 + (y[p] - cy) ** 2 > FAR * FAR:
-                    continue
-                for d in range(
-                    max(b - step, 0), min(b + step + 1, h)
-                ):  # of pieces of one wire: wires may lie far apart
-                    for c in range(max(a - step, 0), min(a + step + 1, w)):
-                        for t in range(start[d * w + c], start[d * w + c + 1]):
-                            o = order[t]
-                            dx, dy = x[o] - x[p], y[o] - y[p]
-                            out = np.sqrt(dx * dx + dy * dy)
-                            if wire[o] and out <= PIECE and abs(z[o] - z[p]) <= 0.3 * out + 0.1:
-                                xx += int(np.rint(dx * dx * 1024))
-                                xy += int(np.rint(dx * dy * 1024))
-                                yy += int(np.rint(dy * dy * 1024))
+    for p in _around(cloud, j, i, int(FAR / CELL) + 1):
+        away_x, away_y = cloud.x[p] - (i + 0.5) * CELL - x, cloud.y[p] - (j + 0.5) * CELL - y
+        if not cloud.wire[p] or away_x * away_x + away_y * away_y > FAR * FAR:
+            continue
+        for o in _around(cloud, cloud.row[p], cloud.column[p], int(PIECE / CELL) + 1):
+            dx, dy, dz = cloud.x[o] - cloud.x[p], cloud.y[o] - cloud.y[p], cloud.z[o] - cloud.z[p]
+            out = np.sqrt(dx * dx + dy * dy)
+            if not cloud.wire[o] or out > PIECE or abs(dz) > 0.3 * out + 0.1:
+                continue
+            xx += int(np.rint(dx * dx * 1024))
+            xy += int(np.rint(dx * dy * 1024))
+            yy += int(np.rint(dy * dy * 1024))
+            if n == len(pairs):
+                pairs = np.concatenate((pairs, pairs))
+            for k, value in enumerate((away_x, away_y, dx, dy, dz)):
+                pairs[n, k] = value
+            n += 1
     turn = 0.5 * np.arctan2(2.0 * float(xy), float(xx - yy))
     ux, uy = np.cos(turn), np.sin(turn)
     total, count = np.zeros(2, np.int64), np.zeros(2, np.int64)
-    for b in range(max(j - reach, 0), min(j + reach + 1, h)):
-        for a in range(max(i - reach, 0), min(i + reach + 1, w)):
-            for q in range(start[b * w + a], start[b * w + a + 1]):
-                p = order[q]
-                if not wire[p]:
-                    continue
-                along, aside = (x[p] - cx) * ux + (y[p] - cy) * uy, (y[p] - cy) * ux - (x[p] - cx) * uy
-                if not NEAR <= abs(along) <= FAR or abs(aside) > AT_TOWER:
-                    continue
-                side = 1 if along > 0.0 else 0
-                for d in range(max(b - step, 0), min(b + step + 1, h)):
-                    for c in range(max(a - step, 0), min(a + step + 1, w)):
-                        for t in range(start[d * w + c], start[d * w + c + 1]):
-                            o = order[t]
-                            if not wire[o]:
-                                continue
-                            dx, dy, dz = x[o] - x[p], y[o] - y[p], z[p] - z[o]
-                            out = (dx * ux + dy * uy) * (1.0 if side else -1.0)
-                            steep, askew = abs(dz) > 0.3 * out + 0.1, abs(dy * ux - dx * uy) > 0.3 * out
-                            if 0.5 * PIECE <= out <= PIECE and not steep and not askew:
-                                total[side] += int(np.rint(dz / out * _PARTS))
-                                count[side] += 1
+    for k in range(n):
+        away_x, away_y, dx, dy = pairs[k, 0], pairs[k, 1], pairs[k, 2], pairs[k, 3]
+        along, aside = away_x * ux + away_y * uy, away_y * ux - away_x * uy
+        out, askew = dx * ux + dy * uy, abs(dy * ux - dx * uy)
+        side = int(along > 0.0)
+        out = out if side else -out
+        if abs(along) >= NEAR and abs(aside) <= AT_TOWER and out >= max(0.5 * PIECE, askew / 0.3):
+            total[side] -= int(np.rint(pairs[k, 4] / out * _PARTS))
+            count[side] += 1
     if count.sum() < PAIRS:
         return 0.0, turn
-    if min(count[0], count[1]) < PAIRS:  # the last one of a line
-        side = 0 if count[0] > count[1] else 1
+    if count.min() < PAIRS:  # the last one of a line
+        side = int(count[1] > count[0])
         return 2.0 * total[side] / count[side] / _PARTS, turn
     return (total[0] / count[0] + total[1] / count[1]) / _PARTS, turn
 
@@ -286,37 +275,25 @@ def _best(axes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit
-def _mark(x, y, z, height, wire, order, start, h, w, left, bottom, axes, out):
-    """Say which points are of the supports at axes."""
-    for n in range(len(axes)):
-        j, i, tall, high = int(axes[n, 0]), int(axes[n, 1]), axes[n, 2] > 0, axes[n, 3]
-        size = min(max(axes[n, 8] / WIDE, 1.0), WIDEST)
-        over = max(OVER, ABOVE * high) if tall else OVER
-        cx, cy = (left + i + 0.5) * CELL + axes[n, 5], (bottom + j + 0.5) * CELL + axes[n, 6]
-        ux, uy = np.cos(axes[n, 7]), np.sin(axes[n, 7])
-        reach = int(AT_TOWER * size + BESIDE) + 1
-        widest, low = 0.0, high
-        for part in range(2):
-            for b in range(max(j - reach, 0), min(j + reach + 1, h)):
-                for a in range(max(i - reach, 0), min(i + reach + 1, w)):
-                    for q in range(start[b * w + a], start[b * w + a + 1]):
-                        p = order[q]
-                        dx, dy = x[p] - cx, y[p] - cy
-                        along, aside = abs(dx * ux + dy * uy), abs(dy * ux - dx * uy)
-                        if wire[p]:
-                            out[p] |= part == 1 and not tall and dx * dx + dy * dy <= OWN * OWN
-                            if part == 0 and along <= 4.0 and aside <= AT_TOWER * size:
-                                widest, low = max(widest, aside), min(low, height[p])
-                            continue
-                        if part == 0 or height[p] > high + over:
-                            continue
-                        far = np.sqrt(dx * dx + dy * dy)
-                        if tall:
-                            body = (TOP + SPREAD * max(high - height[p], 0.0)) * size
-                            arm = (
-                                height[p] >= low - 1.5 and along <= ALONG * size and aside <= widest + BESIDE
-                            )
-                            out[p] |= far <= body or arm
-                        else:
-                            arm = height[p] >= low - 1.0 and along <= STEM and aside <= POLE_ARM
-                            out[p] |= far <= STEM or arm
+def _mark(cloud, j, i, tall, high, score, x, y, turn, half, out):
+    """Say which points are of the support at an axis, see `_axes`."""
+    size = min(max(half / WIDE, 1.0), WIDEST)
+    over = max(OVER, ABOVE * high) if tall else OVER
+    ux, uy = np.cos(turn), np.sin(turn)
+    widest, low = 0.0, high
+    near = _around(cloud, int(j), int(i), int(AT_TOWER * size + BESIDE) + 1)
+    for arms in range(2):  # how far these reach is known after the wires
+        for p in near:
+            # In this order, whatever the raster's corner is.
+            dx, dy = cloud.x[p] - (i + 0.5) * CELL - x, cloud.y[p] - (j + 0.5) * CELL - y
+            far, height = np.sqrt(dx * dx + dy * dy), cloud.height[p]
+            along, aside = abs(dx * ux + dy * uy), abs(dy * ux - dx * uy)
+            if cloud.wire[p]:
+                if not arms and along <= 4.0 and aside <= AT_TOWER * size:
+                    widest, low = max(widest, aside), min(low, height)
+                out[p] |= not tall and far <= OWN
+            elif arms and height <= high + over and tall:
+                out[p] |= far <= (TOP + SPREAD * max(high - height, 0.0)) * size
+                out[p] |= height >= low - 1.5 and along <= ALONG * size and aside <= widest + BESIDE
+            elif arms and height <= high + over:
+                out[p] |= far <= STEM or (height >= low - 1.0 and along <= STEM and aside <= POLE_ARM)

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import cell_numbers
+from .cells import cell_numbers, levels, patches
 from .linked import longest_sides, number_sets
-from .patches import patches
 
-#: Side of the cells, and how far apart in height the levels of a cell are at least, meters.
-CELL, GAP = 1.0, 1.0
+#: Side of the cells, meters.
+CELL = 1.0
 #: Wires hang higher than that above the ground, are no thicker in a cell, and have no more other levels around, in 5 x 5
 #: cells.
 LOWEST, THICK, CROWD = 4.0, 0.9, 14
@@ -72,9 +71,8 @@ def find_wires(
 
 def _find(xyz, cell, every, high, h, w) -> NDArray[np.bool_]:
     """Which of the high points are of wires; `cell` numbers those of a raster, of which `every` has the points there."""
-    order = np.lexsort((xyz[high, 2], cell[high]))
+    order, begins = levels(xyz[high, 2], cell[high])
     z, cells = xyz[high[order], 2], cell[high[order]]
-    begins = np.r_[True, (np.diff(cells) != 0) | (np.diff(z) > GAP)]
     level = np.empty(len(high), np.int64)
     level[order] = np.cumsum(begins) - 1
     first = np.flatnonzero(begins)

@@ -123,7 +123,7 @@ def from_before(
     stage = stage_of(context.plan)
     needed = stage.needed_of_blocks(box)
     found = (load_arrays(path, needed) for path in paths if os.path.exists(path))  # others have no points
-    return FromBefore(stage.made_of_blocks(found, box), [_changed(context, folder, piece) for piece in cuts])
+    return FromBefore(stage.made_of_blocks(found), [_changed(context, folder, piece) for piece in cuts])
 
 
 def _changed(context: RunContext, folder: str, piece: Piece) -> Changed:
