@@ -115,7 +115,7 @@ INTERRUPTED = """
 import os, signal, subprocess
 big = {"type": "readers.faux", "count": 1_000_000, "mode": "ramp", "bounds": "([0,30],[0,30],[0,3])"}
 ps.run_pipeline([good, {"type": "filters.hag_minima"}])  # Numba is imported, which Ctrl-C would break off
-for wait in (0, 0.3, 1):
+for wait in (0.1, 0.3, 1):
     kill = subprocess.Popen(["sh", "-c", f"sleep {wait}; kill -INT {os.getpid()}"])
     try:
         ps.run_pipeline([big, {"type": "filters.hag_minima"}])

@@ -8,18 +8,19 @@ import logging
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from types import CodeType, FrameType
+from typing import Any, TypeVar
 
-from ..base.errors import DependencyError, PipelineError, suggest
+from ..base.errors import DependencyError, PipelineError
 from ..base.lascheck import DAMAGED, check_readable
 from .filenames import readers_files
-from .interrupts import calls_pdal
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "
@@ -87,25 +88,6 @@ def ask_program(*arguments: str) -> str:
     raise PipelineError(f"pdal {' '.join(arguments)} failed", found=said)
 
 
-def nearest_option(type_name: str, option: str) -> str:
-    """``Did you mean ...?`` among the options of a stage of PDAL's, and where they are listed."""
-    return f"{suggest(option, _named('--options', type_name))}List its options with: pdal-stages options {type_name}"
-
-
-def nearest_stage(type_name: str, ours: Iterable[str]) -> str:
-    """``Did you mean ...?`` among PDAL's stages and ours, and where they are listed."""
-    known = [*ours, *_named("--drivers")]
-    return f"{suggest(type_name, known)}List the stages there are with: pdal-stages drivers"
-
-
-def _named(*question: str) -> list[str]:
-    """The names in what `pdal` lists; none where it cannot."""
-    with contextlib.suppress(DependencyError, PipelineError, ValueError, OSError):
-        listed = json.loads(ask_program(*question, "--showjson"))
-        return [one["name"] for one in (listed[1] if question[0] == "--options" else listed)]
-    return []
-
-
 def execute(
     stages: list[dict[str, Any]], *, arrays: bool = True, loglevel: int = logging.WARNING
 ) -> Execution:
@@ -131,7 +113,6 @@ def execute(
 _one_run = threading.RLock()
 
 
-@calls_pdal
 def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
@@ -258,6 +239,59 @@ def _log(pipeline) -> str:
         return error.object.decode(errors="backslashreplace")
     except RuntimeError:  # a pipeline that PDAL could not even make has none
         return ""
+
+
+# ---- Ctrl-C while PDAL runs ----------------------------------------------------------------------
+
+# PDAL's plugins crash when KeyboardInterrupt comes up in Python code that PDAL called. So it is raised only inside
+# functions that `catches` marks, which hand it on as an error; otherwise it waits for `check_interrupt`.
+_Function = TypeVar("_Function", bound=Callable)
+_catching: set[CodeType] = set()
+_handling = False
+_asked = False
+
+
+def catches(function: _Function) -> _Function:
+    """Mark a function inside which KeyboardInterrupt may be raised, even if PDAL called it."""
+    _catching.add(function.__code__)
+    return function
+
+
+def check_interrupt() -> None:
+    """Raise KeyboardInterrupt if the user asked to stop."""
+    if _asked:
+        raise KeyboardInterrupt
+
+
+def _handle(number: int, frame: FrameType | None) -> None:
+    global _asked
+    _asked = True
+    inside_pdal = False
+    while frame is not None:
+        if frame.f_code in _catching:
+            raise KeyboardInterrupt
+        inside_pdal |= frame.f_code is _execute.__code__
+        frame = frame.f_back
+    if not inside_pdal:
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def gentle() -> Iterator[None]:
+    """Handle Ctrl-C, and SIGTERM where Python handles it, so."""
+    global _asked, _handling
+    if _handling or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if callable(signal.getsignal(n))]
+    before = {number: signal.signal(number, _handle) for number in numbers}
+    _handling, _asked = True, False
+    try:
+        yield
+    finally:
+        _handling = _asked = False
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 # ---- what differs between versions ---------------------------------------------------------------

@@ -6,20 +6,19 @@ import json
 import logging
 import os
 import re
-import signal
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ..base.errors import InterruptedStage, PipelineError, StageError
+from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import whole_files
 from ..base.las import odd_text, supersede_copc
 from ..base.lascheck import check_complete, check_readable
 from ..base.outputs import Output, check_outputs
 from ..base.report import Report
 from ..stages import registry
-from . import interrupts, las_output, runtime
+from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand
 from .filenames import (
@@ -176,10 +175,10 @@ class Pipeline:
                     if is_writer(stage, run):
                         run[number] = las_output.uncompressed_writer(stage, run[:number])
                 try:
-                    with interrupts.gentle(signal.SIGINT):
+                    with pdal_env.gentle():
                         run = callbacks.check_ground(run)
                         result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
-                        interrupts.check()
+                        pdal_env.check_interrupt()
                     compressed = las_output.compress(partials)
                 finally:
                     self.reports = []
@@ -239,11 +238,13 @@ class Pipeline:
         given = [stage.get("type") if isinstance(stage, dict) else None for stage in self.source.stages]
         if given.count(named[0]) == 1 and self.source.lines[given.index(named[0])]:
             error.where = self.source.where(given.index(named[0]))
-        if error.cure is None and (option := _NO_OPTION.search(found)):
-            error.cure = pdal_env.nearest_option(named[0], option[1])
+        if error.cure is None and "Unexpected argument" in found:
+            error.cure = f"List its options with: pdal-stages options {named[0]}"
         if error.cure is None and _NO_STAGE.search(found):
             error.found = found.splitlines()[0]
-            error.cure = pdal_env.nearest_stage(named[0], registry.stages())
+            theirs = [one["name"] for one in json.loads(pdal_env.ask_program("--drivers", "--showjson"))]
+            near = suggest(named[0], [*registry.stages(), *theirs])
+            error.cure = f"{near}List the stages there are with: pdal-stages drivers"
         return error
 
 
@@ -255,7 +256,6 @@ def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override]
 
 
 _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
-_NO_OPTION = re.compile(r"Unexpected argument '([^']*)'")
 _NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")
 _NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
 

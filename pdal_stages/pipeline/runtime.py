@@ -27,7 +27,6 @@ from ..stages import registry
 from ..stages.base import Stage
 from ..stages.points import Points
 from ..stages.preparation import NEEDS_GROUND
-from . import interrupts
 from . import pdal as pdal_env
 
 #: What ``source`` of an expanded stage holds. PDAL sets the globals before each call.
@@ -134,12 +133,12 @@ def _made_again(arguments: Mapping[str, Any]) -> Stage:
     return stage
 
 
-@interrupts.catches
+@pdal_env.catches
 def run_on_view(
     stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
 ) -> Report:
     """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
-    interrupts.check()
+    pdal_env.check_interrupt()
     points = points_of(stage, module, ins)
     for name in stage.reads():
         if name not in ins:
@@ -323,7 +322,7 @@ def _check_ground(where: str, module: dict[str, Any], ins: Mapping[str, Any], ou
     )
 
 
-@interrupts.catches
+@pdal_env.catches
 def call_back(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
     """Call the function of a filter that :class:`Callbacks` made."""
     label = module["pdalargs"]["label"]

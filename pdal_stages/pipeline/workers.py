@@ -23,7 +23,7 @@ from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
 from ..base.messages import LoggedStream, PlainStream
 from ..base.resources import CORES, available_threads
-from .interrupts import check, gentle
+from .pdal import check_interrupt, gentle
 
 #: Of a worker that died.
 KILLED = "it killed its worker: too little memory, or a crash in a library"
@@ -96,7 +96,7 @@ class ThisProcess(AbstractContextManager):
         future: Future = Future()
         with gentle():
             future.set_result(perform(task))
-            check()
+            check_interrupt()
         return future
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
