@@ -30,19 +30,6 @@ def test_numbers_are_taken_where_they_are_within(value):
         assert good and whole == value and type(whole) is int
 
 
-def test_bounds_in_words():
-    for arguments, says in {
-        (None, None): "",
-        (0, None): " of 0 or more",
-        (None, 4): " of at most 4",
-        (0, 1): " from 0 to 1",
-        (0, None, True): " above 0",
-        (0, 0.5, True, "m"): " above 0 and at most 0.5 m",
-        (16, None, False, "MB"): " of 16 MB or more",
-    }.items():
-        assert checks.bounds(*arguments) == says
-
-
 def test_what_is_taken_and_what_is_not():
     assert checks.whole("x", np.int8(5)) == 5 and checks.number("x", np.float32(0.5)) == 0.5
     assert checks.flag("x", np.True_) is True and checks.one_of("x", "a", ("a", "b")) == "a"

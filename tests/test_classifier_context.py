@@ -9,7 +9,7 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import passes
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.context import OWN, WHOLE, Context, around, count_shares
-from pdal_stages.classifier.passes import PassRun, Strips
+from pdal_stages.classifier.passes import PassRun
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
@@ -95,18 +95,6 @@ def test_band_by_band_is_the_same(seed, kind, size):
     assert np.array_equal(got[rows], reference(xyz, shares, rows, context))
 
 
-@given(st.integers(0, 10**6), st.integers(1, 60))
-def test_bands_are_all_strips_once(seed, size):
-    y = np.random.default_rng(seed).uniform(0, 50, 200)
-    strips = Strips(np.column_stack([y, y, y]), None, 2.0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(passes, "BAND", size)
-        bands = strips.bands()
-    assert sorted(np.concatenate([strips.rows(band) for band, _ in bands])) == list(range(200))
-    for band, _ in bands:
-        assert band.stop - band.start <= size or len(np.unique(y[strips.rows(band)] // 2)) == 1
-
-
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(["even", "corners", "far"]))
 def test_what_is_around_is_all_that_matters(seed, kind):
@@ -123,16 +111,6 @@ def test_what_is_around_is_all_that_matters(seed, kind):
     assert np.array_equal(
         context.columns_of(xyz[alone], shares[alone])(np.searchsorted(alone, rows)), expected
     )
-
-
-def test_around_of_nothing_and_of_all():
-    xyz, _ = cloud(0, 50)
-    context = Context(("column8",))
-    assert around(xyz, None, context) is None
-    assert len(around(xyz, np.zeros(0, np.int64), context)) == 0
-    assert around(xyz, np.arange(50), context) is None
-    some = np.array([3, 7])
-    assert around(xyz, some, Context((OWN,))) is some
 
 
 def test_names_and_reach():

@@ -344,12 +344,6 @@ def test_copt_is_the_oracle_s():
 # ---- what is reported, and real clouds -----------------------------------------------------------------------
 
 
-def test_what_reaches_beyond_the_halo_is_counted():
-    xyz = np.vstack([scattered(300, 15), [[500.0, 0.0, 0.0]] * 3])
-    report = compute_features(xyz, neighborhoods="k10,kopt", feature_set="Density").report
-    assert report.beyond_halo == {"k10": 3, "kopt": 3}
-
-
 def test_a_different_seed_changes_shapes_only():
     xyz = CLOUDS["utm"][:400]
     one = compute_features(xyz, None, "k7,kopt", "all", seed=4)

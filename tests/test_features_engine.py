@@ -377,19 +377,6 @@ def test_other_number_types(kind):
     )
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
-def test_few_points(count):
-    xyz = np.random.default_rng(0).uniform(0, 2, (count, 3))
-    if count == 0:
-        assert compute_features(xyz, None, TOKENS, MOMENTS).values.shape == (
-            0,
-            len(FeaturePlan.parse(TOKENS, MOMENTS).names),
-        )
-        return
-    table = compute_features(xyz, None, TOKENS, "all")
-    assert np.isfinite(table.values).all() and len(table) == count
-
-
 # ---- processes: cold start, unwritable folders, memory, Ctrl-C ----------------------------------------------
 
 

@@ -60,15 +60,6 @@ def test_variations_with_many_ties(points, k, scale):
             assert got.values[i, 0] == pytest.approx(expected["NormalAgreement"], rel=1e-4, abs=2e-5)
 
 
-def test_surface_variation_is_that_of_k10():
-    """One definition: a neighborhood that is the point alone and its nearest has the variations of both."""
-    xyz = town(2000)
-    own = compute_features(xyz, None, "k10", "SurfaceVariation")["SurfaceVariation_k10"]
-    index = [np.argsort(oracle.squared_distance(xyz, q), kind="stable")[:2] for q in xyz[:400]]
-    low = compute_features(xyz, np.arange(400), "k1", "SurfaceVariationMin")["SurfaceVariationMin_k1"]
-    assert np.array_equal(low, np.array([own[at].min() for at in index]))
-
-
 def test_a_plane_agrees_and_a_crown_does_not():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0, 10, (800, 2))
@@ -77,18 +68,6 @@ def test_a_plane_agrees_and_a_crown_does_not():
     assert table["NormalAgreement_k20"].min() > 1 - 1e-6 and table["SurfaceVariationMean_k20"].max() < 1e-12
     crown = compute_features(rng.normal(0, 2, (800, 3)), None, "k20", "surfaces")
     assert crown["NormalAgreement_k20"].max() < 0.95 and crown["SurfaceVariationMin_k20"].min() > 0
-
-
-def test_points_on_a_line_agree():
-    for along in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 2.0, 0.5)):
-        table = compute_features(np.outer(np.arange(50), along), None, "k5", "surfaces")
-        assert table["NormalAgreement_k5"].min() > 1 - 1e-6
-        assert table["SurfaceVariationStd_k5"].max() < 1e-12
-
-
-def test_copies_of_one_point_have_no_surface():
-    values = compute_features(CLOUDS["all copies"], None, "k20", "surfaces").values
-    assert (values == np.array([0, 1 / 3, 1 / 3, 0], np.float32)).all()
 
 
 @settings(max_examples=15, deadline=None)

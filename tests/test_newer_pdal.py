@@ -132,26 +132,6 @@ def test_pdals_expressions_after_a_stage_of_ours(cloud):
 # ---- python-pdal -------------------------------------------------------------------------------------------
 
 
-def test_objects_of_both_kinds_joined(cloud, pdal_module, tmp_path):
-    """In any order, from either side, and into a pipeline that is there already."""
-    reader, out = pdal_module.Reader.las(str(cloud)), tmp_path / "out.las"
-    features = ps.Filter.multiscalefeatures(neighborhoods="c1", feature_set="Verticality")
-    high = pdal_module.Filter.range(limits="HeightAboveGround[3:]")
-    writer = pdal_module.Writer.las(str(out), minor_version=4, extra_dims="all")
-    ours = ps.Filter.hag_minima() | features
-    for pipeline in (
-        reader | ours | high | writer,
-        reader | ps.Filter.hag_minima() | (features | high) | writer,
-    ):
-        count = pipeline.execute()
-        assert 0 < count < 2000 and len(laspy.read(out)) == count
-        assert {"HeightAboveGround", "Verticality_c1"} <= set(pipeline.arrays[0].dtype.names)
-        out.unlink()
-    grown = reader.pipeline()
-    grown |= ps.Filter.hag_minima()
-    assert grown.execute() == 2000
-
-
 def test_what_cannot_stream_says_so(cloud, pdal_module):
     """Our stages see all points at once: python-pdal's iterators refuse, and the process goes on."""
     pipeline = pdal_module.Reader.las(str(cloud)) | ps.Filter.hag_minima()
@@ -176,6 +156,10 @@ def test_every_join_that_python_pdal_lets_us_have(cloud, pdal_module):
     assert isinstance(after, ps.Pipeline) and (ps.Pipeline([str(cloud)]) | after).execute() == 7
     reader = pdal_module.Reader.las(str(cloud))
     assert (pdal_module.Pipeline([reader]) | ps.Filter.hag_minima() | head).execute() == 5
+    assert (reader | (ps.Filter.hag_minima() | head)).execute() == 5
+    grown = reader.pipeline()
+    grown |= ps.Filter.hag_minima()
+    assert grown.execute() == 2000
     for theirs in (reader, head, pdal_module.Pipeline([reader])):
         with pytest.raises(TypeError, match="Expected Stage or Pipeline"):
             theirs | ps.Pipeline([hag])

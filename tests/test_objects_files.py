@@ -133,20 +133,6 @@ def test_other_formats_hold_the_same(folder, tmp_path, ending):
 
 
 @pytest.mark.pdal
-def test_metadata_never_replaces_an_input(folder, tmp_path, capsys):
-    cloud = tmp_path / "0.laz"
-    cloud.write_bytes((folder / "parts" / "0.laz").read_bytes())
-    before = cloud.read_bytes()
-    command = ["objects", str(cloud), str(tmp_path / "t.gpkg"), "--metadata"]
-    assert cli.main([*command, str(cloud)]) == 1
-    assert "metadata" in capsys.readouterr().err
-    assert cloud.read_bytes() == before and not (tmp_path / "t.gpkg").exists()
-    assert cli.main([*command, str(tmp_path / "t.gpkg")]) == 1
-    assert "the metadata file is the objects file too" in capsys.readouterr().err
-    assert not (tmp_path / "t.gpkg").exists()
-
-
-@pytest.mark.pdal
 def test_settings_and_metadata(folder, tmp_path):
     def run(*more):
         files = [str(folder / "town.laz"), str(tmp_path / "t.gpkg"), "--metadata", str(tmp_path / "m.json")]

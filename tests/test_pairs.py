@@ -113,25 +113,6 @@ def _neutral(name, given):
 ROWS = rows()
 
 
-def test_every_pair_that_makes_sense_is_there():
-    names = list(VALUES)
-    left = {}
-    for one, two in itertools.combinations(range(len(names)), 2):
-        there = {(row[one], row[two]) for row in ROWS}
-        left |= {
-            pair: 1 for pair in itertools.product(VALUES[names[one]], VALUES[names[two]]) if pair not in there
-        }
-    # Tiles are for two of the doors and want a writer, `classify` writes points, a model of buildings has no vegetation.
-    doors = {(door, tiles) for door in ("objects", "stock") for tiles in VALUES["tiles"][1:]}
-    assert set(left) == {
-        *doors,
-        *(("classify", writer) for writer in ("gdal", "ogr", "none")),
-        *((tiles, writer) for tiles in VALUES["tiles"][1:] for writer in ("gdal", "none")),
-        ("binary", "vegetation_heights"),
-    }
-    assert len(ROWS) < 140
-
-
 @pytest.fixture(scope="session")
 def scenes(tmp_path_factory, write_las):
     """Files of every kind of input."""

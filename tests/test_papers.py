@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -58,13 +57,6 @@ def folder(town, tmp_path_factory):
 # ---- .pts ------------------------------------------------------------------------------------------------
 
 
-def test_pts_round_trip(folder, town):
-    back = pts_input.read_pts(sorted((folder / "town").glob("*.pts")), "town")
-    assert len(back) == len(town)
-    assert sorted(back.labels) == sorted(town.labels)
-    assert set(back.dimensions) == {"Intensity", "ReturnNumber", "NumberOfReturns"}
-
-
 @pytest.mark.pdal
 def test_pts_through_pdal(folder, tmp_path, monkeypatch):
     """The commands of docs/papers.md for clouds that cannot be had, on a stand-in with the same format."""
@@ -97,36 +89,6 @@ def test_pts_through_pdal(folder, tmp_path, monkeypatch):
     assert np.trace(matrix) / matrix.sum() > 0.7
 
 
-@pytest.mark.pdal
-@pytest.mark.skipif(
-    importlib.util.find_spec("torch") is None,
-    reason="PyTorch is not installed (extra 'deep'): training is not tested",
-)
-def test_alsnet_with_the_papers_inputs_through_pdal(folder, tmp_path, monkeypatch):
-    from pdal_stages.classifier import load_model
-    from pdal_stages.pipeline.read import parse_overrides
-    from pdal_stages.pipeline.run import Pipeline
-
-    monkeypatch.chdir(tmp_path)
-    writer = json.loads((FOLDER / "vaihingen-train-alsnet.json").read_text())[-1]
-    there = {str(label): writer["classes"][str(label)] for label in (1, 2, 5, 7, 8)}
-    quick = {**writer["alsnet"], "configuration": "tiny", "epochs": 1, "device": "cpu"}
-    words = [
-        f"--stage.input.filename={folder / 'town' / 'train.pts'}",
-        f"--stage.model.classes={json.dumps(there)}",
-        f"--stage.model.alsnet={json.dumps(quick)}",
-    ]
-    Pipeline(FOLDER / "vaihingen-train-alsnet.json", parse_overrides(words)[0]).execute()
-    model = load_model(tmp_path / "vaihingen-alsnet.model")
-    assert model.required_dimensions == ("Intensity", "ReturnNumber", "NumberOfReturns")
-    evaluate = [
-        f"--stage.input.filename={folder / 'town' / 'test.pts'}",
-        "--stage.classifier.model=vaihingen-alsnet.model",
-    ]
-    Pipeline(FOLDER / "vaihingen-evaluate.json", parse_overrides(evaluate)[0]).execute()
-    assert (tmp_path / "vaihingen-accuracy.json").exists()
-
-
 # ---- experiments -----------------------------------------------------------------------------------------
 
 
@@ -146,24 +108,6 @@ def test_b16_names():
     assert count["c1", "distributions"] == 50
     assert count["kopt", "both"] == 64
     assert count["all", "both"] == 312  # 311 and Z
-
-
-def test_b16_experiment(scene, monkeypatch):
-    monkeypatch.setattr(b16_experiments, "COUNT", 100)
-    monkeypatch.setattr(b16_experiments, "TREES", (5, 10))
-    results = kit.Results(None, {})
-    runs = []
-    for feature_set in b16_experiments.SETS:
-        run = {"scene": "town", "neighborhood": "c3", "set": feature_set, "seed": 0}
-        made = results.get(run, lambda f=feature_set: b16_experiments.experiment(scene, "c3", f, 0, 1))
-        runs.append({**run, **made})
-    assert runs[0]["oa"] > 60
-    assert runs[1]["oa"] > 40  # distributions alone
-    assert runs[2]["oa"] > 60
-    assert np.array(runs[0]["matrix"]).sum() == len(scene.test)
-    text = b16_experiments.report(runs)
-    assert f"{runs[0]['kappa']:.2f}" in text
-    assert "both sets beat measures, c3" in text
 
 
 def test_w18_run(scene):

@@ -17,13 +17,6 @@ from pdal_stages.tiling import run_tiled
 
 pytestmark = pytest.mark.pdal
 
-UTM = (
-    'PROJCS["WGS 84 / UTM zone 32N",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
-    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
-    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],'
-    'PARAMETER["false_easting",500000],PARAMETER["false_northing",0],UNIT["metre",1]]'
-)
-
 
 def scene(n=3000, seed=0, size=59.9):
     """Ground with boxes on it: X, Y, Z, Classification and some LAS dimensions."""
@@ -136,69 +129,6 @@ def test_door_3_filters_python_by_hand(cloud, pdal_module):
     pipeline = pdal_module.Pipeline(json.dumps(stages))
     assert pipeline.execute() == 3000
     assert pipeline.arrays[0]["HeightAboveGround"].max() > 5
-
-
-# ---- what must survive -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("point_format,suffix", [(0, ".las"), (3, ".laz"), (7, ".las")])
-def test_everything_else_comes_out_unchanged(tmp_path, write_las, model, point_format, suffix):
-    arrays = scene()
-    if point_format in (0, 1, 6):
-        arrays.pop("Red")
-    if point_format == 0:
-        arrays.pop("GpsTime")
-    arrays["Mine"] = np.arange(3000, dtype=np.int32)
-    source = write_las(
-        tmp_path / f"in{suffix}", arrays, point_format=point_format, wkt=UTM if point_format >= 6 else None
-    )
-    out = tmp_path / f"out{suffix}"
-    ps.run_pipeline(
-        [
-            {"type": "readers.las", "filename": str(source), "use_eb_vlr": True},
-            {"type": "filters.hag_minima"},
-            {"type": "filters.modelclassifier", "model": str(model)},
-            {"type": "writers.las", "filename": str(out), "forward": "all", "extra_dims": "all"},
-        ]
-    )
-    before, after = read(source), read(out)
-    assert after.header.version == before.header.version
-    assert after.header.point_format.id == before.header.point_format.id
-    assert np.array_equal(after.header.scales, before.header.scales)
-    assert np.array_equal(after.header.offsets, before.header.offsets)
-    for name in before.point_format.dimension_names:
-        if name != "classification":
-            assert np.array_equal(np.asarray(after[name]), np.asarray(before[name])), name
-    if point_format >= 6:
-        assert "UTM zone 32N" in str(after.header.vlrs.get("WktCoordinateSystemVlr")[0].string)
-    assert set(np.unique(after.classification)) <= {2, 6}
-    assert np.mean(after.classification == before.classification) > 0.95
-    assert {"HeightAboveGround", "Reliability"} <= set(after.point_format.dimension_names)
-
-
-def test_legacy_flag_bits_stay(tmp_path, write_las, model):
-    arrays = scene()
-    rng = np.random.default_rng(5)
-    for name in ("Synthetic", "KeyPoint", "Withheld"):
-        arrays[name] = rng.integers(0, 2, 3000).astype(np.uint8)
-    source = write_las(tmp_path / "in.las", arrays, point_format=3)
-    out = tmp_path / "out.las"
-    pipeline = ps.run_pipeline(
-        [
-            str(source),
-            {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
-            {"type": "filters.hag_minima"},
-            {"type": "filters.modelclassifier", "model": str(model)},
-            {"type": "filters.accuracy", "print": False},
-            {"type": "writers.las", "filename": str(out), "forward": "all"},
-        ]
-    )
-    before, after = read(source), read(out)
-    for name in ("synthetic", "key_point", "withheld"):
-        assert np.array_equal(np.asarray(after[name]), np.asarray(before[name])), name
-    assert set(np.unique(after.classification)) <= {2, 6}
-    # Flags taken for classes would halve it.
-    assert pipeline.metadata["metadata"]["filters.accuracy"]["overall_accuracy"] > 0.8
 
 
 # ---- class codes that do not fit -------------------------------------------------------------------------
@@ -377,15 +307,3 @@ def test_pipelines_run_in_threads(cloud):
         t.join()
     assert len(results) == 4
     assert all(np.array_equal(results[0], r) for r in results.values())
-
-
-def test_ctrl_c_in_a_stage_is_an_interrupt(cloud, monkeypatch, tmp_path):
-    from pdal_stages.stages.hag_minima import HagMinima
-
-    def interrupted(stage, points):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(HagMinima, "run", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        ps.run_pipeline([str(cloud), {"type": "filters.hag_minima"}, str(tmp_path / "o.laz")])
-    assert not list(tmp_path.glob("*o.laz*"))

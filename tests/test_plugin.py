@@ -174,7 +174,6 @@ READY = {
     "train": ["--stage.model.filename=m.model"],
     "evaluate": ["--stage.classifier.model=MODEL", "--stage.output.filename=o.laz", "--stage.accuracy.json=a.json",
                  "--stage.accuracy.html=a.html"],
-    "classify-on-smrf-ground": ["--stage.classifier.model=SMRF", "--stage.output.filename=o.laz"],
     "tiles-to-tiles": ["--stage.classifier.model=MODEL", "--stage.output.filename=o_#.laz", "--stage.tiles.length=40"],
 }  # fmt: skip
 
@@ -187,10 +186,8 @@ def test_a_ready_pipeline_gives_the_same_bytes(
         (tmp_path / door).mkdir()
         source = ready_halves / "*.laz" if name == "tiles-to-tiles" else town
         words = [f"--stage.input.filename={source}", *READY[name], *(quick if name == "train" else ())]
-        names = {"MODEL": ready_models / "classes.model", "SMRF": ready_models / "smrf.model"}
-        for word, path in names.items():
-            words = [one.replace(word, str(path)) for one in words]
-        stages = with_words(name, *words)
+        model = str(ready_models / "classes.model")
+        stages = with_words(name, *(one.replace("MODEL", model) for one in words))
         if door == "stock":
             pipeline(stages, cwd=tmp_path / door)
         else:
@@ -244,16 +241,14 @@ def test_metadata_is_the_report(pipeline, town, tmp_path):
 
 
 def test_an_empty_list_is_none(pipeline, town, tmp_path):
-    """PDAL cannot tell an empty list from none given; null, or an empty text, is one."""
-    for given, ours in ((None, []), ("", [])):
-        files = tmp_path / "stock.txt", tmp_path / "ours.txt"
-        for value, run, file in (
-            (given, pipeline, files[0]),
-            (ours, lambda s: ps.Pipeline(s).execute(), files[1]),
-        ):
-            stage = {"type": "filters.hag_minima", "ignore": value}
-            run([str(town), stage, {"type": "writers.text", "filename": str(file)}])
-        assert files[0].read_bytes() == files[1].read_bytes()
+    """PDAL cannot tell an empty list from none given; null is one."""
+    files = tmp_path / "stock.txt", tmp_path / "ours.txt"
+    for given, run, file in zip(
+        (None, []), (pipeline, lambda s: ps.Pipeline(s).execute()), files, strict=True
+    ):
+        stage = {"type": "filters.hag_minima", "ignore": given}
+        run([str(town), stage, {"type": "writers.text", "filename": str(file)}])
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 # ---- errors ------------------------------------------------------------------------------------------------
@@ -263,9 +258,7 @@ def test_an_empty_list_is_none(pipeline, town, tmp_path):
     ("options", "says"),
     [
         ({"cell": "wide"}, "filters.hag_minima: Invalid value 'wide' for argument 'cell'"),
-        ({"sell": 3}, "filters.hag_minima: Unexpected argument 'sell'"),
         ({"cell": -1}, "filters.hag_minima (tag 'h'): option 'cell' must be a number from 0.05"),
-        ({"where": "X >"}, "filters.hag_minima (tag 'h'): the 'where' expression"),
         ({"option_file": "nowhere.json"}, "there is no option 'option_file'"),
     ],
 )
@@ -335,21 +328,13 @@ def test_a_package_that_is_missing(pipeline, environment, town, tmp_path):
     assert not (tmp_path / "o.laz").exists()
 
 
-def test_a_plugin_of_another_version(stock, environment, town, tmp_path, plugin, monkeypatch):
-    question = {
-        "version": "9.9",
-        "digest": "x",
-        "stage": "filters.hag_minima",
-        "label": "l",
-        "step": "prepare",
-    }
-    module = {"pdalargs": question}
-    outs = {}
-    assert answers.answer(module, {}, outs)
+def test_a_plugin_of_another_version():
+    asked = {"version": "9.9", "digest": "x", "stage": "filters.hag_minima", "label": "l", "step": "prepare"}
+    module = {"pdalargs": asked}
+    assert answers.answer(module, {}, {})
     (leaf,) = module["out_metadata"]["children"]
-    assert (
-        leaf["name"] == "pdal_stages_error" and "plugin --install" in leaf["value"] and "9.9" in leaf["value"]
-    )
+    assert leaf["name"] == "pdal_stages_error" and "9.9" in leaf["value"]
+    assert "plugin --install" in leaf["value"]
 
 
 def test_without_filters_python(plugin, pdal_program, town, tmp_path):

@@ -60,12 +60,6 @@ def ball(n, seed=0, radius=2.0):
     return v / np.linalg.norm(v, axis=1)[:, None] * radius * rng.uniform(0, 1, (n, 1)) ** (1 / 3)
 
 
-def disk(n, seed=0, radius=2.0):
-    rng = np.random.default_rng(seed)
-    r, a = radius * np.sqrt(rng.uniform(0, 1, n)), rng.uniform(0, 2 * math.pi, n)
-    return np.c_[r * np.cos(a), r * np.sin(a), np.zeros(n)]
-
-
 def close(values, expected, sigma=6):
     """The mean is the expected one, within `sigma` standard errors and what the finite cloud is off."""
     assert values.mean() == pytest.approx(
@@ -87,15 +81,6 @@ def test_ball():
         assert np.mean(d <= t) == pytest.approx(t**3 - 9 / 16 * t**4 + t**6 / 32, abs=0.006)
     for t in (0.2, 0.5, 0.8):
         assert np.mean(v["D1"] / 2 <= t) == pytest.approx(t**3, abs=0.006)
-
-
-def test_disk():
-    v = pulls(disk(60_000), repeats=400)
-    close(v["D1"], 2 / 3 * 2)
-    close(v["D2"], 128 / (45 * math.pi) * 2)
-    close(v["A3"], math.pi / 3)
-    close(v["D3"] ** 2, 35 / (48 * math.pi) * 2**2)  # mean area of a random triangle
-    assert v["D4"].max() < 0.01
 
 
 def test_equilateral_triangle_and_regular_tetrahedron():
@@ -144,14 +129,6 @@ def test_every_ordered_choice_is_equally_likely(n):
         chi2 = ((off - expected) ** 2 / expected).sum()
         freedom = len(off) - 1
         assert abs(chi2 - freedom) < 6 * math.sqrt(2 * freedom)
-
-
-def test_draws_of_different_seeds_and_pulls_are_independent():
-    at = drawn(1000, 400).astype(float)
-    rows = [*at, at[0].reshape(-1, PULLS)[:, 1:].ravel(), at[0].reshape(-1, PULLS)[:, :-1].ravel()]
-    assert abs(np.corrcoef(rows[0], rows[1])[0, 1]) < 0.02
-    assert abs(np.corrcoef(rows[2], rows[3])[0, 1]) < 0.02
-    assert abs(np.corrcoef(rows[4], rows[5])[0, 1]) < 0.02
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -278,16 +255,6 @@ def test_values_that_repeat_leave_bins_empty_and_nothing_else():
         assert (np.diff(rows[4:]) > 0).all() or m == 0
     empty = ShapeBins.fit({"c1": np.full((3, 5, 255), np.nan, f32)})
     assert (empty.thresholds("c1") == 0).all()
-
-
-def test_comparable_thresholds_are_the_values_they_were_fitted_to():
-    values = np.zeros((4, 5, 255), f32)
-    rng = np.random.default_rng(3)
-    values[:, 0] = rng.uniform(-1, 1, (4, 255))
-    values[:, 1:] = rng.exponential(5, (4, 4, 255))
-    comparable = ShapeBins.fit({"c1": values}).comparable(["c1"])[0]
-    for m in range(5):
-        assert np.isin(comparable[m], values[:, m]).all()
 
 
 def test_thresholds_survive_json(fitted):

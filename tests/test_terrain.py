@@ -55,22 +55,6 @@ def test_equals_the_slow_reference(seed, offset):
     assert np.allclose(got, slow_hag(x, y, z, 20.0, 0.5), atol=1e-9 * max(1, abs(offset) / 1e4))
 
 
-def test_a_plane_of_minima_is_reproduced_between_cell_centers():
-    # One point at each cell center, on a plane: bilinear interpolation is exact on it.
-    cx, cy = np.meshgrid(np.arange(10.0, 200, 20), np.arange(10.0, 200, 20))
-    plane = 5 + 0.2 * cx - 0.1 * cy
-    x, y = np.append(cx.ravel(), 87.25), np.append(cy.ravel(), 101.75)
-    z = np.append(plane.ravel(), 5 + 0.2 * 87.25 - 0.1 * 101.75 + 3.0)
-    assert hag_minima(x, y, z)[-1] == pytest.approx(3.0, abs=1e-9)
-
-
-def test_points_of_one_fine_cell_share_the_terrain():
-    x = np.array([0.0, 100.0, 50.1, 50.4])
-    y = np.array([0.0, 100.0, 50.1, 50.4])
-    height = hag_minima(x, y, np.array([0.0, 10.0, 20.0, 20.0]))
-    assert height[2] == height[3]
-
-
 def test_one_stray_point_costs_one_cell():
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 100, (2, 1000))
@@ -89,12 +73,6 @@ def test_gaps_are_filled_and_counted():
     assert 0.0 < ground[0] < 50.0
     assert terrain.figures["interpolated_cells"] > 0
     assert terrain.figures["farthest_fill"] >= 20.0
-
-
-def test_masked_points_do_not_form_the_terrain():
-    x = y = np.array([1.0, 2.0, 3.0])
-    z = np.array([-50.0, 1.0, 4.0])
-    assert hag_minima(x, y, z, mask=[False, True, True]).tolist() == [-51.0, 0.0, 3.0]
 
 
 def test_not_finite_coordinates_stay_apart():

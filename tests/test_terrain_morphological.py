@@ -87,20 +87,6 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
     assert np.array_equal(floor, want_floor)
 
 
-def test_a_plane_is_carried_across_a_hole():
-    left, bottom, h, w = 123_450, -77, 60, 70
-    j, i = np.mgrid[:h, :w]
-    level = 5 + 0.3 * (i + left) - 0.2 * (j + bottom)
-    ground = (np.hypot(i - 35, j - 30) > 18) & ((i * 7 + j * 3) % 4 == 0)
-    place = np.zeros((h, w, 3))
-    place[..., 2] = level
-    floor = level.astype(np.float32)
-    planes = surface(ground, place, floor, floor, left, bottom, 5, np.ones_like(ground))
-    # Held a little by the level planes the coarsest blocks start from.
-    assert np.abs(planes[..., 0] - level).max() < 0.25
-    assert np.array_equal(planes[ground, 0], level[ground])
-
-
 def slow_planes(cells, left, bottom, level, floor, at):
     """Plane (height, gradient) of one block of the pyramid, by least squares over its cells, and recursion."""
     size = 2**level
@@ -419,17 +405,6 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
         if spacing == 250:
             assert len(shapes) > 5
             assert sum(shapes) < 0.1 * 8**2 * spacing**2
-
-
-def test_cost_of_strays_follows_their_number():
-    rng = np.random.default_rng(0)
-    x, y = np.concatenate([rng.uniform(0, 200, (2, 2000)), rng.uniform(-1e6, 1e6, (2, 300))], axis=1)
-    column, row = (np.floor(v).astype(np.int64) for v in (x, y))
-    pieces = list(cells.patches(column, row, 400, 100))
-    own = np.concatenate([points[mine] for points, mine in pieces])
-    assert np.array_equal(np.sort(own), np.arange(len(x)))
-    area = sum(cells._cells(column[points], row[points]) for points, _ in pieces)
-    assert area < 201 * 201 + 300 * 100
 
 
 def test_one_stray_point_costs_little_memory():

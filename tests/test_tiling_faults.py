@@ -517,7 +517,7 @@ def test_a_cluster(tmp_path, folder, expected, monkeypatch):
         check_same(tmp_path, expected)
         flag = tmp_path / "working"
         slow = pipeline(
-            folder, tmp_path / "o_#.laz", python_filter(f"open({str(flag)!r}, 'w').close(); time.sleep(1)")
+            folder, tmp_path / "o_#.laz", python_filter(f"open({str(flag)!r}, 'w').close(); time.sleep(0.3)")
         )
 
         def kill(process: subprocess.Popen) -> None:

@@ -88,12 +88,6 @@ def test_other_options(tmp_path, more):
     same_forests(cloud, TrainingOptions(**{**QUICK, **more}), 17.0, tmp_path)
 
 
-def test_on_top_of_a_model(tmp_path):
-    base = train([scene(seed=8)], TrainingOptions(**QUICK), progress=False)
-    options = TrainingOptions(**{**QUICK, "base": base, "classes": {"2": 2, "6": 6}})
-    same_forests(scene(), options, 17.0, tmp_path)
-
-
 def test_neighbors_beyond_the_halo_are_counted(tmp_path):
     """At one point on 40 m2 the fifty nearest lie 25 m around."""
     (tmp_path / "work").mkdir()

@@ -89,7 +89,7 @@ def widths_of(radii: np.ndarray, cell: float) -> np.ndarray:
     away = np.maximum(np.abs(np.arange(-reach, reach + 1)) - 1, 0) * cell  # of a row, or column, at least
     touched = away[:, None] ** 2 + away**2 < radii[:, None, None] ** 2
     touched = touched[:, touched.any(axis=(0, 2))]
-    return touched[:, :, reach:].sum(axis=2) - 1
+    return np.ascontiguousarray(touched[:, :, reach:].sum(axis=2) - 1)  # as of one radius: a kernel for both
 
 
 @njit

@@ -9,6 +9,7 @@ import laspy
 import numpy as np
 import pytest
 from robustness_kit import HAG, job, las, scene
+from test_robust_clouds import METERS
 
 from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline.inputs_outputs import reference_of, reference_of_file
@@ -44,7 +45,19 @@ def test_versions_and_formats(command, tmp_path, write_las, model, version, poin
     if suffix == ".laz" and (waves or version <= 1):
         pytest.skip("lazrs and laspy do not write such LAZ")
     written = max(version, 3 if waves else 2)
-    source = write_las(tmp_path / f"in{suffix}", scene(), point_format=point_format, minor_version=written)
+    rng = np.random.default_rng(point_format)
+    arrays = scene() | {"Intensity": rng.integers(0, 65535, 600), "UserData": rng.integers(0, 255, 600)}
+    arrays |= {name: rng.integers(0, 2, 600) for name in ("Synthetic", "KeyPoint", "Withheld")}
+    if point_format not in (0, 2):
+        arrays["GpsTime"] = rng.uniform(0, 1e6, 600)
+    if point_format in (2, 3, 5, 7, 8, 10):
+        arrays["Red"] = rng.integers(0, 65535, 600)
+    how = {
+        "point_format": point_format,
+        "minor_version": written,
+        "wkt": METERS if point_format > 5 else None,
+    }
+    source = write_las(tmp_path / f"in{suffix}", {**arrays, "Mine": np.arange(600, dtype=np.int32)}, **how)
     if version <= 1:
         data = bytearray(source.read_bytes())
         data[25] = version
@@ -54,8 +67,13 @@ def test_versions_and_formats(command, tmp_path, write_las, model, version, poin
         command.refused(done, "waveforms", "laspy.convert")
         return
     command.runs(done)
-    out = check(tmp_path)
-    assert out.header.point_format.id == point_format
+    out, before = check(tmp_path), laspy.read(source)
+    for name in set(before.point_format.dimension_names) - {"classification"}:
+        assert np.array_equal(np.asarray(out[name]), np.asarray(before[name])), name
+    assert out.header.point_format.id == point_format and out.header.parse_crs() == before.header.parse_crs()
+    assert np.array_equal(
+        [out.header.scales, out.header.offsets], [before.header.scales, before.header.offsets]
+    )
     # PDAL writes no LAS 1.0, newer PDAL LAS 1.4 where it is not told otherwise
     assert out.header.version.minor == version if version else out.header.version.minor in (2, 4)
 
