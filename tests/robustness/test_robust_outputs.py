@@ -98,7 +98,7 @@ REPLACING = [
     ([*CLASSIFY, "o.las", "--metadata", "o.las"], "the metadata file is the output file too"),
     ([*ACCURACY, "--json", "b.las"], OTHER),
     ([*ACCURACY, "--json", "x", "--html", "x"], "is the json file too"),
-    (["objects", "a.las", "t.gpkg", "--metadata", "a.las"], INPUT),
+    (["objects", "a.las", "t.gpkg", "--metadata", "a.las"], OTHER),
     (["objects", "a.las", "t.gpkg", "--metadata", "t.gpkg"], "the metadata file is the objects file too"),
     (["expand", "p.json", "-o", "p.json"], INPUT),
     (["pipeline", "p.json", "--metadata", "p.json"], INPUT),
