@@ -7,7 +7,6 @@ from pathlib import Path
 
 from ..base.messages import print_messages
 from ..tiling.command import add_arguments
-from ..tiling.objects import add_arguments as add_objects_arguments
 from .parser import INPUTS, Parser, switch
 
 
@@ -97,7 +96,16 @@ def add_commands(parser: Parser) -> None:
         overrides=True,
         logged=True,
     )
-    add_objects_arguments(parser.commands["objects"])
+    takes = parser.commands["objects"].add_argument
+    takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
+    takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
+    takes("--outlines", choices=("straight", "cells"), help="Outlines along walls (default) or along cells")
+    takes(
+        "--cell", type=float, metavar="METERS",
+        help="Side of the grid's cells (0.5, where points are fewer than 4 or so per m2 1, 2 or 4)",
+    )  # fmt: skip
+    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
+    takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
     takes = parser.command(
         "review", _review, "List where a person should look in classified files, worst first", logged=True

@@ -32,8 +32,10 @@ MAKERS = {
         "The reader does not give it; leave it out of the model's dimensions",
     ),
 }
-#: How the warning begins that a `where` chooses no point.
+#: How the warnings begin that a `where` chooses no point, and that none of a file's polygons is near; in tiles they are
+#: told where it is so in all.
 HOLDS_NOWHERE = "'where' holds for none of the"
+TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 #: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical unit.

@@ -9,11 +9,8 @@ from ..objects.outlines import with_vector
 from ..objects.overlay import Overlay, inside_of
 from .base import ClassStage
 from .options import ignore_option, keep_option, option
-from .points import Points, class_counts
+from .points import TOUCH_NONE, Points, class_counts
 from .selection import Selection
-
-#: How the warning begins that none of a file's polygons is near the points.
-TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
 
 
 class Polygons(ClassStage):

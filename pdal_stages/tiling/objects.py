@@ -43,20 +43,6 @@ _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 LARGEST = 4.0
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the flags to the parser of ``objects``."""
-    takes = command.add_argument
-    takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
-    takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    takes("--outlines", choices=("straight", "cells"), help="Outlines along walls (default) or along cells")
-    takes(
-        "--cell", type=float, metavar="METERS",
-        help="Side of the grid's cells (0.5, where points are fewer than 4 or so per m2 1, 2 or 4)",
-    )  # fmt: skip
-    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
-    takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
-
-
 def run_command(options: argparse.Namespace) -> int:
     """Run ``pdal-stages objects``; the exit code."""
     given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..base.version import __version__
-from ..stages.points import HOLDS_NOWHERE
-from ..stages.polygons import TOUCH_NONE
+from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
 from .inputs import InputSource
 
 #: Points that did not get a class from the classifier, or another one, by their names in the reports of stages.

@@ -20,8 +20,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of
 from ..stages import registry
 from ..stages.hag_morphological import HagMorphological
-from ..stages.points import HOLDS_NOWHERE
-from ..stages.polygons import TOUCH_NONE
+from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
 from .grid import Box, TileGrid, inside
 from .inputs import CloudIndex, InputSource
 from .outputs import PieceResults, changed_in, class_counts, flags_in_classes, save_results, write_tile
