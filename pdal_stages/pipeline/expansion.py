@@ -231,7 +231,7 @@ def check_dimensions(expanded: Expanded) -> None:
                 raise DimensionError(
                     f"the dimension '{name}' is missing: no stage before makes it, and no input has it",
                     where=ours.place,
-                    cure=getattr(ours.stage, "hint", None) or MAKERS.get(name),
+                    cure=ours.stage.hint or MAKERS.get(name),
                 )
 
 

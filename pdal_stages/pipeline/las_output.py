@@ -17,7 +17,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.las import LasHeader, extra_dimensions, read_header, supersede_copc
 from ..stages import registry
-from ..stages.base import CodeLimit, Stage
+from ..stages.base import Stage
 from . import pdal as pdal_env
 from .filenames import is_reader, is_writer, reader_files, writes_las
 from .runtime import python_filter
@@ -80,13 +80,14 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
     OptionError, DimensionError
         Naming the stage.
     """
+    last = [stage for stage, _, _ in ours if "Classification" in stage.creates()][-1:]
     for stage, place, index in ours:
         extra = len(stage.creates())
         for writer in filter(writes_las, stages[index + 1 :]):
             if (limit := _code_limit(writer, stages[:index])) is not None:
-                stage.code_limit = limit
-                if (largest := stage.largest_class()) > limit.largest:
-                    raise OptionError(limit.what, where=place, found=f"code {largest}", cure=limit.cure)
+                stage.code_limit = limit if stage in last else None
+                if (largest := stage.largest_class()) > LEGACY_LIMIT:
+                    raise OptionError(limit[0], where=place, found=f"code {largest}", cure=limit[1])
             if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
                     f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
@@ -98,8 +99,8 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
                 )
 
 
-def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLimit | None:
-    """The largest class code that a LAS writer can hold; None for point formats that hold all codes."""
+def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[str, str] | None:
+    """What to say of codes above 31, and the cure; None for point formats that hold all codes."""
     if writer.get("type") == "writers.copc":
         return None
     minor, format_id = las_version(writer, before)
@@ -109,7 +110,7 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> CodeLim
         f"class codes above {LEGACY_LIMIT} do not fit the LAS file that writers.las would write "
         f"(LAS 1.{minor}, dataformat_id {format_id})"
     )
-    return CodeLimit(LEGACY_LIMIT, what, f"Give writers.las {_AS_LAS_14}")
+    return what, f"Give writers.las {_AS_LAS_14}"
 
 
 def check_copc(stages: list[dict[str, Any]]) -> None:

@@ -142,7 +142,7 @@ def run_on_view(
     points = points_of(stage, module, ins)
     for name in stage.reads():
         if name not in ins:
-            stage.take(points, name)  # raises, naming the stage that makes it
+            raise points.missing(name, stage.hint)
     if not points.count:
         return run_on_nothing(stage)
     points.lent_by_pdal = isinstance(ins, dict)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +27,6 @@ def files_read(stages: Sequence[Mapping[str, Any]]) -> list[str]:
     """Files of the readers among stages, as they are written."""
     readers = [s for s in stages if str(s.get("type") or "readers.").startswith("readers.")]
     return [str(s["filename"]) for s in readers if "filename" in s]
-
-
-class CodeLimit(NamedTuple):
-    """The largest class code that a later writer can hold, and what to say of larger ones."""
-
-    largest: int
-    what: str
-    cure: str
 
 
 class Stage(ABC):
@@ -108,8 +100,8 @@ class Stage(ABC):
     own_points: str = ""
     #: Whether stages before it in the pipeline make what it makes too.
     makes_again: bool = False
-    #: Set where a pipeline's writer cannot hold every class code.
-    code_limit: CodeLimit | None = None
+    #: Set where a pipeline's writer cannot hold codes above 31: what to say of them, and the cure.
+    code_limit: tuple[str, str] | None = None
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
         try:
@@ -134,6 +126,11 @@ class Stage(ABC):
 
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
         """Told, before it runs in a pipeline, which stages made what it reads; what the user should know of it."""
+        return None
+
+    @property
+    def hint(self) -> str | None:
+        """What to do where a dimension that it reads is missing, if it knows better than :data:`MAKERS`."""
         return None
 
     def inputs(self) -> list[str]:
@@ -188,11 +185,11 @@ class Stage(ABC):
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
         own = arrays.get(self.own_points)
-        return Points(arrays, wkt=wkt, where=self._condition, units=units, legacy_flags=legacy_flags, own=own)
-
-    def take(self, points: Points, name: str) -> NDArray:
-        """A dimension the stage reads; an error for a missing one names the stage that makes it."""
-        return points.dimension(name)
+        points = Points(
+            arrays, wkt=wkt, where=self._condition, units=units, legacy_flags=legacy_flags, own=own
+        )
+        points.code_limit = self.code_limit
+        return points
 
     @abstractmethod
     def run(self, points: Points) -> dict[str, NDArray]:

@@ -43,13 +43,7 @@ AUTO = "auto"
 def trained(name: str, /, **other: Any) -> Any:
     """An option of training, as it is declared there; `other` is what is different here, as for :class:`Option`."""
     field = _TRAINING[name]
-    rule = field.metadata
-    default: Any = field.default
-    if rule["kind"] == "list" and default is not None and not isinstance(default, tuple):
-        default = (default,)
-    if rule["kind"] == "number" and default is not None:
-        default = float(default)
-    return option(**{"default": default, **rule, **other})
+    return option(**{"default": field.default, **field.metadata, **other})
 
 
 class ClassifierModel(Stage):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from numpy.typing import NDArray
 
-from ..base.asprs import bands
 from ..objects.consistency import RULES, consistent, reach
 from .base import ClassStage
 from .options import ignore_option, keep_option, option, vegetation_heights_option
@@ -29,7 +28,7 @@ class Consistency(ClassStage):
     lone: bool = option(
         "boolean", True, "A lone building or leaf among at least ten of the other is of their class"
     )
-    vegetation_heights: list = vegetation_heights_option(
+    vegetation_heights: tuple[float, float] | None = vegetation_heights_option(
         "what becomes vegetation is low (3) below the first, medium (4) below the second and high (5) above; without "
         "heights it is what most vegetation around it is, high where there is none"
     )
@@ -48,9 +47,6 @@ cloud. The feet of walls stay what they are: surveys label them building as ofte
         {"type": "filters.modelclassifier", "model": "standard"},
     )
     example = {"type": "filters.consistency"}
-
-    def check(self) -> None:
-        bands(self.vegetation_heights)  # refused here where it means nothing
 
     @property
     def _rules(self) -> list[str]:
@@ -74,8 +70,7 @@ cloud. The feet of walls stay what they are: surveys label them building as ofte
                 "there is no HeightAboveGround or no Ground: the rules ground and islands did nothing"
             )
         before = points.class_codes
-        limits = bands(self.vegetation_heights)
-        if limits:
+        if self.vegetation_heights:
             points.dimension("HeightAboveGround")  # refused where there is none
         points.keep_only(["Classification", "HeightAboveGround", "Ground"])
         codes, changed = consistent(
@@ -85,7 +80,7 @@ cloud. The feet of walls stay what they are: surveys label them building as ofte
             mask=~ignored,
             change=change,
             rules=self._rules,
-            vegetation_heights=limits,
+            vegetation_heights=self.vegetation_heights,
         )
         points.report.figures |= changed
         points.report.figures["changed"] = points.counted(codes != before)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import HIGH as HIGH_VEGETATION
-from ..base.asprs import LOW, MEDIUM, bands, by_height
-from ..base.errors import DimensionError, OptionError
+from ..base.asprs import LOW, MEDIUM, by_height
+from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..classifier import Model
 from ..classifier.model import UNCLASSIFIED, loaded_model
@@ -23,6 +23,8 @@ from .preparation import as_json, same
 from .selection import Selection
 
 HEIGHT = "HeightAboveGround"
+#: Parts of the unit that compact outputs are rounded to: probabilities and the like, and heights.
+_PARTS, _PARTS_OF_HEIGHT = 64, 32
 
 
 class ModelClassifier(Stage):
@@ -73,7 +75,7 @@ class ModelClassifier(Stage):
         "Points that are neighbors but keep the class they have, written as for ignore; 12 (overlap of strips) says of a "
         "point what a class would overwrite"
     )
-    vegetation_heights: list = vegetation_heights_option(
+    vegetation_heights: tuple[float, float] | None = vegetation_heights_option(
         "points the model calls vegetation (5) become low (3) below the first and medium (4) below the second"
     )
     compact: bool = option(
@@ -105,24 +107,14 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
     example = {"type": "filters.modelclassifier", "model": "town.model"}
 
     def check(self) -> None:
-        self.model  # noqa: B018  said before any work where it cannot be read
-        self.bands  # noqa: B018  refused here where it means nothing
-        self.limits  # noqa: B018  and here where nothing is known of the model
-
-    @cached_property
-    def bands(self) -> tuple[float, float] | None:
-        """Below these heights in meters vegetation is low, and medium."""
-        found = bands(self.vegetation_heights)
-        if found is None:
-            return None
+        self.limits  # noqa: B018  refused here where nothing is known of the model
         codes = [code for code, _ in self.model.classes]
-        if HIGH_VEGETATION not in codes or {LOW, MEDIUM} & set(codes):
+        if self.vegetation_heights and (HIGH_VEGETATION not in codes or {LOW, MEDIUM} & set(codes)):
             raise OptionError(
                 "option 'vegetation_heights' is for models that know vegetation as one class, 5",
                 found=f"classes {', '.join(map(str, codes))}",
                 cure="Leave it out",
             )
-        return found
 
     @cached_property
     def model(self) -> Model:
@@ -175,7 +167,9 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         return self.model.plan.second_neighbors
 
     def reads(self) -> list[str]:
-        return list(dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.bands else [])]))
+        return list(
+            dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.vegetation_heights else [])])
+        )
 
     def creates(self) -> dict[str, str]:
         more = ["Margin"] if self.margin else []
@@ -195,25 +189,14 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         unsure = UNCLASSIFIED if self.keep_sure is not None else None
         return unsure if self.rejected_code is None else self.rejected_code
 
-    def _dimensions(self, points: Points) -> dict[str, NDArray]:
-        """What the model reads."""
-        found = {name: points.arrays[name] for name in self.model.welcome_dimensions if name in points.arrays}
-        return found | {name: self.take(points, name) for name in self.model.required_dimensions}
-
-    def take(self, points: Points, name: str) -> NDArray:
-        try:
-            return points.dimension(name)
-        except DimensionError as error:
-            error.cure = self.hint or error.cure
-            raise
-
     def run(self, points: Points) -> dict[str, NDArray]:
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
         points.report.figures["kept"] = points.counted(inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
-        self._refuse_codes_that_stay(points, wanted)
-        dimensions, current = self._dimensions(points), points.class_codes
+        dimensions = {n: points.arrays[n] for n in self.model.welcome_dimensions if n in points.arrays}
+        dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
+        current = points.class_codes
         points.keep_only([*dimensions, *self.creates(), HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(
@@ -233,8 +216,9 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             )
         rejected = np.zeros(points.count, np.bool_)
         rejected[found.unsure] = True
-        if self.bands:
-            by_height(found.classification, wanted & ~rejected, self.take(points, HEIGHT), self.bands)
+        if self.vegetation_heights:
+            high = wanted & ~rejected
+            by_height(found.classification, high, points.dimension(HEIGHT), self.vegetation_heights)
             found.report.figures["classes"] = class_counts(found.classification[wanted])
         values: dict[str, NDArray] = {
             "Classification": found.classification,
@@ -262,25 +246,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
         points.report.merge(found.report)
         points.report.figures["outside_where"] = points.counted(~inside)
         return values
-
-    def _refuse_codes_that_stay(self, points: Points, wanted: NDArray[np.bool_]) -> None:
-        """Before any work: codes that points keep must fit the file, as those do that the model gives."""
-        if self.code_limit is None:
-            return
-        may_keep = self.reject_below is not None and self._rejected is None
-        codes = points.class_codes if may_keep else points.class_codes[~wanted]
-        beyond, number = np.unique(codes[codes > self.code_limit.largest], return_counts=True)
-        if beyond.size:
-            listed = ", ".join(
-                f"{code}: {n:,} points" for code, n in zip(beyond[:5], number[:5], strict=True)
-            )
-            raise OptionError(
-                self.code_limit.what, found=f"codes that points keep, {listed}", cure=self.code_limit.cure
-            )
-
-
-#: Parts of the unit that compact outputs are rounded to: probabilities and the like, and heights.
-_PARTS, _PARTS_OF_HEIGHT = 64, 32
 
 
 def _rounded(values: NDArray, parts: int) -> NDArray:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from ..base import checks
-from ..base.asprs import OVERLAP
+from ..base.asprs import OVERLAP, bands
 from ..base.errors import OptionError, suggest
 from .selection import UNWANTED, Selection
 
@@ -27,6 +28,7 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
     "list": _LISTED,
     "codes": _LISTED,
     "selection": _LISTED,
+    "bands": _LISTED,
     "mapping": (["object", "string"], 'a mapping such as {"2": "Ground"}'),
 }
 
@@ -36,7 +38,8 @@ class Option:
     """One option of a stage; see :func:`option`. Read from a stage object it gives the parsed value."""
 
     #: A key of ``_KINDS``. ``list`` is a JSON list or comma-separated text; ``codes`` a list of class codes, or of
-    #: ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the same, of other dimensions too.
+    #: ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the same, of other dimensions too; ``bands`` two
+    #: heights.
     kind: str
     #: The value where the option is absent; None means "decided by the stage".
     default: Any
@@ -86,14 +89,10 @@ class Option:
         )
 
     def _parse_number(self, value: Any) -> float:
-        try:
-            number = checks.finite(float(value) if isinstance(value, str) else value)
-        except ValueError:
-            number = None
-        if number is None or (self.kind == "integer" and number != int(number)):
-            raise self._wrong(value)
+        with suppress(ValueError):
+            value = float(value) if isinstance(value, str) else value
         check: Any = checks.whole if self.kind == "integer" else partial(checks.number, above=self.exclusive)
-        return check(f"option '{self.name}'", number, self.minimum, self.maximum, unit=self.unit)
+        return check(f"option '{self.name}'", value, self.minimum, self.maximum, unit=self.unit)
 
     _parse_integer = _parse_number
 
@@ -128,6 +127,9 @@ class Option:
                 f"({', '.join(map(str, self.default))})",
             )
         return list(value)
+
+    def _parse_bands(self, value: Any) -> tuple[float, float] | None:
+        return bands(self._parse_list(value))
 
     def _parse_codes(self, value: Any) -> list[int]:
         chosen = self._parse_selection(value)
@@ -174,7 +176,9 @@ def keep_option(points: str = "Points that are neighbors but keep their class") 
 
 def vegetation_heights_option(points: str) -> Any:
     """The option `vegetation_heights`; says what becomes of which `points`."""
-    return option("list", (), f"Two heights above ground in meters, e.g. 0.5,2: {points}", may_be_empty=True)
+    return option(
+        "bands", None, f"Two heights above ground in meters, e.g. 0.5,2: {points}", may_be_empty=True
+    )
 
 
 def split_list(text: str) -> list[str]:

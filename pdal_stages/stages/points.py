@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
-from ..base.errors import DimensionError, StageError
+from ..base.errors import DimensionError, OptionError, StageError
 from ..base.report import Report
 from ..base.resources import give_back
 from ..base.units import Units, reprojection_cure, units_of_wkt
@@ -63,6 +63,8 @@ class Points:
 
     #: Whether the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
     lent_by_pdal = False
+    #: Where they will be written with codes up to 31 alone: what to say of others, and the cure.
+    code_limit: tuple[str, str] | None = None
 
     def __init__(
         self,
@@ -163,13 +165,17 @@ class Points:
         self.__dict__.pop("axes", None)
         return xyz
 
+    def missing(self, name: str, hint: str | None = None) -> DimensionError:
+        """What to say where they do not have a dimension."""
+        return DimensionError(
+            f"the dimension '{name}' is missing",
+            found=", ".join(self.arrays),
+            cure=hint or MAKERS.get(name, "Add the stage that makes it before this one"),
+        )
+
     def _given(self, name: str) -> NDArray:
         if name not in self.arrays:
-            raise DimensionError(
-                f"the dimension '{name}' is missing",
-                found=", ".join(self.arrays),
-                cure=MAKERS.get(name, "Add the stage that makes it before this one"),
-            )
+            raise self.missing(name)
         return self.arrays[name]
 
     def dimension(self, name: str, *, meters: bool = True) -> NDArray:
@@ -246,18 +252,18 @@ class Points:
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """New class codes for `Classification`, with the flag bits of each point kept; they are counted in the report."""
         self.report.codes = class_counts(codes)
-        if not self.legacy_flags:
-            return codes
-        flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
-        if not flags.any():
-            return codes
-        if codes.size and codes.max() > LEGACY_LIMIT:
-            raise StageError(
-                f"class codes above {LEGACY_LIMIT} do not fit these points: read from LAS 1.0-1.3, some carry "
-                "synthetic, key-point or withheld flags in the same byte",
-                found=f"code {int(codes.max())}, {np.count_nonzero(flags):,} flagged points",
-                cure="Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
-            )
+        limit = self.code_limit
+        flags: Any = np.uint8(0)
+        if self.legacy_flags:
+            flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
+            if flags.any():
+                limit = limit or (
+                    f"class codes above {LEGACY_LIMIT} do not fit these points: read from LAS 1.0-1.3, some carry "
+                    "synthetic, key-point or withheld flags in the same byte",
+                    "Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
+                )
+        if limit and (largest := codes.max(initial=0)) > LEGACY_LIMIT:
+            raise OptionError(limit[0], found=f"code {largest}", cure=limit[1])
         return codes | flags
 
 
