@@ -13,8 +13,10 @@ import laspy
 import numpy as np
 import pytest
 
+from pdal_stages.base.errors import PipelineError
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.pipeline.inputs_outputs import outputs_of
 
 pytestmark = pytest.mark.pdal
 
@@ -253,6 +255,16 @@ def test_a_dimension_that_is_not_made(folder, classify, tmp_path):
     assert code == 1 and "Did you mean 'Reliability'" in err
     code, _, err = classify(folder / "in" / "t0.laz", tmp_path / "o.ply", "--dimensions", "none")
     assert code == 1 and "--dimensions is for LAS" in err
+
+
+def test_octrees_are_called_alike_in_one_piece_and_in_tiles():
+    """But for a folder, where one piece stays an octree if this PDAL can write one."""
+    kept = "a.copc.laz" if pdal_env.writes_copc() else "a.laz"
+    assert outputs_of(["in/a.copc.laz"], "o/#", copc=True) == [f"o/{kept}"]
+    assert outputs_of(["in/a.copc.laz"], "o/#") == ["o/a.laz"]
+    assert outputs_of(["in/a.copc.laz"], "c_#.las", copc=True) == ["c_a.las"]
+    with pytest.raises(PipelineError, match="one name"):
+        outputs_of(["in/a.copc.laz", "in/a.laz"], "o/c_#.laz")
 
 
 def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):

@@ -196,7 +196,7 @@ def test_resume_does_only_what_changed(tmp_path, expected, folder):
     def again() -> dict[str, int]:
         run = run_tiled(stages, 20, workers=0, resume=True)
         assert not run.failures
-        return run.summary["states"] | {o.source.stem: o.state for o in run.outputs}
+        return run.summary["states"] | {Path(o.source.path).stem: o.state for o in run.outputs}
 
     assert again() == {"done": 0, "kept": 8, "failed": 0, "west": "kept", "east": "kept"}
     (tmp_path / "o_west.las").unlink()

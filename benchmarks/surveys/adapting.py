@@ -22,7 +22,7 @@ from clouds import SURVEYS, slug, true_classes
 
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.tiling.adapting import SURE, AdaptTask
-from pdal_stages.tiling.classify import classify_file
+from pdal_stages.tiling.classify import ClassifyTask
 
 CODES = (2, 5, 6)
 
@@ -38,7 +38,7 @@ def run(data: Path, survey: str, model: Path, sure: float, folder: Path) -> dict
         matrix, began = np.zeros((256, 256), np.int64), time.process_time()
         for number, file in enumerate(files):
             target = str(folder / f"{number}.laz")
-            classify_file(ClassifyRequest(used), file, target)
+            ClassifyTask((file,), target, ClassifyRequest(used)).run_whole()
             matrix += _confusion(survey, file, target)
         right, scored = int(matrix.diagonal().sum()), int(matrix.sum())
         f1 = {

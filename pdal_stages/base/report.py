@@ -21,6 +21,8 @@ class Report:
     beyond_halo : dict of str to int
         By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile of that halo their
         values may differ from those of the whole cloud.
+    reach : float
+        How far away the farthest of these lay, in meters; not in the metadata.
     codes : dict of str to int or None
         The points of each class code after a stage that gives classes, whichever it looked at; not in the metadata.
     """
@@ -29,12 +31,14 @@ class Report:
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     beyond_halo: dict[str, int] = field(default_factory=dict)
+    reach: float = 0.0
     codes: dict[str, int] | None = None
 
     def merge(self, other: Report) -> None:
         """Take over what another has. Of figures of one name, its own stay; dicts are merged by their keys."""
         _merge(self.figures, other.figures)
         _merge(self.beyond_halo, other.beyond_halo)
+        self.reach = max(self.reach, other.reach)
         for mine, theirs in ((self.notes, other.notes), (self.warnings, other.warnings)):
             mine += [text for text in theirs if text not in mine]
 

@@ -49,10 +49,6 @@ class InputPlan:
     names: tuple[str, ...]  #: its inputs, in order
     dimensions: tuple[str, ...]  #: which of them are dimensions of the points
     halo_m: float  #: meters around a tile whose points the tile's results depend on
-    #: the most a point is asked for, where their number decides how far away they are
-    most_neighbors: int = 0
-    #: the most that these are asked for in turn
-    second_neighbors: int = 0
 
 
 class Column(NamedTuple):

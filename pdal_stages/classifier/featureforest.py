@@ -202,3 +202,4 @@ class CloudFeatures:
         if few:
             report.figures.setdefault("fewer_than_three", {}).update(few)
         report.beyond_halo.update(self._engine.report.beyond_halo)
+        report.reach = max(report.reach, self._engine.report.reach)

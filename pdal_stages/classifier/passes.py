@@ -38,8 +38,6 @@ def plan_of(passes: Sequence[Any]) -> FeaturePlan | InputPlan:
         tuple(dict.fromkeys(name for plan in plans for name in plan.names)),
         tuple(dict.fromkeys(name for plan in plans for name in plan.dimensions)),
         halo_m,
-        max(plan.most_neighbors for plan in plans),
-        max(plan.second_neighbors for plan in plans),
     )
 
 

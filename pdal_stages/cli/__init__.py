@@ -4,14 +4,31 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
-from ..base.errors import StageError
+from ..base.errors import StageError, suggest
 from ..base.messages import LoggedStream, PlainStream, RunLog, print_messages
 from ..base.outputs import Output, check_outputs
 from ..base.version import __version__
+
+#: Modules and their commands, which are imported for these alone; for ``commands`` all are.
+_COMMANDS = {
+    "pipelines": ("pipeline", "expand", "validate"),
+    "files": ("classify", "objects", "review", "corrections"),
+    "models": ("models", "train", "adapt", "accuracy", "model"),
+    "machine": ("drivers", "options", "doctor", "plugin", "demo", "warmup"),
+}
+OVERRIDES = (
+    "Options of stages are set as in PDAL: --stage.TAG.option=VALUE for stages with a tag, "
+    "--filters.name.option=VALUE for all stages of a type."
+)
+INPUTS = "Files that PDAL reads, folders, patterns, tile indexes, EPT sources"
+_NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,18 +87,18 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     """
     # Imported here, so that an environment that lacks something is told in a sentence.
     from ..pipeline.read import parse_overrides
-    from . import files, machine, models, pipelines
-    from .parser import OVERRIDES, Parser
 
+    overrides, rest = parse_overrides(arguments)
     parser = Parser(
         prog="pdal-stages",
         description="PDAL pipelines with stages that classify airborne laser scans.",
         epilog=OVERRIDES + " --debug shows tracebacks.",
     )
     parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
-    for group in (pipelines, files, models, machine):
-        group.add_commands(parser)
-    overrides, rest = parse_overrides(arguments)
+    of_command = {name: module for module, names in _COMMANDS.items() for name in names}
+    asked = of_command.get(rest[0]) if rest else None
+    for module in [asked] if asked else _COMMANDS:
+        importlib.import_module(f".{module}", __name__).add_commands(parser)
     if not rest or rest[0] not in parser.commands:
         parser.parse_args(rest)  # which shows help or the version, or says what is wrong, and leaves
     command, *rest = rest
@@ -113,3 +130,52 @@ def _unforeseen(error: Exception) -> StageError:
     return StageError(
         f"internal error: {type(error).__name__}: {error}", cure="Run with --debug and report what it prints"
     )
+
+
+class Parser(argparse.ArgumentParser):
+    """Says which of the choices may have been meant, and adds commands."""
+
+    def error(self, message: str) -> NoReturn:
+        if chosen := _NO_CHOICE.search(message):
+            message += f". {suggest(chosen[1], re.findall(r'[a-z_-]+', chosen[2]))}".rstrip(". ")
+        super().error(message)
+
+    @property
+    def commands(self) -> dict[str, argparse.ArgumentParser]:
+        """The commands that are there."""
+        if self._subparsers is None:
+            self.add_subparsers(dest="command", required=True, metavar="COMMAND")
+        return self._subparsers._group_actions[0].choices  # type: ignore
+
+    def command(
+        self,
+        name: str,
+        run: Callable[[argparse.Namespace], Any],
+        help: str,
+        overrides: bool = False,
+        logged: bool = False,
+        **more: Any,
+    ) -> Callable:
+        """Add a command; returns what adds its arguments. `logged`: it works long enough for a log and progress."""
+        assert self.commands is not None
+        more.setdefault("epilog", OVERRIDES if overrides else None)
+        made = self._subparsers._group_actions[0].add_parser(  # type: ignore
+            name, help=help, description=f"{help}.", **more
+        )
+        made.set_defaults(run=run, takes_overrides=overrides)
+        takes = made.add_argument
+        if logged:
+            takes("--log", metavar="FILE", help="Add all that the run and its workers print to a log file")
+            takes("--progress", action=argparse.BooleanOptionalAction, help="Show progress")
+        return takes
+
+    def refuse(self, command: str, unknown: Sequence[str]) -> NoReturn:
+        """Leave the program: a command's words are unknown."""
+        flags = re.findall(r"(?<!\S)--[\w-]+(?![\w.-])", self.commands[command].format_help())
+        near = suggest(unknown[0].partition("=")[0], flags)
+        self.commands[command].error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
+
+
+def switch(takes: Callable, flag: str, default: bool, help: str) -> None:
+    """Add ``--flag`` and ``--no-flag``."""
+    takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ..base.messages import print_messages
-from ..tiling.command import add_arguments
-from .parser import INPUTS, Parser, switch
+from ..base.asprs import class_name
+from ..base.errors import StageError
+from ..base.messages import one_line, print_messages
+from . import INPUTS, Parser, switch, tiles
+
+if TYPE_CHECKING:
+    from ..tiling.classify import ClassifyTask
+    from ..tiling.report import Job
 
 
 def add_commands(parser: Parser) -> None:
@@ -87,23 +96,20 @@ def add_commands(parser: Parser) -> None:
     )
     takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
-    add_arguments(parser.commands["classify"], survey=True)
+    tiles.add_arguments(parser.commands["classify"], survey=True)
 
-    parser.command(
+    takes = parser.command(
         "objects",
         _objects,
         "Write buildings, trees, spans of wires and bridge decks of classified files to a vector file",
         overrides=True,
         logged=True,
     )
-    takes = parser.commands["objects"].add_argument
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes("--outlines", choices=("straight", "cells"), help="Outlines along walls (default) or along cells")
-    takes(
-        "--cell", type=float, metavar="METERS",
-        help="Side of the grid's cells (0.5, where points are fewer than 4 or so per m2 1, 2 or 4)",
-    )  # fmt: skip
+    cell = "Side of the grid's cells (0.5, where points are fewer than 4 or so per m2 1, 2 or 4)"
+    takes("--cell", type=float, metavar="METERS", help=cell)
     takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
@@ -168,52 +174,98 @@ def add_commands(parser: Parser) -> None:
 def _classify(options: argparse.Namespace) -> int:
     from ..pipeline.classify_request import WRITTEN, ClassifyRequest
     from ..tiling.classify import ClassifyTask
-    from ..tiling.command import classify, options_of
 
     own, others = [], list(options.overrides)
     if options.objects:
-        from ..tiling.objects import OPTIONS_OF
+        from ..tiling.objects import OPTIONS_OF, refuse_tiles, write_objects, writer
 
         own = [one for one in others if not one.by_tag and one.selector in OPTIONS_OF]
         others = [one for one in others if one not in own]
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
+    same = ("noise", "bridges", "towers", "consistency", "vegetation_heights", "keep_sure")
     request = ClassifyRequest(
         options.model,
         tuple(others),
         options.where,
         named,
-        noise=options.noise,
-        bridges=options.bridges,
         wires=options.wires or options.towers,
-        towers=options.towers,
-        consistency=options.consistency,
         polygons=tuple(options.polygons),
-        vegetation_heights=options.vegetation_heights,
-        keep_sure=options.keep_sure,
+        **{name: getattr(options, name) for name in same},
     )
     print_messages(*request.cost)
     task = ClassifyTask(
         tuple(options.inputs),
         options.output,
         request,
-        options_of(options),
+        tiles.options_of(options),
         metadata=options.metadata or "",
         log=options.log or "",
+        reports=bool(options.report),
     )
-    if not options.objects:
-        return classify(task, options)
-    from ..tiling.objects import objects_of_outputs, refuse_tiles, writer
+    tiles.check_reports(options)
+    then = None
+    if options.objects:
+        stage = writer(options.objects, own)
+        refuse_tiles(task, options.objects)
+        then = partial(write_objects, task.outputs, stage, max(1, task.options.local_workers))
+    names = {code: one_line(name) for code, name in request.loaded.classes}
+    if not task.in_one_piece:
+        return _classify_tiles(task, options, names, then)
+    if options.dry_run:
+        request.pipeline(task.files[0], task.outputs[0])
+        print("1 input, in one piece")
+        return 0
+    tiles.end_at_once(options)
+    written = task.run_whole()
+    print_messages(*written.messages)
+    print(f"{tiles.counted(written.points, 'point')} written to {written.path}")
+    tiles.print_classes(written.classes, written.left_alone, names)
+    if then is not None:
+        then()
+    return 0
 
-    stage = writer(options.objects, own)
-    refuse_tiles(task, options.objects)
-    return classify(task, options, lambda: objects_of_outputs(task, stage))
+
+def _classify_tiles(
+    task: ClassifyTask,
+    options: argparse.Namespace,
+    names: Mapping[int, str],
+    then: Callable[[], dict[str, Any]] | None,
+) -> int:
+    def finished(job: Job) -> None:  # out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %
+        assert job.outputs is not None
+        classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
+        total = sum(classes.values())
+        shares = [
+            f"{code} {names.get(code, class_name(code))} {100.0 * n / total:.1f} %"
+            for code, n in sorted(classes.items())
+        ]
+        said = f"; {', '.join(shares)}" if shares else ""
+        print(f"{job.outputs[0]}: {tiles.counted(job.record.get('written', 0), 'point')}{said}", flush=True)
+
+    run, interrupted = tiles.ran(lambda: task.run_tiles(dry_run=options.dry_run, finished=finished))
+    if options.dry_run:
+        tiles.print_dry(run)
+    else:
+        tiles.print_run(run)
+        tiles.print_classes(run.summary["classes"], run.summary["left_alone"], names)
+        if then is not None and not interrupted and not run.failures:
+            try:
+                run.objects = then()
+            except StageError:
+                tiles.end_run(options, run, "")
+                raise
+    words = [word for word in options.arguments if word != "--resume"]
+    same = shlex.join(["pdal-stages", *words]) if len(words) <= 20 else "the same command with"
+    return tiles.end_run(options, run, f"{same} --resume" if interrupted else "")
 
 
-def _objects(options: argparse.Namespace) -> int:
-    from ..tiling.objects import run_command
+def _objects(options: argparse.Namespace) -> None:
+    from ..tiling.objects import write_objects, writer
 
-    return run_command(options)
+    given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}
+    stage = writer(options.output, options.overrides, **given)
+    write_objects(options.inputs, stage, options.workers, options.metadata)
 
 
 def _review(options: argparse.Namespace) -> None:

@@ -9,8 +9,7 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.messages import print_messages
 from ..base.outputs import JSON, Output, check_outputs
-from ..tiling.command import add_tile_arguments
-from .parser import INPUTS, OVERRIDES, Parser
+from . import INPUTS, OVERRIDES, Parser, tiles
 
 
 def add_commands(parser: Parser) -> None:
@@ -46,7 +45,7 @@ def add_commands(parser: Parser) -> None:
         "other, weigh alike, and may have different reference systems",
     )
 
-    add_tile_arguments(parser.commands["train"])
+    tiles.add_sizes(parser.commands["train"])
     parser.commands["train"].epilog = (
         "Of several files the score is by file. Of one file, --writers.classifiermodel.groups=PointSourceId makes it one by "
         "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
@@ -69,7 +68,7 @@ def add_commands(parser: Parser) -> None:
         metavar="SHARE",
         help="How sure it must be of a point (Reliability) to be believed; default 0.7",
     )
-    add_tile_arguments(parser.commands["adapt"])
+    tiles.add_sizes(parser.commands["adapt"])
 
     takes = parser.command(
         "accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True, logged=True
@@ -115,7 +114,6 @@ def _train(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
     from ..pipeline.inputs_outputs import input_files
     from ..pipeline.training import surveys_of
-    from ..tiling.command import interruptible, options_of
     from ..tiling.training import TrainTask
 
     named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base", "passes")
@@ -123,8 +121,8 @@ def _train(options: argparse.Namespace) -> None:
     files, surveys = input_files(options.inputs), {}
     if options.surveys is not None:
         surveys = surveys_of(files, options.surveys)
-    task = TrainTask(files, options.model, options.overrides, extra, options_of(options), surveys)
-    with interruptible():
+    task = TrainTask(files, options.model, options.overrides, extra, tiles.options_of(options), surveys)
+    with tiles.interruptible():
         said = task.run()
     # Nothing is said of one written into a pipe or device
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""
@@ -137,10 +135,9 @@ def _train(options: argparse.Namespace) -> None:
 def _adapt(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
     from ..tiling.adapting import AdaptTask
-    from ..tiling.command import interruptible, options_of
 
-    task = AdaptTask(options.inputs, options.model, options.teacher, options.sure, options_of(options))
-    with interruptible():
+    task = AdaptTask(options.inputs, options.model, options.teacher, options.sure, tiles.options_of(options))
+    with tiles.interruptible():
         print_messages(*task.run())
     if Path(options.model).is_file():
         print(load_model(options.model))

@@ -14,8 +14,7 @@ from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.messages import print_messages
 from ..base.outputs import JSON, Output, check_outputs
-from ..tiling.command import add_arguments
-from .parser import Parser
+from . import Parser, tiles
 
 if TYPE_CHECKING:
     from ..pipeline.read import PipelineSource
@@ -37,7 +36,7 @@ def add_commands(parser: Parser) -> None:
     takes("--nostream", action="store_true", help=never)
     levels = "Print more of PDAL's log: 1 warnings (default), 2 what it does, 3 and more everything"
     takes("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
-    add_arguments(parser.commands["pipeline"])
+    tiles.add_arguments(parser.commands["pipeline"])
 
     help = "Print the plain PDAL JSON, which stock 'pdal pipeline' runs"
     takes = parser.command("expand", _expand, help, overrides=True)
@@ -74,26 +73,39 @@ def _built(options: argparse.Namespace) -> Pipeline:
 
 
 def _pipeline(options: argparse.Namespace) -> int:
-    from ..tiling.command import run_command, wants_tiles
-
-    if wants_tiles(options):
-        return run_command(options, _source(options))
+    if tiles.wants_tiles(options):
+        return _in_tiles(options)
     if options.validate:
         return _validate(options)
     print_messages(*executed(options, _built(options)))
     return 0
 
 
+def _in_tiles(options: argparse.Namespace) -> int:
+    from ..pipeline.run import Pipeline
+    from ..tiling.plan import make_plan
+    from ..tiling.run import run_tiled
+
+    tiles.check_reports(options)
+    chosen = tiles.options_of(options)
+    pipeline = Pipeline(_source(options), options.overrides, whole=False)
+    if options.validate:
+        make_plan(pipeline, chosen.buffer)
+        print(pipeline.validate())
+        return 0
+    run, interrupted = tiles.ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
+    tiles.print_dry(run) if options.dry_run else tiles.print_run(run)
+    return tiles.end_run(options, run, "run it again with --resume" if interrupted else "")
+
+
 def executed(options: argparse.Namespace, pipeline: Pipeline) -> list[str]:
     """Run a pipeline in this process; what PDAL and stages said."""
-    from ..tiling.command import end_at_once
-
     metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
     more = [Output(options.log, "log")] if options.log else []
     pipeline.check_outputs(*more, *([Output(metadata, "metadata", JSON)] if metadata else []))
     before = list(pipeline.expanded.warnings)
     print_messages(*before)
-    end_at_once(options)
+    tiles.end_at_once(options)
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
     lines = pipeline.log_lines

@@ -166,19 +166,23 @@ class AdaptiveNeighborhoods:
         few: np.ndarray,
         far: np.ndarray,
         out: np.ndarray,
-    ) -> None:
+    ) -> float:
         """Compute the columns of these neighborhoods in `out` (m, F) for a block of queries, neighbors at best.
 
         Each query stands for so many `copies` of the user's. `bins` are needed where shapes are wanted, the threshold for
         copt. For each neighborhood, `few` is raised by the number of queries with fewer than three points, and `far` by
-        that of queries whose result depends on points farther than the plan's halo.
+        that of queries whose result depends on points farther than the plan's halo. How far the farthest of all lie is
+        returned, meters.
         """
+        reach = 0.0
         shapes = shapes_of(self.chosen, points, seed, bins)
         for search in self.searches:
             table = self.choose(search, points, copt_threshold, shapes, out)
             for number, rows in zip(search.numbers, table, strict=True):
                 finish(rows, 0.0, points[2], few[number : number + 1], copies, self.columns[number], out)
                 far[number] += int(copies[rows[REACH] > self.halo_m].sum())
+                reach = max(reach, float(rows[REACH].max(initial=0.0)))
+        return reach
 
     def choose(
         self,

@@ -256,6 +256,7 @@ class Run:
             raise StageError("the cloud has no points", found=f"{count} queries")
         engine.fit()
         self.fixed, self.adaptive = engine.neighborhoods()
+        self.reaches = [0.0]  # of the blocks: how far away the farthest neighbors lie
         x, y, z = self.grid.x, self.grid.y, self.grid.z
         new = np.ones(count, np.bool_)
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
@@ -282,10 +283,11 @@ class Run:
         if self.adaptive is not None:
             tokens = self.adaptive.tokens
             few, far = np.zeros(len(tokens), np.int64), np.zeros(len(tokens), np.int64)
-            self.adaptive.fill(
+            reach = self.adaptive.fill(
                 points, copies, engine.bins, engine.seed, engine.copt_threshold, few, far, values
             )
             tally["fewer_than_three"].update(zip(tokens, few.tolist(), strict=True))
+            self.reaches.append(reach)
             tally["beyond_halo"] = {token: n for token, n in zip(tokens, far.tolist(), strict=True) if n}
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
@@ -326,6 +328,7 @@ class Run:
     def _count(self, count: int, tally: Tally) -> None:
         report = self.engine.report
         report.figures["queries"] += count
+        report.reach = max(report.reach, *self.reaches)
         totals = {"beyond_halo": report.beyond_halo, **report.figures}
         for key, counts in tally.items():
             for token, n in counts.items():

@@ -166,16 +166,6 @@ class FeaturePlan:
         return reach + self.cell
 
     @property
-    def most_neighbors(self) -> int:
-        """The most neighbors a point is asked for, of neighborhoods whose size is a number of points; 0 where none is."""
-        return max((int(n.parameters[-1]) for n in self.neighborhoods if n.reach is None), default=0)
-
-    @cached_property
-    def second_neighbors(self) -> int:
-        """The neighbors that neighbors' own features are made of (``names.SURFACES``); 0 where none is wanted."""
-        return AROUND if self._surfaced else 0
-
-    @property
     def _surfaced(self) -> list[int]:
         """The numbers of neighbors whose surfaces are wanted."""
         return [

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import StageError, optional_import, suggest
+from ..base.errors import PipelineError, StageError, optional_import, suggest
 from ..base.las import projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, units_of_wkt
 from . import pdal as pdal_env
@@ -125,10 +125,10 @@ def is_folder(target: str) -> bool:
     return path.is_dir() or target.endswith(("/", os.sep)) or named
 
 
-def _output_name(source: str) -> str:
-    """The input's name; what this PDAL cannot write as COPC becomes plain LAZ."""
+def _output_name(source: str, copc: bool) -> str:
+    """The input's name; what is not written as COPC becomes plain LAZ."""
     name = Path(source).name
-    return name[: -len(".copc.laz")] + ".laz" if _is_copc(name) and not pdal_env.writes_copc() else name
+    return name[: -len(".copc.laz")] + ".laz" if _is_copc(name) and not copc else name
 
 
 def _is_copc(name: str) -> bool:
@@ -145,37 +145,44 @@ def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
     return [os.path.normpath(os.path.join(folder, name)) for folder, name in zip(inside, names, strict=True)]
 
 
-def outputs_of(sources: Sequence[str], target: str) -> list[str]:
-    """An output for each input: in a folder under the input's name (see :func:`in_folders`), or with that name for ``#``.
+def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[str]:
+    """An output for each input, whose name stands for ``#``; for ``#`` alone with its suffix (see :func:`in_folders`).
+
+    `copc`: octrees may be written as such, where this PDAL can.
 
     Raises
     ------
-    StageError
+    PipelineError
         Where several inputs would be written to one file.
     """
     path = Path(target)
-    if is_folder(target):
-        outputs = [str(path / n) for n in in_folders(sources, [_output_name(source) for source in sources])]
-    elif "#" in path.name:
-        outputs = [str(path.with_name(path.name.replace("#", Path(source).stem))) for source in sources]
-    elif len(sources) > 1:
-        raise StageError(
-            "several inputs would be written to one file",
-            found=f"{len(sources)} inputs, {target}",
-            cure="Name a folder (with a slash at its end), or put '#' where the input's name should be, e.g. "
-            "classified_#.laz. To merge them into one file, use a pipeline",
-        )
+    if path.name == "#":
+        names = [_output_name(source, copc and pdal_env.writes_copc()) for source in sources]
+        outputs = [str(path.parent / name) for name in in_folders(sources, names)]
     else:
-        return [target]
+        outputs = named_outputs(target, [Path(_output_name(source, False)).stem for source in sources])
     first: dict[str, str] = {}
     for source, output in zip(sources, outputs, strict=True):
         if (other := first.setdefault(output, source)) is not source:
-            raise StageError(
+            raise PipelineError(
                 "two inputs have one name and would be written to one file",
                 found=f"{other} and {source}: {output}",
                 cure="Name a folder (with a slash at its end), in which each lies in the folder of its input; or rename one",
             )
     return outputs
+
+
+def named_outputs(target: str, names: Sequence[str]) -> list[str]:
+    """A file's name with each name in place of ``#``; PipelineError where several would be written to one file."""
+    path = Path(target)
+    if "#" not in path.name and len(names) > 1:
+        raise PipelineError(
+            "several inputs or tiles would be written to one file",
+            found=f"{len(names)} to {target}",
+            cure="Name a folder (with a slash at its end), or put '#' where the name of the input or tile should be, e.g. "
+            "classified_#.laz. To merge inputs into one file, use a pipeline",
+        )
+    return [str(path.with_name(path.name.replace("#", name))) for name in names]
 
 
 def reader_of(source: str, tag: str) -> dict[str, Any]:

@@ -157,14 +157,6 @@ class Stage(ABC):
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0
 
-    def most_neighbors(self) -> int:
-        """The most neighbors a point is asked for, where their number decides how far away they are; 0: none."""
-        return 0
-
-    def second_neighbors(self) -> int:
-        """The most neighbors that these neighbors are asked for in turn; 0: none."""
-        return 0
-
     def check_tiled(self) -> None:
         """Refuse options whose result depends on all points at once."""
 

@@ -160,12 +160,6 @@ need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before
             f"{as_json(self.preparation)}. Here: {as_json(preparation)}. Expect lower accuracy, or use the former"
         )
 
-    def most_neighbors(self) -> int:
-        return self.model.plan.most_neighbors
-
-    def second_neighbors(self) -> int:
-        return self.model.plan.second_neighbors
-
     def reads(self) -> list[str]:
         return list(
             dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.vegetation_heights else [])])

@@ -118,12 +118,6 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
     def halo_m(self) -> float:
         return self.plan.halo_m + self.voxel
 
-    def most_neighbors(self) -> int:
-        return self.plan.most_neighbors
-
-    def second_neighbors(self) -> int:
-        return self.plan.second_neighbors
-
     def check_tiled(self) -> None:
         if self.bins and Path(self.bins).exists():
             return

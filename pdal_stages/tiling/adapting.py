@@ -21,7 +21,7 @@ from ..base.outputs import MODEL, Output, check_outputs
 from ..classifier.model import load_model
 from ..classifier.modelfile import digest_of
 from ..pipeline.classify_request import ClassifyRequest
-from ..pipeline.inputs_outputs import input_files, is_ept, is_las
+from ..pipeline.inputs_outputs import input_files, is_las
 from .classify import ClassifyTask
 from .settings import TilingOptions
 from .training import TrainTask
@@ -89,10 +89,8 @@ class AdaptTask:
         """The inputs as the teacher classifies them."""
         request = ClassifyRequest(self.teacher, dimensions=("Reliability",))
         task = ClassifyTask(tuple(files), f"{folder}/classified/", request, self.options)
-        if task.in_one_piece():
+        if task.in_one_piece:
             return [task.run_whole().path]
-        if not all(is_las(name) or is_ept(name) for name in files):
-            return [replace(task, inputs=(name,)).run_whole().path for name in files]
         run = task.run_tiles()
         if run.failures:
             raise StageError(

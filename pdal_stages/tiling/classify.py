@@ -16,9 +16,8 @@ from ..base.files import write_whole
 from ..base.outputs import JSON, Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
-from ..pipeline.run import Pipeline
 from .inputs import ept_format, read_ept
-from .plan import TilePlan, make_plan
+from .plan import plan_of_files
 from .report import Job, TiledRun, left_alone
 from .run import run_plan
 from .settings import TilingOptions, fits_whole
@@ -26,14 +25,13 @@ from .settings import TilingOptions, fits_whole
 
 @dataclass
 class Written:
-    """An output that was written."""
+    """An output that was written in one piece."""
 
     path: str
     points: int
-    classes: dict[int, int]  #: number of points by code
-    counts: dict[str, int] = field(default_factory=dict)  #: of points that got no class, by reason
-    messages: list[str] = field(default_factory=list)
-    metadata: dict[str, Any] = field(default_factory=dict)  #: PDAL's
+    classes: dict[str, int]  #: number of points by code
+    left_alone: dict[str, int]  #: of points that got no class, by reason
+    messages: list[str]
 
 
 @dataclass(frozen=True)
@@ -50,6 +48,8 @@ class ClassifyTask:
     options : TilingOptions
     metadata, log : str
         Files that are written beside, empty for none.
+    reports : bool
+        Whether reports are wanted, which only runs in tiles have.
     """
 
     inputs: tuple[str, ...]
@@ -58,17 +58,19 @@ class ClassifyTask:
     options: TilingOptions = field(default_factory=TilingOptions)
     metadata: str = ""
     log: str = ""
+    reports: bool = False
 
     @cached_property
     def files(self) -> list[str]:
         """All inputs."""
         return input_files(self.inputs)
 
+    @cached_property
     def in_one_piece(self) -> bool:
         """Whether the only input is a file that fits into memory, and nothing asks for tiles."""
         options = self.options
         asked = options.tile is not None or options.per != "auto" or options.scheduler or options.resume
-        if len(self.files) > 1 or asked:
+        if len(self.files) > 1 or asked or self.reports:
             return False
         if not is_las(self.files[0]):
             return not is_ept(self.files[0])
@@ -78,11 +80,23 @@ class ClassifyTask:
             header = None  # said when it is read
         return header is None or fits_whole(header.count, options.memory)
 
-    def _make_folders(self, outputs: list[str]) -> None:
+    @property
+    def _per_tile(self) -> bool:
+        return self.options.per == "tile" or any(map(is_ept, self.files))
+
+    @cached_property
+    def outputs(self) -> list[str]:
+        """A file for each input; none where each tile is one."""
+        if self._per_tile:
+            return []
+        target = str(Path(self.output) / "#") if is_folder(self.output) else self.output
+        return outputs_of(self.files, target, copc=self.in_one_piece)
+
+    def _make_folders(self) -> None:
         """Make the output folder, and those in it that outputs lie in."""
         if not is_folder(self.output):
             return
-        for folder in sorted({Path(self.output), *(Path(name).parent for name in outputs)}):
+        for folder in sorted({Path(self.output), *(Path(name).parent for name in self.outputs)}):
             try:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
@@ -90,30 +104,45 @@ class ClassifyTask:
                     "the output folder cannot be made", found=f"{folder}: {error.strerror}"
                 ) from None
 
+    @property
+    def _beside(self) -> list[Output]:
+        more = [("log", self.log, ""), ("metadata", self.metadata, JSON)]
+        return [Output(name, what, kind) for what, name, kind in more if name]
+
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
-        (source,), (target,) = self.files, outputs_of(self.files, self.output)
-        self._make_folders([target])
-        return classify_file(self.request, source, target, self.metadata, self.log)
+        (source,), (target,) = self.files, self.outputs
+        self._make_folders()
+        pipeline = self.request.pipeline(source, target)
+        pipeline.check_outputs(*self._beside)
+        count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
+        if self.metadata:
+            text = json.dumps(pipeline.metadata, indent=2, default=str) + "\n"
+            write_whole(self.metadata, text.encode())
+        reports = [each[-1] for _, each in pipeline.reports if each]
+        codes = [report.codes for report in reports if report.codes is not None]
+        messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+        alone = left_alone(report.figures for report in reports)
+        return Written(target, count, codes[-1] if codes else {}, alone, messages)
 
-    # ---- in tiles ----------------------------------------------------------------------------------------
+    def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
+        """Classify all inputs in tiles; `finished` hears of every output that was written.
 
-    @property
-    def _per_tile(self) -> bool:
-        return self.options.per == "tile" or any(map(is_ept, self.files))
-
-    @cached_property
-    def _pipeline(self) -> Pipeline:
-        """What is done, of one input of each kind."""
-        heads: list[dict[str, Any]] = []
-        for kind, more in (("readers.las", {"use_eb_vlr": True}), ("readers.ept", {})):
-            # Of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told.
-            if names := [name for name in self.files if is_ept(name) == (kind == "readers.ept")]:
-                heads.append({"type": kind, "filename": names[0], "tag": "input", **more})
+        Raises
+        ------
+        StageError
+            For whatever is wrong with names, model or options, before any point is read.
+        """
+        if odd := [name for name in self.files if not is_las(name) and not is_ept(name)]:
+            raise OptionError(
+                "several inputs, and the options of tiles, are for LAS, LAZ, COPC and EPT: others cannot be cut into tiles",
+                found=odd[0],
+                cure="Convert them first (pdal translate INPUT input.laz), or classify one after the other without options "
+                "of tiles",
+            )
         target = named = self.output
-        if is_folder(self.output):  # '#' may stand for a name with its suffix: always that of a LAS file
-            target = str(Path(self.output) / ("#.laz" if self._per_tile else "#"))
-            named = "x.laz"
+        if is_folder(self.output):
+            target, named = str(Path(self.output) / ("#.laz" if self._per_tile else "#")), "x.laz"
         if target.lower().endswith(".copc.laz"):
             raise OptionError(
                 "outputs of tiles are plain LAS or LAZ",
@@ -123,52 +152,20 @@ class ClassifyTask:
             )
         alike = one_format(self.files) if self._per_tile else {}
         writer = {**self.request.writer(named), "filename": target, **alike}
-        return Pipeline([*heads, *self.request.stages, writer], self.request.overrides, whole=False)
-
-    def plan(self) -> TilePlan:
-        """What is done to each tile.
-
-        Raises
-        ------
-        StageError
-            For whatever is wrong with model or options, before any point is read.
-        """
-        plan = make_plan(self._pipeline, self.options.buffer)
+        stages = [*self.request.stages, writer]
+        plan, source = plan_of_files(self.files, stages, self.request.overrides, self.options.buffer)
         beside = self.request.beside
-        for reader in plan.readers:
-            reader["filename"] = [n for n in self.files if is_ept(n) == (reader["type"] == "readers.ept")]
-        return replace(
+        plan = replace(
             plan,
             creates=["Classification", *beside] if len(plan.tail) == 1 and plan.creates else plan.creates,
             makes=beside,
             beside=beside,
-            whole_names=is_folder(self.output) and self.options.per != "tile",
             name=self.request.model,
         )
-
-    def run_tiles(
-        self,
-        *,
-        dry_run: bool = False,
-        finished: Callable[[Written], None] | None = None,
-    ) -> TiledRun:
-        """Classify all inputs in tiles; `finished` hears of every output that was written."""
-        outputs = (
-            [] if self._per_tile else outputs_of(self.files, self.output)
-        )  # says what is wrong with names
-        plan = self.plan()
         if not dry_run:
-            self._make_folders(outputs)
-        more = [("metadata", self.metadata, JSON), ("log", self.log, "")]
-        check_outputs([Output(name, what, kind) for what, name, kind in more if name], self.files)
-
-        def finished_one(job: Job) -> None:
-            if finished is not None and job.outputs:
-                classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
-                finished(Written(job.outputs[0], job.record.get("written", 0), classes))
-
-        source = self._pipeline.source
-        return run_plan(plan, self.options, dry_run=dry_run, finished=finished_one, source=source)
+            self._make_folders()
+        check_outputs(self._beside, self.files)
+        return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)
 
 
 def one_format(paths: Sequence[str]) -> dict[str, Any]:
@@ -201,21 +198,3 @@ def one_format(paths: Sequence[str]) -> dict[str, Any]:
         if len({(place[axis], place[3 + axis]) for place in places}) > 1:
             options |= {f"scale_{name}": min(place[axis] for place in places), f"offset_{name}": "auto"}
     return options
-
-
-def classify_file(
-    request: ClassifyRequest, source: str, target: str, metadata: str = "", log: str = ""
-) -> Written:
-    """Classify a file in one piece; `metadata` and `log` are files that are written beside."""
-    pipeline = request.pipeline(source, target)
-    more = [("log", log, ""), ("metadata", metadata, JSON)]
-    pipeline.check_outputs(*(Output(name, what, kind) for what, name, kind in more if name))
-    count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
-    if metadata:
-        write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    reports = [each[-1] for _, each in pipeline.reports if each]
-    codes = [report.codes for report in reports if report.codes is not None]
-    classes = {int(code): n for code, n in (codes[-1] if codes else {}).items()}
-    messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
-    counts = left_alone(report.figures for report in reports)
-    return Written(target, count, classes, counts, messages, pipeline.metadata)

@@ -14,8 +14,7 @@ from typing import Any
 from ..base.errors import StageError, optional_import
 from ..base.version import build
 from ..pipeline import pdal as pdal_env
-from ..pipeline.workers import TaskResult, ThisProcess, WorkerProcesses, perform
-from .settings import TilingOptions
+from ..pipeline.workers import TaskResult, perform
 
 #: Seconds to wait for the scheduler, and for a worker: at the beginning, and when all are gone.
 _CONNECT, _WAIT = 10.0, 120.0
@@ -27,8 +26,8 @@ _RESUME = "Once it is there again, --resume goes on"
 class Cluster(contextlib.AbstractContextManager):
     """Tasks on the workers of a scheduler, one at a time on each; they may join and leave."""
 
-    def __init__(self, options: TilingOptions, folder: str) -> None:
-        self.address, self.folder, self.slots = options.scheduler, folder, 1
+    def __init__(self, address: str, folder: str) -> None:
+        self.address, self.folder, self.slots = address, folder, 1
 
     def __enter__(self) -> Cluster:
         dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
@@ -115,11 +114,3 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
     if answer.reason and here != host:
         answer.reason = f"on {here}: {answer.reason}"
     return answer
-
-
-def open_workers(options: TilingOptions, folder: str) -> ThisProcess | WorkerProcesses | Cluster:
-    """What does the tasks of a run, which keeps what it makes in `folder`."""
-    if options.scheduler:
-        return Cluster(options, folder)
-    workers, threads = options.local_workers, options.threads
-    return WorkerProcesses(workers, threads) if workers else ThisProcess(threads)

@@ -11,30 +11,32 @@ raster from the blocks.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..pipeline.runtime import points_of
 from ..stages.hag_morphological import HagMorphological, inside_block
-from .grid import Box, TileGrid
 from .inputs import CloudIndex, InputSource
 from .pieces import Piece, cut_all
-from .plan import FirstRound, TilePlan
+from .plan import OUTSIDE, FirstRound, TilePlan
+from .settings import Box, TileGrid
 from .store import load_arrays, save_arrays, written
-from .tile import Changed, FromBefore, RunContext, run_first
+from .tile import Changed, FromBefore, HeadRun, RunContext, run_head
 
 
-def left_file(tile: str) -> str:
-    """The name of the file of what the first round left of a tile."""
-    return f"{tile}.first.npz"
+def left_name(tile: str) -> str:
+    """What is called what the first round left of a tile."""
+    return f"{tile}.first"
 
 
-def block_file(block: tuple[int, int]) -> str:
-    """The name of the file of a block that is made of what is left."""
-    return f"{block[0]}_{block[1]}.block.npz"
+def block_name(block: tuple[int, int]) -> str:
+    """What is called a block that is made of what is left."""
+    return f"{block[0]}_{block[1]}.block"
 
 
 def stage_of(plan: TilePlan) -> HagMorphological:
@@ -56,17 +58,34 @@ class FirstRoundTask:
     target: str  #: file for what is left of its points
 
     def run(self) -> dict[str, Any]:
-        """Write what is left of the tile's own points, and what the stages before the one that wants it changed."""
-        context = self.context
+        """Write what is left of the tile's own points, and what the stages before the one that wants it made of them.
+
+        The latter as arrays named ``INPUT/index`` (the points' numbers) and ``INPUT/DIMENSION``.
+        """
+        context, plan, first = self.context, self.context.plan, self.first
+        stage, left = stage_of(plan), [{"around": np.empty((0, 3))}]
+
+        def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+            mine = ins[OUTSIDE] < 0
+            if mine.any():
+                left.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
+
+        before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
+        head = HeadRun([])
         with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
-            halo = self.first.halo_m / context.unit
-            cuts = cut_all(context.grid, self.tile, self.sources, halo, folder)
-            left, arrays, messages = run_first(context, cuts, self.first) if cuts else ([], {}, [])
-        left.append({"around": np.empty((0, 3))})
-        for name in {name for one in left for name in one}:
-            arrays[name] = np.concatenate([one[name] for one in left if name in one])
+            cuts = cut_all(context.grid, self.tile, self.sources, first.halo_m / context.unit, folder)
+            if cuts:
+                head = run_head(replace(context, plan=before), self.tile, cuts, True, last=leave)
+        arrays = {
+            name: np.concatenate([one[name] for one in left if name in one])
+            for name in {name for one in left for name in one}
+        }
+        for result in head.results if first.kept else ():
+            key = result.piece.source.key
+            arrays[f"{key}/index"] = result.piece.index[result.rows]
+            arrays |= {f"{key}/{name}": values for name, values in result.values.items()}
         save_arrays(self.target, arrays)
-        return {"outputs": written([self.target]), "messages": messages}
+        return {"outputs": written([self.target]), "messages": head.messages}
 
 
 @dataclass(frozen=True)
@@ -94,20 +113,16 @@ class BlockTask:
         return {"outputs": written([self.target])}
 
 
-def blocks_around(first: FirstRound, box: Box, unit: float, around_m: float) -> list[tuple[int, int]]:
-    """The blocks that a box with surroundings touches, in units of the coordinates and in meters."""
-    x0, y0, x1, y1 = (side * unit for side in box)
-    grid = TileGrid(first.blocks.side)
-    return grid.covering((x0 - around_m, y0 - around_m, x1 + around_m, y1 + around_m))
+def blocks_around(context: RunContext, tile: tuple[int, int], around_m: float) -> list[tuple[int, int]]:
+    """The blocks that a tile with so many meters around it touches."""
+    assert context.plan.first is not None
+    box = _box_m(context, tile, around_m)
+    return TileGrid(context.plan.first.blocks.side).covering(box)
 
 
-def tiles_around(
-    first: FirstRound, grid: TileGrid, unit: float, block: tuple[int, int], known: Collection[tuple[int, int]]
-) -> list[tuple[int, int]]:
-    """The known tiles whose points may matter for a block."""
-    x0, y0, x1, y1 = (side / unit for side in TileGrid(first.blocks.side).box(block, first.blocks.reach))
-    (i0, j0), (i1, j1) = grid.index(np.array([x0, y0])).tolist(), grid.index(np.array([x1, y1])).tolist()
-    return [(i, j) for j in range(j0, j1 + 1) for i in range(i0, i1 + 1) if (i, j) in known]
+def _box_m(context: RunContext, tile: tuple[int, int], around_m: float) -> Box:
+    x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
+    return (x0 - around_m, y0 - around_m, x1 + around_m, y1 + around_m)
 
 
 def from_before(
@@ -117,22 +132,26 @@ def from_before(
     first = context.plan.first
     assert first is not None
     around = read_m + first.blocks.around + first.blocks.spill
-    x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
-    box = (x0 - around, y0 - around, x1 + around, y1 + around)
-    paths = [os.path.join(folder, block_file(block)) for block in TileGrid(first.blocks.side).covering(box)]
+    box = _box_m(context, tile, around)
+    blocks = map(block_name, blocks_around(context, tile, around))
     stage = stage_of(context.plan)
     needed = stage.needed_of_blocks(box)
-    found = (load_arrays(path, needed) for path in paths if os.path.exists(path))  # others have no points
-    return FromBefore(stage.made_of_blocks(found), [_changed(context, folder, piece) for piece in cuts])
+    found = (load_arrays(path, needed) for path in _there(folder, blocks))  # others have no points
+    tiles = context.grid.covering(context.grid.box(tile, read_m / context.unit))
+    left = _there(folder, [left_name(context.grid.name(each)) for each in tiles])
+    changed = [_changed(first.kept or (), left, piece) for piece in cuts]
+    return FromBefore(stage.made_of_blocks(found), changed)
 
 
-def _changed(context: RunContext, folder: str, piece: Piece) -> Changed:
+def _there(folder: str, names: Iterable[str]) -> list[str]:
+    paths = (os.path.join(folder, f"{name}.npz") for name in names)
+    return [path for path in paths if os.path.exists(path)]
+
+
+def _changed(names: Sequence[str], left: list[str], piece: Piece) -> Changed:
     """New values of a piece's points that the stages before the far-reaching one gave: rows and values by dimension."""
-    assert context.plan.first is not None
-    names = context.plan.first.kept or ()
     parts = []
-    for tile in sorted(piece.tiles) if names else ():
-        path = os.path.join(folder, left_file(context.grid.name(tile)))
+    for path in left if names else ():
         kept = load_arrays(path, under=f"{piece.source.key}/")
         if "index" in kept:
             rows = np.searchsorted(piece.index, kept["index"])

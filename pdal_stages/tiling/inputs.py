@@ -9,8 +9,7 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,20 +19,28 @@ from ..base.errors import OptionError, PipelineError, StageError
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import LAS_READERS, named_files
-from ..pipeline.inputs_outputs import Reference, check_one_reference, in_folders, locations, reference_of
-from .grid import Box, TileGrid, check_number, touching, union
-from .settings import Density, Extent, TilingOptions, block_bytes, settled
+from ..pipeline.inputs_outputs import Reference, check_one_reference, locations, reference_of
+from .plan import TilePlan, outputs_for
+from .settings import (
+    Box,
+    Density,
+    Extent,
+    TileGrid,
+    TilingOptions,
+    block_bytes,
+    check_number,
+    settled,
+    touching,
+    union,
+)
 from .store import fingerprint
-
-if TYPE_CHECKING:
-    from .plan import TilePlan
 
 #: Bytes of an EPT source's description at most.
 _LARGEST = 16 << 20
 #: Options of readers.tindex that choose files or points, or change them.
 _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
-#: Bytes looked at: at the beginning and the end, and at some places between.
-_ENDS, _BETWEEN, _PLACES = 1 << 16, 1 << 12, 8
+#: Bytes looked at, at the beginning and the end.
+_ENDS = 1 << 16
 #: Inputs with odd headers that are named.
 _ODD = 5
 
@@ -50,19 +57,6 @@ class InputSource:
     def key(self) -> str:
         """A short name, the same in every run."""
         return hashlib.sha1(os.fsencode(self.path)).hexdigest()[:12]
-
-    @property
-    def stem(self) -> str:
-        """The name outputs are called after."""
-        return Path(self.plain_name).stem
-
-    @property
-    def plain_name(self) -> str:
-        """The file's name, without what says that it is COPC: outputs of tiles are not."""
-        name = Path(self.path).name
-        return (
-            name[: -len(".copc.laz")] + name[-len(".laz") :] if name.lower().endswith(".copc.laz") else name
-        )
 
     def within(self, box: Box) -> dict[str, Any]:
         """The reader of an EPT source for a box alone."""
@@ -221,7 +215,6 @@ class Survey:
     def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
-        self._whole_names = plan.whole_names
         self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
         self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
@@ -236,6 +229,8 @@ class Survey:
             raise OptionError("--per file needs LAS or LAZ inputs", cure="Use --per tile")
         #: ``file`` or ``tile``: what one output is made of.
         self.per = options.per if options.per != "auto" else "file" if files else "tile"
+        #: What each of the writers writes of each input; empty where each tile is an output.
+        self.outputs = outputs_for(plan, self.paths) if self.per == "file" else []
         self.unit = self._unit(plan)  #: meters per unit of the coordinates
         self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
         self.place()
@@ -273,34 +268,30 @@ class Survey:
     def _unit(self, plan: TilePlan) -> float:
         """Meters per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
         needed = bool(plan.head and plan.halo_m)
-        groups: dict[str, list[InputSource]] = {}
-        for source in self.sources:
-            if source.path not in self.unreadable:
-                ept = source.kind == "ept"
-                own = read_ept(source.path).get("srs") if ept else las.projection(source.path)
-                groups.setdefault(fingerprint(source.reader, own), []).append(source)
+        of_kind: dict[str, Reference] = {}  # PDAL is asked once for inputs that say the same
         found: dict[str, Reference] = {}
-        for group in groups.values():
-            for source in group:
-                try:
-                    found[source.path] = self._reference_of(source, plan.unit)
-                    break
-                except PipelineError as error:
-                    self.unreadable[source.path] = str(error)
-                except StageError:
-                    if needed:
-                        raise
-                    found[source.path] = Reference(Units())  # nobody asks
-                    break
+        for source in self.sources:
+            if source.path in self.unreadable:
+                continue
+            ept = source.kind == "ept"
+            own = read_ept(source.path).get("srs") if ept else las.projection(source.path)
+            kind = fingerprint(source.reader, own)
+            try:
+                if kind not in of_kind:
+                    of_kind[kind] = self._reference_of(source, plan.unit)
+            except PipelineError as error:
+                self.unreadable[source.path] = str(error)
+                continue
+            except StageError:
+                if needed:
+                    raise
+                of_kind[kind] = Reference(Units())  # nobody asks
+            found[source.path] = of_kind[kind]
         if not found:
             reasons = iter(self.unreadable.values())
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if needed:
-            readable = [
-                [one.path for one in group if one.path not in self.unreadable] for group in groups.values()
-            ]
-            of_all = {path: found[next(p for p in each if p in found)] for each in readable for path in each}
-            self.messages += check_one_reference(of_all)
+            self.messages += check_one_reference(found)
         return next(iter(found.values())).units.horizontal
 
     def _reference_of(self, source: InputSource, horizontal: str) -> Reference:
@@ -319,13 +310,6 @@ class Survey:
             boxes.append(index.box if index and index.count else self.extents[source.path].box)
         self._boxes = np.array(boxes, np.float64)
         self.bounds: Box = union(boxes)
-
-    @property
-    def names(self) -> list[str]:
-        """What outputs of files are called, in place of '#'."""
-        if self._whole_names:
-            return in_folders(self.paths, [source.plain_name for source in self.sources])
-        return [source.stem for source in self.sources]
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
         """Names and stamps of the files that stages read."""
@@ -376,17 +360,16 @@ class Survey:
 
 
 def stamp(path: str | os.PathLike) -> list[Any]:
-    """Size, time of change, and a digest of samples: a copy, link or change of mode leaves it as it is.
+    """Size, time of change, and a digest of both ends: a copy, link or change of mode leaves it as it is.
 
     A file that was replaced is told by it even if size and time are those of the older one.
     """
     try:
         with open(path, "rb") as file:
-            status = os.fstat(file.fileno())
-            size, digest = status.st_size, hashlib.sha256()
-            for at in (0, *(size * k // (_PLACES + 1) for k in range(1, _PLACES + 1)), max(0, size - _ENDS)):
+            status, digest = os.fstat(file.fileno()), hashlib.sha256()
+            for at in (0, max(0, status.st_size - _ENDS)):
                 file.seek(at)
-                digest.update(file.read(_ENDS if at in (0, max(0, size - _ENDS)) else _BETWEEN))
+                digest.update(file.read(_ENDS))
     except OSError:
         return [-1, -1, ""]  # not there, or not a file
-    return [size, status.st_mtime_ns, digest.hexdigest()[:16]]
+    return [status.st_size, status.st_mtime_ns, digest.hexdigest()[:16]]

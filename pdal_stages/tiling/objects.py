@@ -5,7 +5,6 @@ Each file is read once into records of cells; then objects are found in all.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
@@ -24,13 +23,12 @@ from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import refuse_unclassified
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import check_one_reference, input_files, outputs_of, reference_of_file
+from ..pipeline.inputs_outputs import check_one_reference, input_files, reference_of_file
 from ..pipeline.parts import las_chunks, reads_in_parts
 from ..pipeline.read import Override
 from ..pipeline.workers import each_file
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
-from .report import FoundObjects
 
 if TYPE_CHECKING:
     from .classify import ClassifyTask
@@ -41,21 +39,6 @@ OPTIONS_OF = ("writers.objects", "filters.objects")
 _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 #: Larger cells are not taken by themselves: they tell no house from the next.
 LARGEST = 4.0
-
-
-def run_command(options: argparse.Namespace) -> int:
-    """Run ``pdal-stages objects``; the exit code."""
-    given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}
-    stage = writer(options.output, options.overrides, **given)
-    check_target(options.output)
-    inputs = input_files(options.inputs)
-    more = [Output(options.metadata, "metadata", JSON)] if options.metadata else []
-    check_outputs(
-        [*(Output(str(file), "objects") for file in target_files(options.output)), *more],
-        [*inputs, *options.inputs],
-    )
-    _write(inputs, stage, options.workers, options.metadata)
-    return 0
 
 
 def refuse_tiles(task: ClassifyTask, output: str) -> None:
@@ -69,20 +52,18 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
     check_outputs([Output(output, "objects")], task.files)
 
 
-def objects_of_outputs(task: ClassifyTask, stage: ObjectsWriter) -> FoundObjects:
-    """What ``classify --objects`` does when all is classified."""
-    workers = max(1, task.options.local_workers)
-    return _write(outputs_of(task.files, task.output), stage, workers)
-
-
-def _write(
-    inputs: list[str],
+def write_objects(
+    names: Sequence[str],
     stage: ObjectsWriter,
     workers: int = 1,
     metadata: str | None = None,
-) -> FoundObjects:
-    """Find objects, write them, say what was found."""
+) -> dict[str, Any]:
+    """Find objects in classified files, write them, say what was found; the files, and counts by kind."""
     check_target(stage.filename)
+    inputs = input_files(names)
+    more = [Output(metadata, "metadata", JSON)] if metadata else []
+    wanted = [Output(str(file), "objects") for file in target_files(stage.filename)]
+    check_outputs([*wanted, *more], [*inputs, *names])
     found, units, wkt = _objects_of_files(inputs, stage, workers)
     found, refused = found.without(stage.refuse)
     layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=units)
@@ -106,7 +87,7 @@ def _write(
             "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
         write_whole(metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
-    return FoundObjects(files, summary)
+    return {"files": files, **summary}
 
 
 def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:

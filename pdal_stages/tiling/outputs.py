@@ -244,17 +244,19 @@ class FileTask:
     def run(self) -> dict[str, Any]:
         """Write the outputs; the record says what was written, and counts classes."""
         tail = with_dimensions(self.plan.tail, self.plan.beside, [self.source.path])
-        kinds = {
-            (writer["type"], Path(path).suffix.lower())
-            for writer, path in zip(self.plan.writers, self.outputs, strict=True)
-        }
-        plain = kinds <= {("writers.las", ".las"), ("writers.las", ".laz")}
-        if plain and self.count > MOST_AT_ONCE:
-            with contextlib.suppress(_HeadersDifferError):  # such as automatic offsets: written at once
-                return self._in_parts(tail)
+        if self.count > MOST_AT_ONCE and self._can_be_joined:
+            return self._in_parts(tail)
         new = self._new_values(0, self.count)
         reader = {**self.source.reader, "filename": self.source.path}
         return run_tail([reader], [new], tail, self.outputs, self.scratch) | {"classes": _classes(new)}
+
+    @property
+    def _can_be_joined(self) -> bool:
+        """Whether what is written is one LAS or LAZ file whose parts have the same header."""
+        names = [Path(path).suffix.lower() for path in self.outputs]
+        writer = self.plan.writers[0]
+        plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())
+        return plain and names in ([".las"], [".laz"])
 
     def _new_values(self, start: int, end: int) -> NewValues:
         found = read_results(self.results, self.source, self.count, start, end)
@@ -267,39 +269,31 @@ class FileTask:
         )
 
     def _in_parts(self, tail: list[dict[str, Any]]) -> dict[str, Any]:
-        """Each part goes through tail and writers into uncompressed files, which are joined under the first one's header."""
-        joined: list[_Joined] = []
+        """Each part goes through the tail into an uncompressed file; these are joined under the first one's header."""
         classes: Counter[str] = Counter()
+        tail = [{k: v for k, v in stage.items() if k != "compression"} for stage in tail]
 
         def check(made: Path, final: Path, number: int) -> None:
-            check_complete(made, final, {"type": "writers.las", "filename": final}, joined[number].count)
+            check_complete(made, final, {"type": "writers.las", "filename": final}, joined.count)
 
-        tail = [
-            {k: v for k, v in s.items() if k != "compression"} if s["type"] == "writers.las" else s
-            for s in tail
-        ]
-        with whole_files(*self.outputs, check=check) as partials, contextlib.ExitStack() as stack:
-            joined += [stack.enter_context(contextlib.closing(_Joined(p))) for p in partials]
-            folder = stack.enter_context(TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True))
+        with (
+            whole_files(*self.outputs, check=check) as (partial,),
+            contextlib.closing(_Joined(partial)) as joined,
+            TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True) as folder,
+        ):
+            piece, part = (os.path.join(folder, name) for name in ("part.las", "out.las"))
             for start in range(0, self.count, MOST_AT_ONCE):
                 end = min(self.count, start + MOST_AT_ONCE)
-                piece = os.path.join(folder, "part.las")
                 write_records(piece, header_of(self.source.path), record_blocks(self.source.path, start, end))
-                parts = [os.path.join(folder, f"out{n}.las") for n in range(len(self.outputs))]
                 new = self._new_values(start, end)
-                run_tail([{**self.source.reader, "filename": piece}], [new], tail, parts, self.scratch)
+                run_tail([{**self.source.reader, "filename": piece}], [new], tail, [part], self.scratch)
                 classes.update(_classes(new))
-                for one, part in zip(joined, parts, strict=True):
-                    one.add(part)
-        return {"outputs": written(self.outputs), "written": joined[0].count, "classes": dict(classes)}
+                joined.add(part)
+        return {"outputs": written(self.outputs), "written": joined.count, "classes": dict(classes)}
 
 
 def _classes(new: NewValues) -> dict[str, int]:
     return class_counts([{name: values for name, (_, values) in new.values.items()}])
-
-
-class _HeadersDifferError(Exception):
-    """Parts cannot be joined: the writer gives them different headers."""
 
 
 class _Joined:
@@ -308,28 +302,22 @@ class _Joined:
     def __init__(self, path: Path) -> None:
         self.path, self.count = path, 0
         self._writer: Any = None
-        self._head: Any = None
 
     def add(self, part: str) -> None:
-        """Append the points of a file, which goes."""
+        """Append the points of a file."""
         import laspy
 
         with laspy.open(part) as reader:
             header = reader.header
-            places = [*header.scales.tolist(), *header.offsets.tolist()]
-            records = [(v.user_id, v.record_id, v.record_data_bytes()) for v in header.vlrs]
-            head = (places, header.point_format, str(header.version), records)
             if self._writer is None:
                 compress = self.path.suffix.lower() == ".laz"
-                self._head = head
                 self._writer = laspy.open(self.path, mode="w", header=header, do_compress=compress)
-            elif head != self._head:
-                raise _HeadersDifferError
-            total = int(header.point_count)
+                self._places = [*header.scales, *header.offsets]
+            elif [*header.scales, *header.offsets] != self._places:
+                raise StageError("internal: the parts of a file have different offsets", where=str(self.path))
+            self.count += int(header.point_count)
             for points in reader.chunk_iterator(BLOCK):
                 self._writer.write_points(points)
-            self.count += total
-        os.unlink(part)
 
     def close(self) -> None:
         """Finish the file."""

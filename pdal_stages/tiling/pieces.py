@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ..base.arrays import begins_run
 from ..base.errors import StageError
 from ..pipeline.parts import las_chunks
-from .grid import Box, TileGrid, check_number
 from .inputs import CloudIndex, InputSource, fetch_ept
+from .settings import Box, TileGrid, check_number
 
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
     import laspy
@@ -167,7 +167,6 @@ class Piece:
     index: NDArray[np.int64]  #: (n,) number of each point in its input file
     #: (n,) how far it lies outside the tile along the farther axis, in the unit of the coordinates; -1 inside
     away: NDArray[np.float64]
-    tiles: set[tuple[int, int]]  #: that its points belong to
 
     @cached_property
     def own(self) -> NDArray[np.int64]:
@@ -214,8 +213,5 @@ def cut_all(
         away = np.where((places == tile).all(axis=1), -1.0, np.maximum(away, 0.0))
         target = os.path.join(folder, f"piece{number}.las")
         write_records(target, header, [records])
-        corner = places.min(axis=0)
-        at = np.ravel_multi_index((places - corner).T, wide := tuple(np.ptp(places, axis=0) + 1))
-        there = corner + np.column_stack(np.unravel_index(np.flatnonzero(np.bincount(at)), wide))
-        pieces.append(Piece(source, target, numbers, away, {(i, j) for i, j in there.tolist()}))
+        pieces.append(Piece(source, target, numbers, away))
     return pieces

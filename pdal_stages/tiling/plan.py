@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ from ..base.outputs import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import writes_las
+from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of
+from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
 from ..stages.base import Stage
 from ..stages.hag_morphological import Blocks, HagMorphological
@@ -76,7 +78,6 @@ class TilePlan:
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
     #: Dimensions that our stages make and outputs hold, with PDAL's types: what a file without points gets, too.
     makes: dict[str, str] = field(default_factory=dict)
-    whole_names: bool = False  #: '#' in an output's name is the whole name of the input file, with its suffix
 
     @property
     def writers(self) -> list[dict[str, Any]]:
@@ -129,19 +130,12 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     _check_row(steps)
     readers, filters, writers = ([s for s in steps if s.rank == rank] for rank in (0, 1, 2))
     _check_ends(readers, filters, writers)
-    for step in filters:
-        _check_local(step, buffer)
     end = max((n for n, step in enumerate(filters, 1) if step.sees_neighbors), default=0)
+    for number, step in enumerate(filters):
+        _check_local(step, number < end, buffer)
     head, tail = filters[:end], filters[end:]
-    for step in head:
-        if step.type in MOVING:
-            raise PipelineError(
-                f"{step.type} moves points before stages that see neighbors, and tiles are cut before it",
-                where=step.where,
-                cure="Reproject the files first, or put it after the last stage of pdal_stages",
-            )
     reaches = [step.reach(buffer) for step in head]
-    sees_m = sum(reaches)
+    sees_m = sum(reaches)  # _first_round makes some of them less
     first = _first_round(readers, head, reaches)
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
@@ -169,11 +163,35 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     )
 
 
+def readers_of(files: Sequence[str]) -> list[dict[str, Any]]:
+    """A reader for each kind of input, of all its files."""
+    readers: list[dict[str, Any]] = []
+    # Of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told.
+    for kind, more in (("readers.las", {"use_eb_vlr": True}), ("readers.ept", {})):
+        if names := [name for name in files if is_ept(name) == (kind == "readers.ept")]:
+            readers.append({"type": kind, "filename": names, "tag": "input", **more})
+    return readers
+
+
+def plan_of_files(
+    files: Sequence[str],
+    stages: Sequence[dict[str, Any]],
+    overrides: Iterable[Override],
+    buffer: float | None = None,
+) -> tuple[TilePlan, PipelineSource]:
+    """The plan of stages after the readers of files; and the pipeline, of one input of each kind."""
+    readers = readers_of(files)
+    heads = [{**reader, "filename": reader["filename"][0]} for reader in readers]
+    pipeline = Pipeline([*heads, *stages], overrides, whole=False)
+    plan = make_plan(pipeline, buffer)
+    for settled, reader in zip(plan.readers, readers, strict=True):
+        settled["filename"] = reader["filename"]
+    return plan, pipeline.source
+
+
 def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) -> FirstRound | None:
     """Find the stage whose far-reaching raster is made before; it then needs no halo."""
     for at, step in enumerate(head):
-        if step.ours is None:
-            continue
         if isinstance(step.ours, HagMorphological):
             kept = _kept(readers, head[:at])
             found = FirstRound(at, sum(reaches[:at]), sum(reaches[at:]), step.ours.blocks(), kept)
@@ -181,7 +199,7 @@ def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) 
             if kept is not None:
                 reaches[:at] = [0.0] * at
             return found
-        if step.ours.open_ended:
+        if step.ours is not None and step.ours.open_ended:
             return None
     return None
 
@@ -217,19 +235,19 @@ def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
 
 def _check_row(steps: list[_Step]) -> None:
     """Refuse pipelines that branch; in a row `inputs` say nothing new, so they are left out."""
-    for place, step in enumerate(steps):
-        before = steps[:place]
-        if before and step.rank < before[-1].rank:
+    readers = {str(step.given.get("tag")) for step in steps if step.rank == 0}
+    for number, step in enumerate(steps):
+        before = steps[number - 1] if number else None
+        if before and step.rank < before.rank:
             raise PipelineError(
                 "a pipeline in tiles is a row: readers, then filters, then writers",
                 where=step.where,
-                found=f"{step.type} after {before[-1].type}",
+                found=f"{step.type} after {before.type}",
             )
         wanted = step.given.pop("inputs", None)
-        if wanted is not None and step.rank:
+        if wanted is not None and before and step.rank:
             names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))
-            of_readers = {str(s.given.get("tag")) for s in before if s.rank == 0}
-            if names != of_readers and names != {str(before[-1].given.get("tag"))}:
+            if names not in (readers, {str(before.given.get("tag"))}):
                 raise PipelineError(
                     "a pipeline in tiles is a row; this stage takes only some of the points before it",
                     where=step.where,
@@ -241,20 +259,18 @@ def _check_row(steps: list[_Step]) -> None:
 def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]) -> None:
     if not readers:
         raise PipelineError("the pipeline has no reader, so there is nothing to cut into tiles")
-    if not any(step.ours is not None and step.ours.instead_of_tiles for step in filters):
-        if not writers:
+    if not writers and not any(step.ours is not None and step.ours.instead_of_tiles for step in filters):
+        cure = "End it with a file name, e.g. classified_#.laz"
+        raise PipelineError("the pipeline has no writer", cure=cure)
+    for step in writers:
+        if not isinstance(step.given.get("filename"), str) or "://" in step.given["filename"]:
+            raise PipelineError("in tiles, a writer writes files", where=step.type)
+        if step.type == "writers.gdal":
             raise PipelineError(
-                "the pipeline has no writer", cure="End it with a file name, e.g. classified_#.laz"
+                "rasters are not written in tiles, where each would lack what lies beyond its edge",
+                where=step.where,
+                cure="Write LAS files, and give these to PDAL: pdal pipeline pipelines/terrain-and-surface.json",
             )
-        for step in writers:
-            if not isinstance(step.given.get("filename"), str) or "://" in step.given["filename"]:
-                raise PipelineError("in tiles, a writer writes files", where=step.type)
-            if step.type == "writers.gdal":
-                raise PipelineError(
-                    "rasters are not written in tiles, where each would lack what lies beyond its edge",
-                    where=step.where,
-                    cure="Write LAS files, and give these to PDAL: pdal pipeline pipelines/terrain-and-surface.json",
-                )
     for step in readers:
         for name in ("count", "start", "bounds", "polygon", "resolution"):
             if name in step.given:
@@ -266,8 +282,8 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
                 )
 
 
-def _check_local(step: _Step, buffer: float | None) -> None:
-    """Refuse stages that need all points at once, or that look at neighbors no one knows how far away."""
+def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
+    """Refuse stages that need all points at once, that look at neighbors no one knows how far away, or that move points."""
     instead = step.ours.instead_of_tiles if step.ours is not None else ""
     if instead or step.type in _GLOBAL:
         raise PipelineError(
@@ -285,6 +301,12 @@ def _check_local(step: _Step, buffer: float | None) -> None:
             f"{step.type} may look at neighbors, and PDAL does not say how far",
             where=step.where,
             cure="Give --buffer METERS, wide enough for it (0 if it looks at single points)",
+        )
+    if in_head and step.type in MOVING:
+        raise PipelineError(
+            f"{step.type} moves points before stages that see neighbors, and tiles are cut before it",
+            where=step.where,
+            cure="Reproject the files first, or put it after the last stage of pdal_stages",
         )
 
 
@@ -305,43 +327,20 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
     return stage
 
 
-def outputs_for(plan: TilePlan, names: list[str], inputs: Iterable[str]) -> list[list[str]]:
-    """For every name put in place of '#', what each of the writers writes.
+def outputs_for(plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None) -> list[list[str]]:
+    """For every input, or every tile by its name, what each of the writers writes.
 
     Raises
     ------
-    PipelineError
-        Where several outputs would have one name.
     StageError
-        Where one is an input, or cannot be written.
+        Where several would be one file, or one is an input, or cannot be written.
     """
-    found: list[list[Output]] = []
+    found = []
     for writer in plan.writers:
-        path = Path(writer["filename"])
-        if "#" not in path.name and len(names) > 1:
-            raise PipelineError(
-                f"{len(names)} files will be written, and the writer has one name",
-                where=writer["type"],
-                found=str(path),
-                cure="Put '#' where the name of the tile or input file should be, e.g. "
-                f"{path.stem}_#{path.suffix}",
-            )
-        if "#" in str(path.parent):
-            raise PipelineError(
-                "'#' goes into the file's name, not its folder", where=writer["type"], found=str(path)
-            )
-        kind = LAS if writes_las(writer) else ""
-        path = path.absolute()
-        found.append([Output(str(path.parent / path.name.replace("#", n)), "output", kind) for n in names])
-    flat = [output for outputs in found for output in outputs]
-    twice = sorted(path for path, n in Counter(output.path for output in flat).items() if n > 1)
-    if twice:
-        raise PipelineError(
-            "two inputs would be written to the same file",
-            found=twice[0],
-            cure="Give input files different names, or use --per tile",
-        )
-    there = {folder for folder in {Path(output.path).parent for output in flat} if folder.is_dir()}
-    # Others will be made: a dry run looks ahead.
-    check_outputs([output for output in flat if Path(output.path).parent in there], inputs)
-    return [[outputs[n].path for outputs in found] for n in range(len(names))]
+        name = os.path.abspath(writer["filename"])
+        found.append(outputs_of(inputs, name) if tiles is None else named_outputs(name, tiles))
+    kinds = [LAS if writes_las(writer) else "" for writer in plan.writers]
+    every = [Output(path, "output", kind) for kind, paths in zip(kinds, found, strict=True) for path in paths]
+    # Other folders will be made: a dry run looks ahead.
+    check_outputs([output for output in every if Path(output.path).parent.is_dir()], inputs)
+    return [list(each) for each in zip(*found, strict=True)]

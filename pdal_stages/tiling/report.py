@@ -62,6 +62,11 @@ class Job:
         """It cannot be done."""
         self.state, self.reason, self.blocked_by = "failed", reason, blocked_by
 
+    def fail_with(self, needed: Iterable[Job]) -> None:
+        """It cannot be done where any that it needs has failed."""
+        if reason := next((job.reason for job in needed if job.reason), ""):
+            self.fail(reason)
+
 
 class InterruptedRun(KeyboardInterrupt):
     """Ctrl-C in a tiled run; `run` says what it did until then."""
@@ -69,14 +74,6 @@ class InterruptedRun(KeyboardInterrupt):
     def __init__(self, run: TiledRun) -> None:
         super().__init__()
         self.run = run
-
-
-@dataclass(frozen=True)
-class FoundObjects:
-    """Objects that were found in the outputs: the files they were written to, and counts by kind."""
-
-    files: list[str]
-    kinds: dict[str, dict[str, Any]]
 
 
 @dataclass
@@ -96,8 +93,8 @@ class TiledRun:
         What the user should know.
     summary : dict
         Figures for people; see :meth:`to_dict`.
-    objects : FoundObjects, optional
-        Those of the outputs, where they were asked for.
+    objects : dict, optional
+        Those of the outputs, where they were asked for: the files they were written to, and counts by kind.
     """
 
     tiles: list[Job]
@@ -106,7 +103,7 @@ class TiledRun:
     changed: list[str]
     messages: list[str]
     summary: dict[str, Any]
-    objects: FoundObjects | None = None
+    objects: dict[str, Any] | None = None
 
     @property
     def failures(self) -> list[tuple[str, str]]:
@@ -149,7 +146,7 @@ class TiledRun:
                 | {k: o.record[k] for k in told if k in o.record}
                 for o in self.outputs
             ],
-            **({"objects": {"files": self.objects.files, **self.objects.kinds}} if self.objects else {}),
+            **({"objects": self.objects} if self.objects else {}),
         }
 
 

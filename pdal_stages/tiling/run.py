@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -22,9 +23,8 @@ from ..base.version import build
 from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
-from ..pipeline.workers import run_tasks
-from .cluster import open_workers
-from .ground import BlockTask, FirstRoundTask, block_file, blocks_around, from_before, left_file, tiles_around
+from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
+from .ground import BlockTask, FirstRoundTask, block_name, blocks_around, from_before, left_name
 from .inputs import CloudIndex, InputSource, Survey
 from .outputs import FileTask
 from .pieces import sort_points
@@ -37,7 +37,7 @@ from .tile import RunContext, TileTask
 #: A run stops when so many tiles failed for one reason and none succeeded.
 _HOPELESS = 10
 #: Bytes that a run keeps of a point until its output is written; in the rounds before the tiles, and there of a cell.
-_KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 60, 24, 112
+_KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 60, 33, 112
 
 
 def run_tiled(
@@ -118,16 +118,13 @@ def run_plan(
         raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
     if plan.makes and progress is not False and not chosen.scheduler and not kept_kernels():
         print_messages("compiling for this processor first, once: it takes a minute or two")
-    folders = {folder}
-    if survey.per == "file":  # refused now, not after reading all inputs
-        named = outputs_for(plan, survey.names, survey.paths)
-        folders |= {Path(path).parent for paths in named for path in paths}
+    folders = {folder, *(Path(path).parent for paths in survey.outputs for path in paths)}
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
         store.finish("run", "", {"tile": survey.grid.size})
         try:
-            with open_workers(survey.options, str(store.folder)) as workers:
+            with _workers(survey.options, str(store.folder)) as workers:
                 run = _Run(plan, survey, store, workers, progress)
                 run.read_inputs()
                 run.find_jobs()
@@ -151,6 +148,16 @@ def run_plan(
     if interrupted:
         raise InterruptedRun(found)
     return found
+
+
+def _workers(options: TilingOptions, folder: str) -> Any:
+    """What does the tasks of a run, which keeps what it makes in `folder`."""
+    if options.scheduler:
+        from .cluster import Cluster
+
+        return Cluster(options.scheduler, folder)
+    workers, threads = options.local_workers, options.threads
+    return WorkerProcesses(workers, threads) if workers else ThisProcess(threads)
 
 
 def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> None:
@@ -231,12 +238,12 @@ class _Run:
             if source.kind != "las" or source.path in survey.unreadable:
                 continue
             name = fingerprint(source.path, survey.stamps[source.path], survey.grid.size)
-            known, copy = store.note(name), store.path(f"{name}.points")
-            if known and (copy.exists() or source.path not in (needed or ())):
-                survey.indexes[source.path] = CloudIndex.of(known, str(copy))
+            known, copy = store.note(name), store.path(name, ".points")
+            if known and (os.path.exists(copy) or source.path not in (needed or ())):
+                survey.indexes[source.path] = CloudIndex.of(known, copy)
             else:
                 points = survey.extents[source.path].count
-                waiting.append(Job(name, points, source=source, outputs=None, step="index", mark=str(copy)))
+                waiting.append(Job(name, points, source=source, step="index", mark=copy))
 
         def task_of(job: Job) -> Callable[[], Any]:
             assert job.source is not None
@@ -285,13 +292,12 @@ class _Run:
                 job.fail(f"an input here cannot be read: {bad[0]}", bad[0])
             self.tiles.append(job)
         if survey.per == "tile":
-            named = outputs_for(plan, [job.name for job in self.tiles], survey.paths)
+            named = outputs_for(plan, survey.paths, [job.name for job in self.tiles])
             for job, paths in zip(self.tiles, named, strict=True):
                 job.outputs = paths
             return
         by_tile = {job.tile: job for job in self.tiles}
-        named = outputs_for(plan, survey.names, survey.paths)
-        for source, paths in zip(survey.sources, named, strict=True):
+        for source, paths in zip(survey.sources, survey.outputs, strict=True):
             out = Job(f"file-{source.key}", source=source, outputs=paths, step="outputs")
             if index := survey.indexes.get(source.path):
                 out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
@@ -302,19 +308,20 @@ class _Run:
 
     def take_over(self) -> None:
         """Keep what an earlier run finished; tiles that no output waits for need not be done again."""
-        for job in self.outputs:
-            self._keep(job)
-        needed = {job.name for out in self.outputs if out.state == "waiting" for job in out.jobs}
+        needed = {job.name for out in self._unkept(self.outputs) for job in out.jobs}
+        self._unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
         for job in self.tiles:
-            if job.outputs is not None or job.name in needed:
-                self._keep(job)
-            elif job.state == "waiting":
+            if job.state == "waiting" and job.outputs is None and job.name not in needed:
                 known = self.store.note(job.name)
                 job.state, job.record = "kept", known if known.get("fingerprint") == job.mark else {}
 
-    def _keep(self, job: Job) -> None:
-        if job.state == "waiting" and (known := self.store.finished(job.name, job.mark)):
-            job.state, job.record = "kept", known
+    def _unkept(self, jobs: Iterable[Job]) -> deque[Job]:
+        """The waiting jobs but those that an earlier run did."""
+        waiting = deque(job for job in jobs if job.state == "waiting")
+        for job in waiting:
+            if known := self.store.finished(job.name, job.mark):
+                job.state, job.record = "kept", known
+        return deque(job for job in waiting if job.state == "waiting")
 
     def _context(self) -> RunContext:
         """What all tiles have in common."""
@@ -339,16 +346,15 @@ class _Run:
 
         def task_of(job: Job) -> Callable[[], Any]:
             if job.source is not None:
-                results = [str(store.path(f"{each.name}.npz")) for each in job.jobs]
+                results = [store.path(each.name) for each in job.jobs]
                 assert job.outputs is not None
                 plan, scratch = context.plan, context.scratch
                 return FileTask(plan, job.source, job.points, results, job.outputs, scratch).run
             assert job.tile is not None
             sources = survey.near(job.tile, self.farthest)
             complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
-            result = str(store.path(f"{job.name}.npz"))
             given = survey.readable(sources)
-            return TileTask(context, job.tile, given, complete, result, job.outputs, before).run
+            return TileTask(context, job.tile, given, complete, store.path(job.name), job.outputs, before).run
 
         for job in self._do("tiles", waiting, task_of):
             if finished is not None and job.state == "done" and job.outputs and job.record["outputs"]:
@@ -371,77 +377,56 @@ class _Run:
         first, survey, store = self.plan.first, self.survey, self.store
         if first is None or len(self.tiles) == 1:
             return
-        grid, unit, context = survey.grid, survey.unit, self._context()
+        unit, context = survey.unit, self._context()
         by_tile = {job.tile: job for job in self.tiles if job.tile}
-        places = {
-            b for tile in by_tile for b in blocks_around(first, grid.box(tile), unit, first.blocks.spill)
-        }
-        # Those of an earlier run with other inputs would be taken for blocks with points.
-        store.remove(".block.npz", [block_file(block) for block in places])
+        places = {b for tile in by_tile for b in blocks_around(context, tile, first.blocks.spill)}
+        # Those of an earlier run with other inputs would be taken for blocks and tiles with points.
+        store.remove(".block.npz", [f"{block_name(block)}.npz" for block in places])
+        store.remove(".first.npz", [f"{left_name(job.name)}.npz" for job in self.tiles])
         around = self.farthest * unit + first.blocks.around
         wanted = {
-            job.name: places.intersection(blocks_around(first, grid.box(job.tile), unit, around))
-            for job in self.tiles
-            if job.state == "waiting" and job.tile
+            job.name: places.intersection(blocks_around(context, tile, around))
+            for tile, job in by_tile.items()
+            if job.state == "waiting"
         }
-        near = {b: tiles_around(first, grid, unit, b, by_tile) for b in sorted(set().union(*wanted.values()))}
+        near: dict[tuple[int, int], list[tuple[int, int]]] = {
+            b: [] for b in sorted(set().union(*wanted.values()))
+        }
+        for tile in by_tile:
+            for block in near.keys() & blocks_around(context, tile, first.blocks.reach):
+                near[block].append(tile)
         head = self.plan.head[: first.at + 1]
-        common = [build(), head, survey.stamps_of(head), grid.size, first.halo_m, unit, first.kept]
+        common = [build(), head, survey.stamps_of(head), survey.grid.size, first.halo_m, unit, first.kept]
 
-        def seen(tile: tuple[int, int]) -> list[InputSource]:
-            return survey.near(tile, first.halo_m / unit)
+        def sources(tile: tuple[int, int]) -> list[tuple[InputSource, CloudIndex | None]]:
+            return survey.readable(survey.near(tile, first.halo_m / unit))
 
         def first_task(job: Job) -> Callable[[], Any]:
             assert job.tile is not None
-            target = str(store.path(f"{job.name}.npz"))
-            return FirstRoundTask(context, first, job.tile, survey.readable(seen(job.tile)), target).run
+            return FirstRoundTask(context, first, job.tile, sources(job.tile), store.path(job.name)).run
 
-        firsts = {
-            tile: Job(
-                left_file(by_tile[tile].name).removesuffix(".npz"),
-                by_tile[tile].points,
-                tile,
-                step="first_rounds",
-                mark=fingerprint(common, tile, survey.seen([s for s, _ in survey.readable(seen(tile))])),
-            )
-            for tile in sorted({tile for found in near.values() for tile in found})
-        }
-        for job in self._unfinished("lowest points of cells", firsts.values(), first_task):
+        firsts: dict[tuple[int, int], Job] = {}
+        for tile in sorted({tile for tiles in near.values() for tile in tiles}):
+            of = by_tile[tile]
+            mark = fingerprint(common, tile, survey.seen([source for source, _ in sources(tile)]))
+            firsts[tile] = Job(left_name(of.name), of.points, tile, step="first_rounds", mark=mark)
+        for job in self._do("lowest points of cells", self._unkept(firsts.values()), first_task):
             self.messages_before.append(job.record.get("messages", []))
 
         def block_task(job: Job) -> Callable[[], Any]:
             assert job.tile is not None
-            left = [str(store.path(f"{firsts[t].name}.npz")) for t in near[job.tile]]
-            target = str(store.path(f"{job.name}.npz"))
-            return BlockTask(context.plan, job.tile, left, target).run
+            left = [store.path(firsts[tile].name) for tile in near[job.tile]]
+            return BlockTask(context.plan, job.tile, left, store.path(job.name)).run
 
-        blocks = {
-            block: Job(
-                block_file(block).removesuffix(".npz"),
-                1,
-                block,
-                step="first_rounds",
-                mark=fingerprint(common, block, [firsts[tile].mark for tile in tiles]),
-            )
-            for block, tiles in near.items()
-        }
-        for block, job in blocks.items():
-            if reason := next(filter(None, (firsts[tile].reason for tile in near[block])), ""):
-                job.fail(reason)
-        for _ in self._unfinished("ground by blocks", blocks.values(), block_task):
+        blocks: dict[tuple[int, int], Job] = {}
+        for block, tiles in near.items():
+            mark = fingerprint(common, block, [firsts[tile].mark for tile in tiles])
+            job = blocks[block] = Job(block_name(block), 1, block, step="first_rounds", mark=mark)
+            job.fail_with(firsts[tile] for tile in tiles)
+        for _ in self._do("ground by blocks", self._unkept(blocks.values()), block_task):
             pass
         for job in self.tiles:
-            if reason := next(filter(None, (blocks[b].reason for b in sorted(wanted.get(job.name, ())))), ""):
-                job.fail(reason)
-
-    def _unfinished(
-        self, what: str, jobs: Iterable[Job], task_of: Callable[[Job], Callable[[], Any]]
-    ) -> Iterator[Job]:
-        """Do what is not there from an earlier run, and yield it."""
-        waiting = (job for job in jobs if job.state == "waiting")
-        return self._do(
-            what, deque(job for job in waiting if not self.store.finished(job.name, job.mark)), task_of
-        )
+            job.fail_with(blocks[block] for block in sorted(wanted.get(job.name, ())))
 
 
 def _make_ready(out: Job, waiting: deque[Job]) -> None:
@@ -462,7 +447,8 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     """What a run would do: tiles, points, memory and disk, as the headers of the inputs tell (``--dry-run``)."""
     grid, options, density = survey.grid, survey.options, survey.density
     tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
-    outputs_for(plan, survey.names if survey.per == "file" else [job.name for job in tiles], survey.paths)
+    if survey.per == "tile":
+        outputs_for(plan, survey.paths, [job.name for job in tiles])
     count, read = density.points, density.read_by(grid.size, survey.halo_units)
     kept = float(count * _KEPT)
     if plan.first is not None:

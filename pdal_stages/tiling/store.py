@@ -95,9 +95,9 @@ class Store:
         shutil.rmtree(self.kept)
         self.kept.mkdir()
 
-    def path(self, name: str) -> Path:
-        """A file of arrays or points, by its name."""
-        return self.kept / name
+    def path(self, name: str, ending: str = ".npz") -> str:
+        """A file of arrays, or of points, by its name."""
+        return str(self.kept / f"{name}{ending}")
 
     def finish(self, name: str, mark: str, record: Mapping[str, Any]) -> None:
         """Note that something is done; `mark` is the fingerprint of all that decides it."""

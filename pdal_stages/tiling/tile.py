@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,22 +18,20 @@ from ..base.errors import NoTerrainError, PipelineError, StageError
 from ..pipeline.inputs_outputs import NO_REFERENCE
 from ..pipeline.las_output import check_writers, flag_splitter
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import Callbacks, points_of
+from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages import registry
 from ..stages.hag_morphological import HagMorphological
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
-from .grid import Box, TileGrid, inside
 from .inputs import CloudIndex, InputSource
 from .outputs import PieceResults, changed_in, class_counts, flags_in_classes, save_results, write_tile
 from .pieces import Piece, cut_all
-from .plan import INPUT, OUTSIDE, ROW, FirstRound, TilePlan
+from .plan import INPUT, OUTSIDE, ROW, TilePlan
 from .report import left_alone
+from .settings import Box, TileGrid, inside
 from .store import written
 
 #: How often a tile is read again with a wider halo.
 _WIDENINGS = 3
-#: Points whose neighbors are looked at in one go where they lie far apart.
-_AT_ONCE = 100_000
 _MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
 #: The warning of `Points` in a tile: of the user's `where` with what was added for the tile, or of that alone.
 _NOWHERE = re.compile(rf"{HOLDS_NOWHERE} [\d,]+ points: (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
@@ -75,12 +74,13 @@ def run_head(
     cuts: list[Piece],
     everything: bool,
     before: FromBefore | None = None,
+    last: Function | None = None,
 ) -> HeadRun:
-    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away."""
+    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away; `last` sees its result."""
     plan, first = context.plan, context.plan.first
-    if not plan.head:
+    if not plan.head and last is None:
         return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts])
-    marks = _marks(cuts, context)
+    marks = [_Mark(number, piece, context) for number, piece in enumerate(cuts)]
     begin = 0
     if before is not None and first is not None and first.kept is not None:
         begin = first.at
@@ -91,7 +91,6 @@ def run_head(
     reaches: dict[int, float] = {}
     needs = [0.0]
     views: list[dict[str, NDArray]] = []  # of the tile's own points: far less than all arrays of all points
-    places: list[NDArray[np.float64]] = []  # of all: X, Y, Z and how far outside the tile
 
     def reach(number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         points = points_of(ours[number].stage, module, ins)
@@ -104,21 +103,20 @@ def run_head(
         names = [name for name in wanted if name in ins and name not in _MARK_TYPES]
         mine = np.flatnonzero(ins[OUTSIDE] < 0)
         views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
-        if most > 0:
-            places.append(np.column_stack([ins[name] for name in ("X", "Y", "Z", OUTSIDE)]))
 
     with Callbacks() as callbacks:
         stages = _marked(callbacks, marks)
+        begins = len(stages)
         for number in range(begin, len(plan.head)):
-            stage = _with_threads(plan.head[number], context.threads)
-            stages.append({**stage, **_after(marks)} if number == begin else stage)
+            stages.append(_with_threads(plan.head[number], context.threads))
             if before is not None and first is not None and number == first.at:
                 from_afar = len(stages) - 1
-            kind = registry.stages().get(stage["type"])
+            kind = registry.stages().get(stages[-1]["type"])
             if kind is not None and kind.open_ended and not everything:
                 reaches[len(stages) - 1] = plan.later[number]
                 stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
-        stages.append(callbacks.filter(take))
+        stages += [callbacks.filter(function) for function in (take, last) if function is not None]
+        stages[begins]["inputs"] = [f"mark{number}" for number in range(len(marks))]
         pipeline = Pipeline(stages, whole=False)
         ours = {one.number: one for one in pipeline.expanded.ours}
         check_writers(
@@ -129,54 +127,12 @@ def run_head(
             one.stage.own_points = OUTSIDE
             if before is not None and one.number == from_afar and isinstance(one.stage, HagMorphological):
                 one.stage.from_blocks = before.blocks
-        most = max((one.stage.most_neighbors() for one in ours.values()), default=0)
         pipeline.execute(arrays=False)
-    results = _collect(views, cuts, plan.creates, marks)
-    need = max(needs)
-    if not everything and any(report.beyond_halo for _, reports in pipeline.reports for report in reports):
-        second = max(one.stage.second_neighbors() for one in ours.values())
-        need = max(need, _far_neighbors(places, most, second, context, tile))
+    reports = [report for _, reports in pipeline.reports for report in reports if report.beyond_halo]
+    if reports and not everything:
+        needs += [plan.halo_m + report.reach for report in reports]
     alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
-    return HeadRun(results, need, _messages(pipeline, context.scratch), alone)
-
-
-def run_first(
-    context: RunContext, cuts: list[Piece], first: FirstRound
-) -> tuple[list[dict[str, NDArray]], dict[str, NDArray], list[str]]:
-    """Run the stages before the one that looks far, on a tile and the surroundings that they need.
-
-    What that stage needs of the tile's own points, view by view; new values that the stages before it gave, as arrays named
-    ``INPUT/index`` (the points' numbers) and ``INPUT/DIMENSION``; messages.
-    """
-    marks = _marks(cuts, context, first.kept or () if first.at else ())
-    views: list[dict[str, NDArray]] = []
-    found: list[dict[str, NDArray]] = []
-
-    def left(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        mine = ins[OUTSIDE] < 0
-        if mine.any():
-            found.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
-        views.append({name: ins[name][mine] for name in (ROW, INPUT, *marks[0].keep)})
-
-    with Callbacks() as callbacks:
-        stages = _marked(callbacks, marks)
-        head = [_with_threads(given, context.threads) for given in context.plan.head[: first.at + 1]]
-        head[0] |= _after(marks)
-        stage = cast(HagMorphological, Pipeline([*stages, *head], whole=False).expanded.ours[-1].stage)
-        run = callbacks.filter(left, **(_after(marks) if first.at == 0 else {}))
-        pipeline = Pipeline([*stages, *head[:-1], run], whole=False)
-        pipeline.execute(arrays=False)
-    changes: dict[str, NDArray] = {}
-    for mark in marks:
-        rows, values = _of_piece(views, mark, mark.keep)
-        new = np.zeros(len(rows), bool)
-        for name, column in values.items():
-            new |= mark.changes(name, rows, column)
-        if new.any():
-            key = mark.piece.source.key
-            changes[f"{key}/index"] = mark.piece.index[rows[new]]
-            changes |= {f"{key}/{name}": column[new] for name, column in values.items()}
-    return found, changes, _messages(pipeline, context.scratch)
+    return HeadRun(_collect(views, marks), max(needs), _messages(pipeline, context.scratch), alone)
 
 
 def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
@@ -193,10 +149,6 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
             text = f"{HOLDS_NOWHERE} points: {nowhere[1]}"
         lines.append(text)
     return lines
-
-
-def _marks(cuts: list[Piece], context: RunContext, keep: Collection[str] = ()) -> list[_Mark]:
-    return [_Mark(number, piece, context, keep) for number, piece in enumerate(cuts)]
 
 
 def _marked(callbacks: Callbacks, marks: list[_Mark]) -> list[dict[str, Any]]:
@@ -216,10 +168,6 @@ def _marked(callbacks: Callbacks, marks: list[_Mark]) -> list[dict[str, Any]]:
     return stages
 
 
-def _after(marks: list[_Mark]) -> dict[str, Any]:
-    return {"inputs": [f"mark{number}" for number in range(len(marks))]}
-
-
 def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
     if given["type"] not in registry.stages():
         return dict(given)
@@ -228,102 +176,44 @@ def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
 
 
 class _Mark:
-    """Numbers a reader's points, and keeps what they were where changes are to be found later."""
+    """Numbers a reader's points, and gives them what the rounds before made."""
 
-    def __init__(self, number: int, piece: Piece, context: RunContext, keep: Collection[str] = ()) -> None:
-        self.number, self.piece, self.keep = number, piece, list(keep)
-        self.keep_all = context.plan.creates is None
-        self.changed: Changed = {}  # given by the rounds before
+    def __init__(self, number: int, piece: Piece, context: RunContext) -> None:
+        self.number, self.piece = number, piece
+        self.changed: Changed = {}
         self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
         self.holds_flags = flags_in_classes(piece.path)
-        self.original: dict[str, NDArray] = {}  # dimensions of the tile's own points
 
     def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        count, own = len(ins["X"]), self.piece.own
+        count = len(ins["X"])
         if count != len(self.away):
             raise StageError(f"the reader gave {count:,} points of {len(self.away):,}")
         outs[ROW] = np.arange(count, dtype=np.uint32)
         outs[INPUT] = np.full(count, self.number, np.uint32)
         outs[OUTSIDE] = self.away
-        names = [name for name in ins if name not in _MARK_TYPES] if self.keep_all else self.keep
-        self.original = self.without_flags({name: ins[name][own] for name in names})
         for name, (rows, values) in self.changed.items():
             outs[name] = changed_in(name, ins[name], rows, values, self.holds_flags)
 
-    def without_flags(self, values: dict[str, NDArray]) -> dict[str, NDArray]:
-        """Values whose class codes are free of the flags that old PDAL reads as bits of them."""
-        if self.holds_flags and "Classification" in values:
-            values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
-        return values
 
-    def changes(self, name: str, rows: NDArray[np.int64], values: NDArray) -> NDArray[np.bool_]:
-        """Which of some rows' values are not what was read; all where the dimension is new."""
-        if name not in self.original:
-            return np.ones(len(rows), bool)
-        return self.original[name][np.searchsorted(self.piece.own, rows)] != values
-
-
-def _of_piece(
-    views: list[dict[str, NDArray]], mark: _Mark, names: Collection[str]
-) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
-    """Rows of a piece that came out, ascending, and their values."""
-    mine = [(view, np.flatnonzero(view[INPUT] == mark.number)) for view in views]
-    rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
-    order = np.argsort(rows, kind="stable")
-    values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
-    return rows[order], mark.without_flags(values)
-
-
-def _collect(
-    views: list[dict[str, NDArray]],
-    cuts: list[Piece],
-    creates: list[str] | None,
-    marks: list[_Mark],
-) -> list[PieceResults]:
+def _collect(views: list[dict[str, NDArray]], marks: list[_Mark]) -> list[PieceResults]:
     """Results of the tile's own points, sorted as their pieces are."""
     names = [name for view in views[:1] for name in view if name not in _MARK_TYPES]
     results = []
-    for piece, mark in zip(cuts, marks, strict=True):
-        rows, values = _of_piece(views, mark, names)
+    for mark in marks:
+        mine = [(view, np.flatnonzero(view[INPUT] == mark.number)) for view in views]
+        rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
+        order = np.argsort(rows, kind="stable")
+        rows = rows[order]
         if (np.diff(rows) == 0).any():
             raise PipelineError(
                 "a stage makes new points, which have no place in the input files",
                 cure="Run the pipeline without --tile",
             )
-        results.append(PieceResults(piece, rows, values))
-    for name in names if creates is None else ():  # what no stage changed is as it was read
-        if not any(
-            mark.changes(name, result.rows, result.values[name]).any()
-            for result, mark in zip(results, marks, strict=True)
-        ):
-            for result in results:
-                del result.values[name]
+        values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
+        if mark.holds_flags and "Classification" in values:  # which old PDAL reads as bits of it
+            values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
+        results.append(PieceResults(mark.piece, rows, values))
     return results
-
-
-def _far_neighbors(
-    places: list[NDArray[np.float64]], most: int, second: int, context: RunContext, tile: tuple[int, int]
-) -> float:
-    """Meters around the tile within which the `most` nearest neighbors of all its points lie, and the `second` of these."""
-    from scipy.spatial import cKDTree
-
-    x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
-    every = np.concatenate(places)
-    xyz = every[:, :3] * context.unit
-    mine = xyz[every[:, 3] < 0]
-    if len(xyz) <= most:
-        return 2 * (x1 - x0)
-    inward = np.min([mine[:, 0] - x0, x1 - mine[:, 0], mine[:, 1] - y0, y1 - mine[:, 1]], axis=0)
-    tree = cKDTree(xyz)
-    beyond = np.zeros(len(xyz))
-    if second:
-        beyond = tree.query(xyz, k=[second + 1], workers=context.threads)[0][:, 0]
-    need = 0.0
-    for start in range(0, len(mine), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
-        away, at = tree.query(mine[part], k=most + 1, workers=context.threads)
-        need = max(need, float(((away + beyond[at]).max(axis=1) - inward[part]).max()))
-    return need
 
 
 # ---- a tile ---------------------------------------------------------------------------------------------------
@@ -381,6 +271,8 @@ class TileTask:
             if everything or need <= halo_m:
                 break
             short = True
+            if math.isinf(need):  # there are too few points
+                need = halo_m + 2 * side
             estimate = read * ((side + 2 * need) / (side + 2 * halo_m)) ** 2
             if attempt == _WIDENINGS or estimate > context.most_points or need > self.complete:
                 break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,19 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
-from ..base.las import extra_dimensions
 from ..base.outputs import check_outputs
 from ..base.report import Report
 from ..classifier import Model, TrainingCloud, train
 from ..classifier.clouds import TiledCloud
-from ..classifier.dimensions import CHECKED
 from ..classifier.summary import FILE_NUMBER
 from ..classifier.training import train_tiles
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden
 from ..pipeline.read import Override
-from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views
 from ..pipeline.training import heights_for, lowered_writer, read_points
 from ..stages.checked import CheckedChoice, Looked
@@ -35,7 +31,7 @@ from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import HOLDS_NOWHERE
 from .inputs import find_sources, read_extent
 from .outputs import NewValues, PieceResults, merged, of_own_points
-from .plan import TilePlan, make_plan
+from .plan import TilePlan, plan_of_files, readers_of
 from .report import TiledRun
 from .run import run_plan
 from .settings import TilingOptions, fits_whole
@@ -43,8 +39,6 @@ from .store import load_arrays, save_arrays, written
 
 #: Memory of a point that is trained on in one piece, voxels and samples' surroundings included.
 TRAIN_POINT = 400
-#: Bytes of a point on the disk at most: as read, with heights, prepared.
-_DISK = 200
 #: Of points that a person checked, and of others of which a base is sure: see :mod:`..stages.checked`.
 _WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 #: Failed tiles that a message names.
@@ -89,24 +83,12 @@ class TrainTask:
 
     def _points(self) -> int:
         """How many points the files have, as their headers tell."""
-        return sum(read_extent(source).count for source in find_sources(self._readers))
+        return sum(read_extent(source).count for source in find_sources(readers_of(self.files)))
 
     @cached_property
     def stage(self) -> ClassifierModel:
         """What trains."""
         return lowered_writer(self._writer)
-
-    @cached_property
-    def _readers(self) -> list[dict[str, Any]]:
-        """One for each kind of input, of all its files."""
-        of_kind: dict[str, list[str]] = {}
-        for name in self.files:
-            of_kind.setdefault("readers.ept" if is_ept(name) else "readers.las", []).append(name)
-        las = {"use_eb_vlr": True}  # of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told
-        return [
-            {"type": kind, "filename": names, **(las if kind == "readers.las" else {})}
-            for kind, names in of_kind.items()
-        ]
 
     def in_one_piece(self) -> bool:
         """Whether all points fit into the memory, those of each survey by themselves, or cannot be cut into tiles.
@@ -167,7 +149,6 @@ class TrainTask:
         clouds: list[TiledCloud] = []
         dimensions: list[str] | None = None
         with TemporaryDirectory(prefix=".pdal-stages-train-", dir=place) as folder:
-            self._check_room(Path(folder))
             for number, task in enumerate(self._each()):
                 made = Path(folder) / f"survey{number}"
                 made.mkdir()
@@ -181,38 +162,15 @@ class TrainTask:
                 training = replace(training, dimensions=tuple(dimensions or ()))
             return train_tiles(clouds, training, Path(folder))
 
-    def _check_room(self, folder: Path) -> None:
-        points = sum(one._points() for one in self._each())
-        free = shutil.disk_usage(folder).free
-        if free < points * _DISK:
-            raise StageError(
-                f"the disk has no room for {points:,} points in tiles, which are kept while training lasts",
-                found=f"{folder.parent}: {free / 1e9:.1f} GB free, up to {points * _DISK / 1e9:.1f} GB needed",
-                cure="Write the model to a disk with more room, or give more --memory",
-            )
-
     def _plan(self, folder: Path, heights: Sequence[Mapping[str, Any]]) -> TilePlan:
-        heads = [{**reader, "filename": reader["filename"][0]} for reader in self._readers]
         tail = {"type": "writers.null", "filename": str(folder / "#.npz")}
         own = [one for one in self.overrides if one.selector != self.stage.type]
-        plan = make_plan(Pipeline([*heads, *map(dict, heights), tail], own, whole=False))
-        files = {reader["type"]: reader["filename"] for reader in self._readers}
-        readers = [{**reader, "filename": files[reader["type"]]} for reader in plan.readers]
+        plan, _ = plan_of_files(self.files, [*map(dict, heights), tail], own)
         numbers: dict[str, int] = {}
         if self.stage.groups == FILE_NUMBER:
             for number, name in enumerate(self.files, 1):
-                kind = "readers.ept" if is_ept(name) else "readers.las"
-                (source,) = find_sources([{"type": kind, "filename": [name]}])
-                numbers[source.path] = number
-        return replace(
-            plan, readers=readers, takes=Taking(self._writer, numbers, self._looks), name=self.model
-        )
-
-    @property
-    def _looks(self) -> bool:
-        """Whether points may have been checked by a person."""
-        known = (is_ept(name) or CHECKED in extra_dimensions(name) for name in self.files)
-        return self.stage.checked_only and any(known)
+                numbers[find_sources(readers_of([name]))[0].path] = number
+        return replace(plan, takes=Taking(self._writer, numbers), name=self.model)
 
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
@@ -289,7 +247,6 @@ class Taking:
 
     writer: Mapping[str, Any]  #: the stage that trains
     numbers: Mapping[str, int]  #: of inputs by path, where points are to have the number of theirs
-    looks: bool  #: whether points may have been checked by a person
 
     def __call__(self, results: list[PieceResults], outputs: list[str], scratch: str) -> dict[str, Any]:
         stage = lowered_writer(self.writer)
@@ -306,7 +263,7 @@ class Taking:
         training = stage.training_on(points)
         marks: dict[str, NDArray] = {}
         looked: dict[str, Any] = {}
-        if self.looks:
+        if stage.checked_only:
             found, counts = stage.looked(points)
             marks, looked = {_WANTED: found.wanted, _SURE: found.sure}, {"looked": counts}
         save_arrays(outputs[0], stage.cloud_of(points, training, marks).arrays)

@@ -1,0 +1,214 @@
+"""The flags of runs in tiles, and what these print."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from ..base.asprs import class_name
+from ..base.errors import OptionError
+from ..base.files import check_writable, write_whole
+from ..base.messages import print_messages
+from ..base.resources import parse_size
+from ..tiling.report import LEFT_ALONE, InterruptedRun, TiledRun
+from ..tiling.settings import PER, TilingOptions
+
+#: Failures printed, and tiles of a dry run.
+_MOST_FAILURES, _MOST_TILES = 20, 50
+#: Flags of tiles and what they are where nothing is said.
+_DEFAULTS: dict[str, Any] = {
+    "memory": None, "workers": None, "scheduler": "", "per": "auto", "buffer": None, "resume": False, "dry_run": False,
+    "report": [],
+}  # fmt: skip
+
+
+def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> None:
+    """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
+    when = "Several inputs, and files too large for memory, are cut into tiles" if survey else "Run in tiles"
+    takes = add_sizes(command, f"{when}; see docs/large-areas.md.")
+    takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
+    takes("--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)")
+    surroundings = "Surroundings for PDAL filters that look at neighbors"
+    takes("--buffer", type=float, metavar="METERS", help=argparse.SUPPRESS if survey else surroundings)
+    takes("--resume", action="store_true", help="Keep what an earlier run in this folder finished")
+    takes("--dry-run", action="store_true", help="Show the tiles and an estimate, then stop")
+    report = "Write a report, .html or .json; may be repeated"
+    takes("--report", action="append", default=[], metavar="FILE", help=report)
+
+
+def add_sizes(
+    command: argparse.ArgumentParser,
+    what: str = "Points that do not fit into the memory are worked on in tiles; the model is the same.",
+) -> Callable:
+    """Add the flags of ``train``, whose only output is a model; returns what adds more."""
+    takes = command.add_argument_group("large areas", what).add_argument
+    side = "Side of the tiles, in the unit of the coordinates; auto takes what the memory allows"
+    takes("--tile", type=_side, metavar="SIZE", help=side)
+    memory = "What all processes together may hold, e.g. 4GB (default: half of what is free)"
+    takes("--memory", metavar="SIZE", help=memory)
+    workers = "Worker processes; 0 runs everything in this process (default: half the cores)"
+    takes("--workers", type=int, metavar="N", help=workers)
+    return takes
+
+
+def _side(text: str) -> float | str:
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"a length or auto, not {text!r}") from None
+
+
+def options_of(options: argparse.Namespace) -> TilingOptions:
+    """What the flags say."""
+    names = {field.name for field in fields(TilingOptions)}
+    chosen = {name: value for name, value in vars(options).items() if name in names}
+    chosen["tile"] = None if options.tile == "auto" else options.tile
+    chosen["memory"] = None if options.memory is None else parse_size(options.memory)
+    return TilingOptions(**chosen)
+
+
+def wants_tiles(options: argparse.Namespace) -> bool:
+    """Whether ``pipeline`` is asked for a run in tiles; other flags of tiles mean nothing without it."""
+    if options.tile is None:
+        for name, default in _DEFAULTS.items():
+            if getattr(options, name) != default:
+                raise OptionError(
+                    f"--{name.replace('_', '-')} needs --tile",
+                    cure="Give the side of the tiles, e.g. --tile 500, or --tile auto",
+                )
+    return options.tile is not None
+
+
+def ran(go: Callable[[], TiledRun]) -> tuple[TiledRun, bool]:
+    """What a run did, and whether it was interrupted."""
+    with interruptible():
+        try:
+            return go(), False
+        except InterruptedRun as stopped:
+            return stopped.run, True
+
+
+@contextmanager
+def interruptible():
+    """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
+    try:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def end_at_once(options: argparse.Namespace) -> None:
+    """Ctrl-C ends the program although PDAL works: Python cannot handle signals meanwhile. The next run sweeps up."""
+    if options.is_program and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def check_reports(options: argparse.Namespace) -> None:
+    """Refuse reports that cannot be written, before any work."""
+    for name in options.report:
+        if Path(name).suffix.lower() not in (".html", ".htm", ".json"):
+            raise OptionError("--report writes .html or .json", found=name)
+        check_writable(name, "report")
+    if options.metadata:
+        check_writable(options.metadata, "metadata")
+
+
+def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
+    """Write reports; the exit code. `again`: of an interrupted run, how to go on."""
+    pages = [name for name in options.report if Path(name).suffix.lower() != ".json"]
+    for name in filter(None, [options.metadata, *options.report]):
+        if name in pages:
+            from ..reports.runpage import write_run_report
+
+            write_run_report(name, run.to_dict())
+        else:
+            write_whole(name, (json.dumps(run.to_dict(), indent=1) + "\n").encode(), "report")
+    if not again:
+        return 1 if run.failures else 0
+    states = run.summary["states"]
+    files = sum(out.state in ("done", "kept") for out in run.outputs)
+    written = f"{files:,} of {counted(len(run.outputs), 'file')} written, " if run.outputs else ""
+    print_messages(
+        f"interrupted; nothing half-written was left. {written}{states['done'] + states['kept']:,} of "
+        f"{counted(len(run.tiles), 'tile')} done. For the rest: {again}"
+    )
+    return 130
+
+
+# ---- what is printed ---------------------------------------------------------------------------------------
+
+
+def print_classes(
+    classes: Mapping[str, int], left_alone: Mapping[str, int], names: Mapping[int, str]
+) -> None:
+    """The points of each class in all files together, and of those that got none."""
+    for code, points in sorted((int(code), points) for code, points in classes.items()):
+        print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
+    for key, what in LEFT_ALONE.items():
+        if left_alone.get(key):
+            print(f"  {what:32s} {left_alone[key]:>12,}")
+
+
+def print_run(run: TiledRun) -> None:
+    """What a run did."""
+    s = run.summary
+    lines = []
+    if run.outputs:
+        files = Counter(out.state for out in run.outputs)
+        lines.append(f"{counted(files['done'], 'file')} written{_others(files)}")
+    lines.append(f"{counted(s['states']['done'], 'tile')} done{_others(s['states'])}")
+    lines.append(f"{s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)")
+    print("; ".join(lines))
+    if s["dropped"]:
+        print(f"{s['dropped']:,} points were dropped by filters of the pipeline")
+    print_messages(*run.messages)
+    _print_failures(run)
+    if run.failures:
+        print_messages("run it again with --resume to try only what failed")
+
+
+def _others(states: Mapping[str, int]) -> str:
+    told = {"kept": "kept from an earlier run", "failed": "failed"}
+    return "".join(f", {states[state]:,} {what}" for state, what in told.items() if states.get(state))
+
+
+def _print_failures(run: TiledRun) -> None:
+    failures = run.failures
+    print_messages(*(f"{what}: {reason}" for what, reason in failures[:_MOST_FAILURES]))
+    if len(failures) > _MOST_FAILURES:
+        print_messages(f"and {len(failures) - _MOST_FAILURES:,} more; see --report")
+
+
+def print_dry(run: TiledRun) -> None:
+    """What a run would do."""
+    s = run.summary
+    workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
+    print(f"{counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it")
+    print(f"{counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
+    print(f"about {s['points_read_by_a_tile']:,} points read for a tile")
+    print(f"up to {s['memory_mb_of_a_worker']:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
+    print(f"about {s['disk_gb']:,.2f} GB of disk beside the outputs")
+    for job in run.tiles[:_MOST_TILES]:
+        print(f"  {job.name}")
+    if len(run.tiles) > _MOST_TILES:
+        print(f"  and {len(run.tiles) - _MOST_TILES} more")
+    print_messages(*run.messages)
+    _print_failures(run)
+
+
+def counted(count: int, word: str) -> str:
+    """A number of things, in words."""
+    return f"{count:,} {word}{'s' * (count != 1)}"
