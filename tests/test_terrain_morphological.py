@@ -508,7 +508,7 @@ def test_the_stage_declares_what_it_makes_and_how_far_it_looks():
         StageError, match=r"filters\.hag_morphological.*'window' must not be more than 300 cells"
     ):
         HagMorphological({"cell": 0.2})
-    with pytest.raises(StageError, match="'openings' must list widths in meters"):
+    with pytest.raises(StageError, match="'openings' must be a number"):
         HagMorphological({"openings": "five"})
 
 

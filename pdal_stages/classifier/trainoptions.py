@@ -104,7 +104,7 @@ class TrainingOptions:
     )
     thin: Sequence[float] = setting(
         (),
-        "list",
+        "numbers",
         "Points per square meter of sparser copies to train on as well, so that the model bears sparse clouds",
     )
     voxel: float = setting(

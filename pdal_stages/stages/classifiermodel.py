@@ -168,7 +168,6 @@ classes.
             values["dimensions"] = ALWAYS
         values["ignore"] = self.ignore.codes
         values["base"] = None if self.base is None else loaded_model(self.base)
-        values["thin"] = [_number(v) if isinstance(v, str) else v for v in values["thin"]]
         return TrainingOptions(**values, memory_mb=self.memory)
 
     @property

@@ -9,7 +9,7 @@ from ..base.asprs import NOISE
 from ..terrain.detached import REACH, detached_noise
 from .base import ClassStage, Stage
 from .options import ignore_option, option
-from .points import Points
+from .points import Points, class_counts
 from .selection import Selection
 
 
@@ -78,10 +78,8 @@ marks of the whole cloud. The counts are in the metadata as `low` and `high`.
             found[~points.mask] = 0
         codes = points.class_codes.copy()
         for name, code, given in zip(("low", "high"), NOISE, (self.low_class, self.high_class), strict=True):
-            marked = found == code
-            codes[marked] = given
-            points.report.figures[name] = int(np.count_nonzero(marked))
-            if points.report.figures[name]:
-                classes = points.report.figures.setdefault("classes", {})
-                classes[str(given)] = classes.get(str(given), 0) + points.report.figures[name]
+            codes[found == code] = given
+            points.report.figures[name] = int(np.count_nonzero(found == code))
+        if found.any():
+            points.report.figures["classes"] = class_counts(codes[found != 0])
         return {"Classification": points.with_codes(codes)}

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError
 from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
 from .base import HEIGHTS_OUTSIDE, Stage
 from .options import ignore_option, option
@@ -54,11 +53,7 @@ the unit of Z.
     example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}
 
     def check(self) -> None:
-        try:
-            check_sizes(self.cell, self.resolution)
-        except OptionError as error:
-            error.what = f"option {error.what}"
-            raise
+        check_sizes(self.cell, self.resolution)
 
     def creates(self) -> dict[str, str]:
         return {"HeightAboveGround": "float"}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError
 from ..terrain.cells import lowest_of_cells
 from ..terrain.decks import level_points
 from ..terrain.groundblocks import GroundCells, by_block, cells_of_block, reach_of_block
@@ -92,8 +92,8 @@ class HagMorphological(Stage):
         "boolean", False, "Also write Ground: 1 where the filter calls the point ground, else 0"
     )
     terrain_slope: bool = option("boolean", False, "Also write Slope: the terrain's, in degrees")
-    openings: list = option(
-        "list",
+    openings: list[float] = option(
+        "numbers",
         (),
         "Also write heights above openings of the minimum grid with windows of these widths in meters, e.g. 5,9,17,33,65: "
         "HeightAboveOpening_5, ...",
@@ -135,29 +135,19 @@ of Z.
     example = {"type": "filters.hag_morphological", "ground": True}
 
     def check(self) -> None:
-        try:
-            self.windows = [float(size) for size in self.openings]
-        except ValueError:
-            raise OptionError(
-                "option 'openings' must list widths in meters", found=", ".join(map(str, self.openings))
-            ) from None
-        try:
-            check_sizes(self.cell, self.slope, self.window, self.threshold, self.scalar, self.windows)
-        except OptionError as error:
-            error.what = f"option {error.what}"
-            raise
+        check_sizes(self.cell, self.slope, self.window, self.threshold, self.scalar, self.openings)
 
     def creates(self) -> dict[str, str]:
         return {
             "HeightAboveGround": "float",
             **({"Ground": "uint8_t"} if self.ground else {}),
             **({"Slope": "float"} if self.terrain_slope else {}),
-            **dict.fromkeys(opening_names(self.windows), "float"),
+            **dict.fromkeys(opening_names(self.openings), "float"),
             **({"Deck": "uint8_t"} if self.decks else {}),
         }
 
     def halo_m(self) -> float:
-        return reach(cell=self.cell, window=self.window, openings=self.windows, decks=self.decks)
+        return reach(cell=self.cell, window=self.window, openings=self.openings, decks=self.decks)
 
     #: In tiles: what :meth:`made_of_blocks` gave.
     from_blocks: GroundCells | None = None
@@ -170,15 +160,7 @@ of Z.
 
     @cached_property
     def _filter(self) -> FilterOptions:
-        return FilterOptions(
-            self.cell,
-            self.slope,
-            self.window,
-            self.threshold,
-            self.scalar,
-            tuple(self.windows),
-            self.decks,
-        )
+        return FilterOptions(**{one.name: self.options[one.name] for one in fields(FilterOptions)})
 
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """First, the points (n, 3) that blocks need: ``around`` them, and inside each (:func:`inside_block`)."""
@@ -208,7 +190,7 @@ of Z.
 
     def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
         """At last, :attr:`from_blocks` out of these arrays of the blocks that a box touches."""
-        return GroundCells.of_blocks(blocks, len(self.windows))
+        return GroundCells.of_blocks(blocks, len(self.openings))
 
     def run(self, points: Points) -> dict[str, NDArray]:
         usable = points.usable(self.ignore)
@@ -223,7 +205,7 @@ of Z.
             window=self.window,
             threshold=self.threshold,
             scalar=self.scalar,
-            openings=self.windows,
+            openings=self.openings,
             slope_too=self.terrain_slope,
             decks=self.decks,
             threads=self.threads,

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import strictjson
-from ..base.errors import OptionError, StageError
+from ..base.errors import OptionError
 from ..base.files import write_whole
 from ..base.outputs import JSON, Output
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.neighborhoods import parse_neighborhoods
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage
@@ -92,17 +91,8 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
         return [name for name in self.plan.names if name not in self.plan.dimensions]
 
     def check(self) -> None:
-        option = "neighborhoods"
-        try:
-            parse_neighborhoods(self.neighborhoods)
-            option = "feature_set"
-            names = self.columns
-        except StageError as error:
-            raise OptionError(
-                f"option '{option}': {error.what}", found=error.found, cure=error.cure
-            ) from None
         check_side(self.voxel)
-        for name in names:
+        for name in self.columns:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(
                     f"the dimension name '{name}' is longer than the {_NAME_BYTES} bytes LAS allows",
@@ -184,8 +174,6 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
         return None, None
     try:
         content = strictjson.loads(Path(path).read_bytes())
-        if missing := {"bins", "copt_threshold"} - set(content):
-            raise ValueError(f"without {' and '.join(sorted(missing))}")
         bins, threshold = content["bins"], content["copt_threshold"]
         return (
             ShapeBins.from_dict(bins) if bins is not None else None,

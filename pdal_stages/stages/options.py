@@ -28,6 +28,7 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
     "list": _LISTED,
     "codes": _LISTED,
     "selection": _LISTED,
+    "numbers": _LISTED,
     "bands": _LISTED,
     "mapping": (["object", "string"], 'a mapping such as {"2": "Ground"}'),
 }
@@ -39,7 +40,7 @@ class Option:
 
     #: A key of ``_KINDS``. ``list`` is a JSON list or comma-separated text; ``codes`` a list of class codes, or of
     #: ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the same, of other dimensions too; ``bands`` two
-    #: heights.
+    #: heights in meters, the lower one first.
     kind: str
     #: The value where the option is absent; None means "decided by the stage".
     default: Any
@@ -127,6 +128,9 @@ class Option:
                 f"({', '.join(map(str, self.default))})",
             )
         return list(value)
+
+    def _parse_numbers(self, value: Any) -> list[float]:
+        return [self._parse_number(one) for one in self._parse_list(value)]
 
     def _parse_bands(self, value: Any) -> tuple[float, float] | None:
         return bands(self._parse_list(value))

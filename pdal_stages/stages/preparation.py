@@ -127,17 +127,13 @@ def _value(option: Option, value: Any) -> Any:
     if option.kind == "selection":
         items = split_list(value) if isinstance(value, str) else value if isinstance(value, list) else [value]
         return [str(one).strip() for one in items]
-    if option.kind == "list":
+    if option.kind == "numbers":
         return [_number(one) for one in parsed]
-    return _number(parsed) if option.kind in ("number", "integer") else parsed
+    return _number(parsed) if option.kind == "number" else parsed
 
 
-_any_number = Option("number", None, "", name="openings")
-
-
-def _number(value: Any) -> int | float:
-    found = _any_number.parse(value)
-    return int(found) if found == int(found) else found
+def _number(value: float) -> int | float:
+    return int(value) if value == int(value) else value
 
 
 def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
