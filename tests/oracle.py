@@ -154,11 +154,6 @@ def surfaces(xyz, q, k):
     return dict(zip(SURFACES, values, strict=True)), min(gap, *(g for _, _, g in found))
 
 
-def of_cylinder(xyz, q, radius):
-    """Features of a cylinder."""
-    return features(cylinder(xyz, q, radius), math.pi * radius**2, q)
-
-
 def of_sphere(xyz, q, radius):
     """Features of a sphere."""
     return features(sphere(xyz, q, radius), 4.0 / 3.0 * math.pi * radius**3, q)
@@ -195,24 +190,6 @@ def kopt(xyz, q, k_min=10, k_max=100, cap=math.inf):
     return points[:size], float(distance[size - 1]), entropies
 
 
-def ropt_radii(r_min=0.25, r_max=2.0, step=0.05):
-    """The radii tried: r_min, r_min + step, ... up to r_max, rounded to nanometers."""
-    count = math.floor((r_max - r_min) / step + 1e-9) + 1
-    return [round(r_min + i * step, 9) for i in range(count)]
-
-
-def ropt(xyz, q, r_min=0.25, r_max=2.0, step=0.05, least=10):
-    """Members, radius and all entropies of the radius with the lowest eigenentropy [H17].
-
-    A radius that holds fewer than `least` points is not a candidate.
-    """
-    radii = ropt_radii(r_min, r_max, step)
-    spheres = [sphere(xyz, q, r) for r in radii]
-    entropies = [entropy(members) if len(members) >= least else math.inf for members in spheres]
-    r = radii[_first_lowest(entropies)]
-    return sphere(xyz, q, r), r, entropies
-
-
 def curvature(xyz, q, radius=1.0, least=10):
     """Surface variation at `radius`, 1/3 where there are fewer than `least` points [H17 eq. 1]."""
     if len(sphere(xyz, q, radius)) < least:
@@ -234,15 +211,6 @@ def copt_threshold(curvatures):
         low, high = new
     upper = abs(c - high) < abs(c - low)
     return float(low + (high - low) * np.count_nonzero(upper) / len(c))
-
-
-def copt(xyz, q, threshold):
-    """Members and radius of the curvature-adaptive neighborhood [H17]."""
-    if curvature(xyz, q) >= threshold:
-        members, radius, _ = kopt(xyz, q, 10, 50, cap=3.0)
-    else:
-        members, radius, _ = ropt(xyz, q, 0.5, 2.0, 0.05)
-    return members, radius
 
 
 # ---- shape distributions -----------------------------------------------------------------------------------

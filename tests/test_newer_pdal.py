@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import metadata as packages
-
 import laspy
 import numpy as np
 import pytest
@@ -21,13 +19,6 @@ def needs(*version: int) -> None:
     if pdal_env.version() < version:
         wanted, found = (".".join(map(str, v)) for v in (version, pdal_env.version()))
         pytest.skip(f"needs PDAL {wanted}, found {found}")
-
-
-def needs_bindings(*version: int) -> None:
-    """Skip below a version of python-pdal."""
-    found = packages.version("pdal")
-    if tuple(int(n) for n in found.split(".")[:2]) < version:
-        pytest.skip(f"needs the bindings python-pdal {'.'.join(map(str, version))}, found {found}")
 
 
 def scene(n=2000, seed=3):

@@ -27,7 +27,7 @@ allpairs = pytest.importorskip("allpairspy").AllPairs
 
 pytestmark = pytest.mark.pdal
 #: Rows that run without --all-pairs.
-FIRST = 12
+FIRST = 9
 VALUES = {
     "input": ["las 1.2", "las 1.4", "laz 1.4", "copc", "feet", "several", "gaps", "noise unlabeled"],
     "door": ["classify", "pipeline", "objects", "stock"],

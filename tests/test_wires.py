@@ -179,7 +179,6 @@ def test_a_corridor(data_dir):
 @pytest.mark.parametrize(
     "name",
     [
-        "forest/neon_osbs.laz",
         "isprs_filter/samp31.laz",
         "seville/plazanueva.laz",
     ],
