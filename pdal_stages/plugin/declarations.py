@@ -15,9 +15,7 @@ _KINDS = {
     "number": "Number",
     "integer": "Integer",
     "boolean": "Boolean",
-    "list": "List",
-    "codes": "List",
-    "selection": "List",
+    **dict.fromkeys(("list", "numbers", "bands", "codes", "selection"), "List"),
 }
 
 _HEADER = """\
