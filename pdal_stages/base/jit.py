@@ -8,13 +8,15 @@ that it calls. Compiled code is cached at first use rather than shipped, because
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import sys
 import threading
 from collections.abc import Callable
 from functools import lru_cache, update_wrapper
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from .errors import DependencyError
 from .progress import Progress
@@ -28,8 +30,6 @@ _ERRORS = {"error_model": "numpy"}
 #: Kernels and device functions, and what each was made of.
 _functions: dict[Any, Callable] = {}
 
-#: Device functions that numba has not heard of yet, with their options.
-_unregistered: list[tuple[Callable, dict[str, Any]]] = []
 _lock = threading.RLock()
 
 
@@ -43,6 +43,8 @@ class Kernel:
         _functions[self] = function
 
     def __call__(self, *arguments: Any) -> Any:
+        if "no_cpython_wrapper" in self._options:
+            return self._function(*arguments)
         return (self._dispatcher or self.dispatcher)(*arguments)
 
     @property
@@ -51,9 +53,6 @@ class Kernel:
         with _lock:
             if self._dispatcher is None:
                 numba = _numba()
-                while _unregistered:
-                    function, options = _unregistered.pop()
-                    numba.extending.register_jitable(**options)(function)
                 try:
                     made = numba.njit(**self._options)(self._function)
                 except RuntimeError:  # no folder for the cache can be written
@@ -82,16 +81,12 @@ def device(function: Callable | None = None, **options):
 
     That entry would take as long to compile as many a function. Where Python calls it, it runs as it is written.
     """
-    if function is None:
-        return lambda f: device(f, **options)
-    _functions[function] = function
-    _unregistered.append((function, {**_ERRORS, **options}))
-    return function
+    return njit(function, cache=False, no_cpython_wrapper=True, **options)
 
 
 def _numba() -> Any:
     try:
-        import numba.extending
+        import numba
     except ValueError as error:  # of an environment variable of its own
         raise DependencyError(
             "numba cannot be started",
@@ -100,8 +95,28 @@ def _numba() -> Any:
         ) from None
     import numba.core.event
 
+    absent = _NoLinearAlgebra(threading.get_ident())
+    sys.meta_path.insert(0, absent)
+    try:
+        with contextlib.suppress(ImportError):  # of a numba that is built otherwise
+            import numba.np.arraymath
+    finally:
+        sys.meta_path.remove(absent)
     Compiling.listen(numba.core.event)
     return numba
+
+
+class _NoLinearAlgebra(NamedTuple):
+    """A finder by which one thread does not find SciPy's linear algebra.
+
+    numba loads it to see whether it is there, a tenth of a small job, and asks that for ``np.correlate`` alone.
+    """
+
+    thread: int
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
+        if name == "scipy.linalg" and threading.get_ident() == self.thread:
+            raise ImportError(name)
 
 
 @lru_cache(maxsize=256)

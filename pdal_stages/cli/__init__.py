@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
+import gc
 import importlib
 import os
 import re
@@ -36,8 +38,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
     arguments = [word for word in arguments if word != "--debug"]
-    if argv is None:  # these threads spin while they wait, for next to nothing
+    if argv is None:
+        # Those threads spin while they wait, for next to nothing.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        gc.set_threshold(100_000)  # imports alone make more objects than Python looks through, over and over
+        atexit.register(gc.freeze)  # nor need it look for what to free when the process ends
     streams = sys.stdout, sys.stderr
     for stream in streams:  # a locale that lacks a character shows its code, rather than ending the run
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
