@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import re
 import textwrap
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import DependencyError, OptionError, PipelineError, suggest
+from ..base.errors import DependencyError, PipelineError, suggest
 from . import Parser
 
 #: Of what ``commands`` says as JSON: changes where a reader must.
@@ -152,7 +152,14 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
         "models": list(shipped()),
         "classes": {str(code): {"name": name, "color": class_color(code)} for code, name in NAMES.items()},
         "commands": {
-            name: {"help": parser.description, "arguments": [_argument(one) for one in _arguments(parser)]}
+            name: {
+                "help": parser.description,
+                "arguments": [
+                    _argument(one)
+                    for one in parser._actions
+                    if one.help != argparse.SUPPRESS and one.dest != "help"
+                ],
+            }
             for name, parser in commands.items()
         },
         "stages": {
@@ -161,10 +168,6 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
         },
     }
     return json.dumps(answer, indent=1)
-
-
-def _arguments(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    return [one for one in parser._actions if one.help != argparse.SUPPRESS and one.dest != "help"]
 
 
 def _argument(action: argparse.Action) -> dict[str, Any]:
@@ -189,16 +192,9 @@ def _argument(action: argparse.Action) -> dict[str, Any]:
 def _option(stage: Any, option: Any) -> dict[str, Any]:
     default = option.default
     return {
-        "name": option.name,
-        "kind": option.kind,
+        **asdict(option),
         "help": stage.where_help or option.help if option.name == "where" else option.help,
         "default": ",".join(map(str, default)) if isinstance(default, tuple) else default,
-        "choices": list(option.choices),
-        "minimum": option.minimum,
-        "maximum": option.maximum,
-        "exclusive": option.exclusive,
-        "unit": option.unit,
-        "required": option.required,
     }
 
 
@@ -231,11 +227,7 @@ def _plugin(options: argparse.Namespace) -> int:
 def _demo(options: argparse.Namespace) -> None:
     from ..synthetic.demo import run_demo
 
-    try:
-        run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
-    except OptionError as error:
-        error.what = re.sub(r"^'(\w+)'", r"'--\1'", error.what)
-        raise
+    run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
 
 
 def _warmup(options: argparse.Namespace) -> None:

@@ -77,7 +77,22 @@ def _pipeline(options: argparse.Namespace) -> int:
         return _in_tiles(options)
     if options.validate:
         return _validate(options)
-    print_messages(*executed(options, _built(options)))
+    pipeline, metadata = _built(options), options.metadata
+    more = [Output(options.log, "log")] if options.log else []
+    pipeline.check_outputs(*more, *([Output(metadata, "metadata", JSON)] if metadata else []))
+    before = list(pipeline.expanded.warnings)
+    print_messages(*before)
+    tiles.end_at_once(options)
+    pipeline.execute(arrays=False, loglevel=_LEVELS.get(options.verbose, logging.DEBUG))
+    # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
+    lines = pipeline.log_lines
+    shown = lines if options.verbose > 1 else lines[:_LOG_LINES]
+    print_messages(*(f"PDAL says: {line}" for line in shown))
+    if len(lines) > len(shown):
+        print_messages(f"PDAL says {len(lines) - len(shown):,} more lines; -v 2 shows them")
+    if metadata:
+        write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
+    print_messages(*(line for line in pipeline.messages if line not in before))
     return 0
 
 
@@ -96,25 +111,6 @@ def _in_tiles(options: argparse.Namespace) -> int:
     run, interrupted = tiles.ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
     tiles.print_dry(run) if options.dry_run else tiles.print_run(run)
     return tiles.end_run(options, run, "run it again with --resume" if interrupted else "")
-
-
-def executed(options: argparse.Namespace, pipeline: Pipeline) -> list[str]:
-    """Run a pipeline in this process; what PDAL and stages said."""
-    metadata, verbose = getattr(options, "metadata", None), getattr(options, "verbose", 1)
-    more = [Output(options.log, "log")] if options.log else []
-    pipeline.check_outputs(*more, *([Output(metadata, "metadata", JSON)] if metadata else []))
-    before = list(pipeline.expanded.warnings)
-    print_messages(*before)
-    tiles.end_at_once(options)
-    pipeline.execute(arrays=False, loglevel=_LEVELS.get(verbose, logging.DEBUG))
-    # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
-    lines = pipeline.log_lines
-    messages = [f"PDAL says: {line}" for line in (lines if verbose > 1 else lines[:_LOG_LINES])]
-    if len(lines) > _LOG_LINES and verbose <= 1:
-        messages.append(f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v 2 shows them")
-    if metadata:
-        write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
-    return messages + [line for line in pipeline.messages if line not in before]
 
 
 def _expand(options: argparse.Namespace) -> None:

@@ -267,7 +267,7 @@ class Survey:
 
     def _unit(self, plan: TilePlan) -> float:
         """Meters per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
-        needed = bool(plan.head and plan.halo_m)
+        needed = bool(plan.head and plan.sees_m)
         of_kind: dict[str, Reference] = {}  # PDAL is asked once for inputs that say the same
         found: dict[str, Reference] = {}
         for source in self.sources:

@@ -241,13 +241,6 @@ class TileGrid:
         where += coordinate >= (where + 1.0) * self.size
         return where.astype(np.int64)
 
-    def only(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[int, int] | None:
-        """The tile that all of some points lie in; None where they lie in several, or there are none."""
-        if not len(x):
-            return None
-        (i, east), (j, north) = (self.index(np.array([v.min(), v.max()])).tolist() for v in (x, y))
-        return (i, j) if i == east and j == north else None
-
     def box(self, tile: tuple[int, int], halo_units: float = 0.0) -> Box:
         """(min x, min y, max x, max y) of a tile, grown by as much on each side."""
         i, j = tile

@@ -86,15 +86,14 @@ def run_head(
         begin = first.at
         for mark, changed in zip(marks, before.changed, strict=True):
             mark.changed = changed
-    from_afar = None
-    # Numbers of open-ended stages: meters outside the tile within which their results are used.
-    reaches: dict[int, float] = {}
     needs = [0.0]
     views: list[dict[str, NDArray]] = []  # of the tile's own points: far less than all arrays of all points
 
-    def reach(number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+    def reach(
+        number: int, used_m: float, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
+    ) -> None:
         points = points_of(ours[number].stage, module, ins)
-        wanted = ins[OUTSIDE] <= reaches[number] if reaches[number] > 0 else ins[OUTSIDE] < 0
+        wanted = ins[OUTSIDE] <= used_m if used_m > 0 else ins[OUTSIDE] < 0
         box = [side * points.units.horizontal for side in context.grid.box(tile)]
         needs.append(ours[number].stage.reach_of(points, wanted, box))
 
@@ -109,12 +108,9 @@ def run_head(
         begins = len(stages)
         for number in range(begin, len(plan.head)):
             stages.append(_with_threads(plan.head[number], context.threads))
-            if before is not None and first is not None and number == first.at:
-                from_afar = len(stages) - 1
             kind = registry.stages().get(stages[-1]["type"])
             if kind is not None and kind.open_ended and not everything:
-                reaches[len(stages) - 1] = plan.later[number]
-                stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
+                stages.append(callbacks.filter(partial(reach, len(stages) - 1, plan.later[number])))
         stages += [callbacks.filter(function) for function in (take, last) if function is not None]
         stages[begins]["inputs"] = [f"mark{number}" for number in range(len(marks))]
         pipeline = Pipeline(stages, whole=False)
@@ -125,8 +121,9 @@ def run_head(
         )
         for one in ours.values():
             one.stage.own_points = OUTSIDE
-            if before is not None and one.number == from_afar and isinstance(one.stage, HagMorphological):
-                one.stage.from_blocks = before.blocks
+        if before is not None:  # of the first one alone
+            far = next(one.stage for one in ours.values() if isinstance(one.stage, HagMorphological))
+            far.from_blocks = before.blocks
         pipeline.execute(arrays=False)
     reports = [report for _, reports in pipeline.reports for report in reports if report.beyond_halo]
     if reports and not everything:
