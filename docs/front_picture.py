@@ -16,7 +16,7 @@ import laspy
 import numpy as np
 
 from pdal_stages.cli import main as command
-from pdal_stages.reports.views import top_view, write_png
+from pdal_stages.reports.views import CLASS_COLORS, paint, shading, surface, write_png
 
 TARGET = Path(__file__).resolve().parent / "pictures" / "raw-and-classified.png"
 GAP = 24  # pixels between the halves
@@ -33,10 +33,12 @@ def picture(folder: Path, width: int = 620) -> np.ndarray:
         np.concatenate([np.asarray(getattr(cloud, name)) for cloud in clouds])
         for name in ("x", "y", "z", "classification")
     )
-    # East up, so that the row of tiles lies
-    raw = top_view(y, -x, z, values=np.full(len(z), np.nan), limits=(0, 1), width=width)
-
-    classified = top_view(y, -x, z, classes, width=width)
+    seen = surface(y, -x, z, width)  # east up, so that the row of tiles lies
+    light = shading(seen)
+    raw, classified = (
+        paint(seen, colors, light)
+        for colors in (np.full((*light.shape, 3), 150), CLASS_COLORS[seen.spread(classes, 0)])
+    )
     return np.concatenate([raw, np.full((len(raw), GAP, 3), 255, np.uint8), classified], axis=1)
 
 

@@ -13,14 +13,16 @@ from PIL import Image
 from pdal_stages.base.asprs import class_color
 from pdal_stages.base.errors import StageError
 from pdal_stages.reports import views
-from pdal_stages.reports.raster import BACKGROUND, shading, surface
 from pdal_stages.reports.views import (
+    BACKGROUND,
+    CLASS_COLORS,
     RIGHT,
     WRONG,
     nice_step,
+    paint,
     png,
-    ramp,
-    top_view,
+    shading,
+    surface,
     triptych,
     verdict,
     write_png,
@@ -35,6 +37,12 @@ def has_color(image: np.ndarray, color) -> bool:
 def even_light(monkeypatch):
     """No shading: colors come out as they are."""
     monkeypatch.setattr(views, "shading", lambda s: np.ones(s.z.shape))
+
+
+def top_view(x, y, z, classes, width):
+    """Classes from above, unshaded."""
+    s = surface(x, y, z, width)
+    return paint(s, CLASS_COLORS[s.spread(classes, 0)], np.ones(s.z.shape))
 
 
 def block(n=40, step=0.5):
@@ -66,7 +74,7 @@ def test_a_file_appears_whole(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_north_is_up_and_east_is_right(even_light):
+def test_north_is_up_and_east_is_right():
     x, y, z = block()
     classes = np.where(y > 10, np.where(x > 10, 5, 6), np.where(x > 10, 9, 2))
     image = top_view(x, y, z, classes, width=200)
@@ -75,13 +83,13 @@ def test_north_is_up_and_east_is_right(even_light):
         assert tuple(image[row, column]) == class_color(code)
 
 
-def test_the_highest_point_wins(even_light):
+def test_the_highest_point_wins():
     x, y, z = block()
     low = top_view(np.r_[x, x], np.r_[y, y], np.r_[z + 5, z], np.r_[z + 6, z + 2].astype(int), width=150)
     assert has_color(low, class_color(6)) and not has_color(low, class_color(2))
 
 
-def test_gaps_close_but_holes_stay(even_light):
+def test_gaps_close_but_holes_stay():
     rng = np.random.default_rng(1)
     x, y = rng.uniform(0, 100, (2, 20_000))
     keep = (np.abs(x - 50) > 10) | (np.abs(y - 50) > 10)
@@ -105,7 +113,7 @@ def test_pictures_of_anything(n, wide, tall, seed, origin):
     codes = rng.integers(0, 256, (2, n))
     image = triptych(x, y, z, codes[0], codes[1], width=400)
     assert image.shape[1] <= 403 and image.dtype == np.uint8
-    assert top_view(x, y, z, width=100).shape[0] <= 252
+    assert surface(x, y, z, 100).z.shape[0] <= 252
 
 
 def test_points_that_are_not_finite_are_left_out():
@@ -115,16 +123,6 @@ def test_points_that_are_not_finite_are_left_out():
     for bad in (np.nan, np.inf, -np.inf):
         more = np.r_[x, bad, 1, 1], np.r_[y, 1, bad, 1], np.r_[z, 1, 1, bad]
         assert np.array_equal(clean, top_view(*more, np.r_[codes, 6, 6, 6], width=120))
-
-
-def test_values_take_the_ramp_and_nan_is_gray(even_light):
-    x, y, z = block()
-    value = np.where(x > 10, 1.0, 0.0)
-    value[0] = np.nan
-    image = top_view(x, y, z, values=value, width=200, limits=(0, 1))
-    low, high = ramp(np.array([0.0, 1.0]), (0, 1))
-    assert tuple(image[50, 10]) == tuple(low) and tuple(image[50, -10]) == tuple(high)
-    assert tuple(image[-1, 0]) == (150, 150, 150)
 
 
 def test_shading_lights_slopes_that_face_the_sun():
@@ -165,12 +163,7 @@ def test_nice_step(step):
 
 def test_what_cannot_be_drawn_is_told():
     x, y, z = block()
-    for what, arrays in {
-        "finite": (x * np.nan, y, z),
-        "one value per point": (x, y, z, np.zeros(3, int)),
-        "0 to 255": (x, y, z, np.full(x.size, 300)),
-    }.items():
-        with pytest.raises(StageError, match=what):
-            top_view(*arrays)
+    with pytest.raises(StageError, match="finite"):
+        surface(x * np.nan, y, z, 100)
     with pytest.raises(StageError, match="width"):
-        top_view(x, y, z, width=3)
+        surface(x, y, z, 3)

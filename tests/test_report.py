@@ -216,7 +216,7 @@ def test_degenerate_clouds(xyz, maps):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"xyz": np.zeros((2, 3))}, "no reference and no predicted"),
+        ({"xyz": np.zeros((2, 3))}, "the reference must be one label per point"),
         ({"xyz": np.zeros((2, 2)), "reference": [2, 2], "predicted": [2, 2]}, "n x 3"),
         ({"xyz": [[0, 0, np.nan], [1, 1, 1]], "reference": [2, 2], "predicted": [2, 2]}, "1 of 2 points"),
     ],

@@ -1,9 +1,8 @@
 """Heights above the coarse terrain of 20 m minima, from above."""
 
-from _common import save, town
+from _common import save, top_view, town
 
 import pdal_stages as ps
-from pdal_stages.reports.views import top_view
 
 points = town()
 height = ps.hag_minima(points.x, points.y, points.z)

@@ -1,10 +1,9 @@
 """Three features of one neighborhood: what lines, planes and walls look like to the classifier."""
 
 import numpy as np
-from _common import save, town
+from _common import save, top_view, town
 
 import pdal_stages as ps
-from pdal_stages.reports.views import top_view
 
 points = town()
 table = ps.compute_features(points.xyz, neighborhoods="s2", feature_set="Linearity,Planarity,Verticality")

@@ -1,10 +1,9 @@
 """One feature at three scales: SurfaceVariation in cylinders of 1, 2 and 5 m."""
 
 import numpy as np
-from _common import save, town
+from _common import save, top_view, town
 
 import pdal_stages as ps
-from pdal_stages.reports.views import top_view
 
 points = town()
 table = ps.compute_features(points.xyz, neighborhoods="c1,c2,c5", feature_set="SurfaceVariation")

@@ -1,10 +1,9 @@
 """Where the classifier is in doubt: reliability from above, and the share of errors among doubtful points."""
 
 import numpy as np
-from _common import halves, save, town
+from _common import halves, save, top_view, town
 
 import pdal_stages as ps
-from pdal_stages.reports.views import top_view
 
 points = town(seed=2)
 west, east = halves(points)

@@ -1,10 +1,9 @@
 """Binary detection: buildings against everything else, learned in one town, found in another."""
 
 import numpy as np
-from _common import save, town
+from _common import save, top_view, town
 
 import pdal_stages as ps
-from pdal_stages.reports.views import top_view
 
 
 def with_height(points):

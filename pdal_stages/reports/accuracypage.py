@@ -19,8 +19,7 @@ from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
 from .page import render
-from .raster import paint, shading, surface
-from .views import IGNORED, RIGHT, WRONG, embedded, nice_step, verdict
+from .views import IGNORED, RIGHT, WRONG, embedded, nice_step, paint, shading, surface, verdict
 
 #: Files within so many meters share a map, and places that are drawn at most.
 TOGETHER, DRAWN = 1000.0, 12
@@ -103,20 +102,12 @@ def write_accuracy_report(
     StageError
         Arrays of different lengths, coordinates that are not numbers, or a file that cannot be written.
     """
-    scenes: list[tuple[str, dict[str, Any]]] = []
-    given = {"xyz": xyz, "reference": reference, "predicted": predicted}
-    if any(values is not None for values in given.values()):
-        if missing := [name for name, values in given.items() if values is None]:
-            raise StageError(
-                "maps need coordinates and both classifications",
-                where="accuracy report",
-                found="no " + " and no ".join(missing),
-                cure="Give 'xyz', 'reference' and 'predicted', or none of them",
-            )
-        scenes = [("", _maps(accuracy, xyz, reference, predicted))]
-    for one in places[:DRAWN]:
-        drawn = _maps(accuracy, one.xyz, one.reference, one.predicted)
-        scenes.append((one.name if len(places) > 1 else "", drawn))
+    if xyz is not None:
+        places = [Place("", np.asarray(xyz), np.asarray(reference), np.asarray(predicted))]
+    scenes = [
+        (one.name if len(places) > 1 else "", _maps(accuracy, one.xyz, one.reference, one.predicted))
+        for one in places[:DRAWN]
+    ]
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
     page = render(
         "accuracy.html",

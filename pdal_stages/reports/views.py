@@ -1,4 +1,7 @@
-"""Pictures of a cloud from above, by class, height, value or error, and PNG files of them."""
+"""Pictures of a cloud from above, and PNG files of them.
+
+Of each pixel the highest point is shown; gaps are closed from the nearest, and relief is shaded.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import base64
 import io
 import math
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +21,16 @@ from scipy import ndimage
 from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
-from .raster import BACKGROUND, Surface, paint, shading, surface
 
 RIGHT, WRONG, IGNORED = (196, 196, 192), (204, 24, 32), (232, 232, 228)
 #: The color of each class code, (256, 3) uint8.
 CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
-#: Color ramps, as a few anchors: heights like a tinted map; values dark to bright with even lightness.
-_RAMPS = {
-    "height": (
-        (38, 84, 106), (62, 128, 112), (132, 170, 104), (208, 200, 130), (206, 152, 98), (172, 102, 84), (233, 204, 186)
-    ),
-    "value": ((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132), (122, 209, 81), (253, 231, 37)),
-}  # fmt: skip
+#: Heights like a tinted map, as a few anchors.
+_TINTS = (
+    (38, 84, 106), (62, 128, 112), (132, 170, 104), (208, 200, 130), (206, 152, 98), (172, 102, 84), (233, 204, 186)
+)  # fmt: skip
 _GAP = 12
+BACKGROUND = (246, 246, 243)
 
 
 def png(rgb: npt.NDArray[np.uint8]) -> bytes:
@@ -60,81 +61,100 @@ def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8]) -> Path:
     return write_whole(path, file.getvalue(), what="picture")
 
 
-def ramp(values: np.ndarray, limits: tuple[float, float] | None = None, name: str = "value") -> np.ndarray:
+@dataclass(frozen=True)
+class Surface:
+    """The highest point of each pixel of a map that is `pixel` units fine and whose lower left corner is (x0, y0).
+
+    ``which`` is the row of the point (-1: none), ``z`` its height (NaN: none), ``spacing`` the typical distance of
+    neighboring points in pixels, 1 at least.
+    """
+
+    x0: float
+    y0: float
+    pixel: float
+    which: np.ndarray
+    z: np.ndarray
+    spacing: float
+
+    def spread(self, values: np.ndarray, missing) -> np.ndarray:
+        """Per-point values on the pixels."""
+        return np.where(self.which >= 0, values[self.which], np.array(missing, values.dtype))
+
+    def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of finite places on the map."""
+        height, width = self.which.shape
+        row = height - 1 - np.floor((y - self.y0) / self.pixel).astype(np.int64)
+        return row.clip(0), np.floor((x - self.x0) / self.pixel).astype(np.int64).clip(None, width - 1)
+
+
+def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
+    """The map of points, (n,) float each, `width` pixels wide (narrower where it would be more than 2.5 times as tall).
+
+    An empty pixel takes the nearest point within 1.6 times the points' spacing; points that are not finite are left out.
+    """
+    if not 16 <= int(width) <= 3000:
+        raise StageError("'width' must be from 16 to 3000 pixels", where="picture", found=width)
+    good = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
+    if not good.size:
+        raise StageError(
+            "there is nothing to draw: no point has finite coordinates",
+            where="picture",
+            found=f"{x.size} points",
+            cure="Check that the pipeline before the picture leaves points",
+        )
+    x, y, z = (np.asarray(a[good], np.float64) for a in (x, y, z))
+    x0, y0 = float(x.min()), float(y.min())
+    wide, tall = max(float(x.max()) - x0, 1e-3), max(float(y.max()) - y0, 1e-3)
+    pixel = max(wide / width, tall / (2.5 * width))
+    shape = max(2, math.ceil(tall / pixel)), max(2, math.ceil(wide / pixel))
+    made = Surface(x0, y0, pixel, np.full(shape, -1), np.full(shape, np.nan), 1.0)
+    order = np.argsort(z, kind="stable")
+    cells = made.cells(x[order], y[order])
+    made.which[cells], made.z[cells] = good[order], z[order]  # of several the last stays: the highest
+    seen = made.which >= 0
+    if seen.all():
+        return made
+    away, at = ndimage.distance_transform_edt(~seen, return_indices=True)
+    # Spacing inside the cloud: pixels near some point, per pixel that has one.
+    share = math.sqrt(seen.size / seen.sum())
+    spacing = max(1.0, math.sqrt((away <= share).sum() / seen.sum()))
+    near = np.where(away <= 1.6 * spacing, made.which[tuple(at)], -1)
+    return Surface(x0, y0, pixel, near, np.where(near >= 0, made.z[tuple(at)], np.nan), spacing)
+
+
+def shading(s: Surface) -> np.ndarray:
+    """Light on the surface, about 0.4 (dark) to 1.2: sun from the north-west, and less sky where surroundings are higher."""
+    known = np.isfinite(s.z)
+    above, weight = np.where(known, s.z - np.nanmedian(s.z), 0.0).astype(np.float32), known.astype(np.float32)
+
+    def smooth(size: float) -> np.ndarray:
+        soft, of = (ndimage.gaussian_filter(a, size, mode="nearest", truncate=2.0) for a in (above, weight))
+        return soft / np.maximum(of, 1e-6)
+
+    fine = smooth(0.45 * s.spacing)
+    south, east = np.gradient(fine, s.pixel)
+    sun = (0.5 * east + 0.5 * south + 0.75) / np.sqrt(1 + east**2 + south**2) / 0.75
+    around = smooth(min(max(4.0 / s.pixel, 1.2 * s.spacing), 0.1 * max(s.z.shape)))
+    light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * np.clip((fine - around) / 4.8, -1, 1)
+    return np.where(known, np.clip(light, 0.42, 1.18), 1.0)
+
+
+def paint(s: Surface, colors: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Pixels from per-pixel colors and light; empty ones get the background."""
+    light, out = light[..., None], colors.astype(float)
+    out = np.where(light <= 1, out * light, 255 - (255 - out) / light)
+    out[s.which < 0] = BACKGROUND
+    return np.clip(np.round(out), 0, 255).astype(np.uint8)
+
+
+def ramp(values: np.ndarray, anchors: npt.ArrayLike, limits: tuple[float, float] | None = None) -> np.ndarray:
     """Colors, (..., 3) uint8, of values between limits, by default the 1st and 99th percentile; NaN becomes mid gray."""
-    good, anchors = np.isfinite(values), np.array(_RAMPS[name], dtype=float)
+    good, colors = np.isfinite(values), np.asarray(anchors, dtype=float)
     low, high = limits or (np.percentile(values[good], [1, 99]) if good.any() else (0.0, 1.0))
-    if limits is None and high <= low:
-        high = low + 1.0
-    share = np.where(good, values - low, 0.0) / max(high - low, 1e-12) * (len(anchors) - 1)
-    out = np.stack([np.interp(share, np.arange(len(anchors)), anchors[:, c]) for c in range(3)], axis=-1)
+    share = np.where(good, values - low, 0.0) / max(high - low, 1e-12) * (len(colors) - 1)
+    out = np.stack([np.interp(share, np.arange(len(colors)), colors[:, c]) for c in range(3)], axis=-1)
     out[~good] = 150
     return np.round(out).astype(np.uint8)
-
-
-def columns(**arrays: npt.ArrayLike | None) -> list[np.ndarray]:
-    """Arrays of one value per point, all as long as the first; their names are for messages.
-
-    ``classes``, ``predicted`` and ``truth`` are codes from 0 to 255, and become (n,) uint8.
-    """
-    given = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
-    size = next(iter(given.values())).shape
-    for name, a in given.items():
-        if a.ndim != 1 or a.shape != size:
-            raise StageError(
-                f"'{name}' must be one value per point", where="picture", found=f"shape {a.shape}"
-            )
-        if name in ("classes", "predicted", "truth"):
-            if a.dtype.kind not in "iub" or (a != a.astype(np.uint8)).any():
-                raise StageError(
-                    "classes must be whole numbers from 0 to 255", where="picture", found=a.dtype
-                )
-            given[name] = a.astype(np.uint8)
-    return list(given.values())
-
-
-def top_view(
-    x: npt.ArrayLike,
-    y: npt.ArrayLike,
-    z: npt.ArrayLike,
-    classes: npt.ArrayLike | None = None,
-    *,
-    values: npt.ArrayLike | None = None,
-    width: int = 900,
-    limits: tuple[float, float] | None = None,
-) -> np.ndarray:
-    """The cloud from above, colored by ASPRS class, by a value or by height; the highest point of a pixel wins.
-
-    Parameters
-    ----------
-    x, y, z : (n,) float
-        Coordinates; points that are not finite are left out.
-    classes : (n,) integer, optional
-    values : (n,) float, optional
-        Instead of classes: a feature, ``Reliability``, intensity. Without either, heights are shown.
-    width : int
-        Pixels across; the height follows from the extent.
-    limits : (low, high), optional
-        Values at the ends of the ramp; by default the 1st and 99th percentile.
-
-    Returns
-    -------
-    (height, width, 3) uint8
-
-    Raises
-    ------
-    StageError
-        If the cloud is empty, or arrays do not fit together.
-    """
-    x, y, z, *by = columns(x=x, y=y, z=z, classes=classes, values=values)
-    s = surface(x, y, z, width)
-    if classes is not None:
-        shown = CLASS_COLORS[s.spread(by[0], 0)]
-    elif values is not None:
-        shown = ramp(s.spread(by[0].astype(np.float64), np.nan), limits)
-    else:
-        shown = ramp(s.z, limits, "height")
-    return paint(s, shown, shading(s))
 
 
 def verdict(
@@ -155,15 +175,15 @@ def verdict(
 
 
 def triptych(
-    x: npt.ArrayLike,
-    y: npt.ArrayLike,
-    z: npt.ArrayLike,
-    predicted: npt.ArrayLike,
-    truth: npt.ArrayLike | None = None,
+    x: np.ndarray,
+    y: np.ndarray,
+    z: np.ndarray,
+    predicted: np.ndarray,
+    truth: np.ndarray | None = None,
     *,
     width: int = 1500,
 ) -> np.ndarray:
-    """Heights, classes and errors (wrong points red) side by side.
+    """Heights, classes and errors (wrong points red) side by side, (height, width, 3) uint8.
 
     Parameters
     ----------
@@ -173,17 +193,12 @@ def triptych(
         Reference classes; without them there is no panel of errors.
     width : int
         Pixels across all panels, about.
-
-    Returns
-    -------
-    (height, width, 3) uint8
     """
-    x, y, z, predicted, *true = columns(x=x, y=y, z=z, predicted=predicted, truth=truth)
-    panels = 2 + len(true)
+    panels = 2 if truth is None else 3
     s = surface(x, y, z, (int(width) - _GAP * (panels - 1)) // panels)
-    shown = [ramp(s.z, name="height"), CLASS_COLORS[s.spread(predicted, 0)]]
-    for known in true:
-        wrong = predicted != known
+    shown = [ramp(s.z, _TINTS), CLASS_COLORS[s.spread(predicted, 0)]]
+    if truth is not None:
+        wrong = predicted != truth
         shown.append(verdict(s, x, y, z, wrong, np.zeros_like(wrong)))
     light, gap = shading(s), np.full((len(s.z), _GAP, 3), BACKGROUND, np.uint8)
     return np.concatenate([part for colors in shown for part in (gap, paint(s, colors, light))][1:], axis=1)
