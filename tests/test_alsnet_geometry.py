@@ -7,9 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.alsnet import Circles, parse_configuration
-from pdal_stages.alsnet.circles import density, halo_m, spacing_for
+from pdal_stages.alsnet.circles import halo_m, spacing_for
 from pdal_stages.alsnet.geometry import ball_query, build, farthest_points, scramble, stack, three_nearest
 from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier.clouds import density
 
 # ---- references ------------------------------------------------------------------------------------------
 
@@ -113,7 +114,7 @@ def test_every_point_is_in_a_batch_and_batches_are_the_nearest_points(seed, n, p
 def test_points_are_in_four_batches_on_average():
     xyz = np.random.default_rng(0).random((15_000, 3)) * [100.0, 100.0, 10.0]
     points = 1000
-    circles = Circles(xyz, points, spacing_for(points, density([xyz])))
+    circles = Circles(xyz, points, spacing_for(points, density(xyz)))
     assert coverage(circles).min() >= 1
     assert 3.7 < coverage(circles).mean() < 4.3
     inside = ((xyz[:, :2] > 20) & (xyz[:, :2] < 80)).all(axis=1)

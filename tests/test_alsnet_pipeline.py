@@ -124,14 +124,14 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     path = write_las(tmp_path / "in.las", arrays, point_format=7)
     reader = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
     made, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
-    network = {"configuration": TINY.to_dict(), "epochs": 12, "validation": 0, "learning_rate": 0.01}
+    network = {"configuration": TINY.to_dict(), "epochs": 16, "validation": 0, "learning_rate": 0.01}
     network["checkpoint"] = str(tmp_path / "a.checkpoint")
     writer = {"type": WRITER, "filename": made, "algorithm": "alsnet", "alsnet": network}
     ps.run_pipeline([reader, {**writer, "dimensions": "Red,EchoWidth"}])
     assert load_model(made).required_dimensions == ("Red", "EchoWidth")
     ps.run_pipeline([reader, {"type": "filters.modelclassifier", "model": made}, out])
     assert (np.asarray(laspy.read(out).classification) == labels).mean() > 0.95
-    assert len(load_model(made).info["training"]["curve"]) == 12 and (tmp_path / "a.checkpoint").exists()
+    assert len(load_model(made).info["training"]["curve"]) == 16 and (tmp_path / "a.checkpoint").exists()
     del arrays["EchoWidth"]
     bare = str(write_las(tmp_path / "bare.las", arrays, point_format=7))
     with pytest.raises(DimensionError, match="EchoWidth"):

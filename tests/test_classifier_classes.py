@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.classes import ClassMap, as_labels
+from pdal_stages.classifier.classes import ClassMap
 from pdal_stages.classifier.trainoptions import TrainingOptions
 
 
@@ -76,13 +76,6 @@ def test_binary():
         classes.binary(6, 6)
     with pytest.raises(OptionError, match="nothing is left"):
         ClassMap.parse([6]).binary(6, 1)
-
-
-def test_labels_are_checked():
-    assert as_labels([1.0, 2.0], "a").dtype == np.uint16
-    for bad in ([1.5], [np.nan], [-1], [70000], ["a"], [[1]]):
-        with pytest.raises(OptionError):
-            as_labels(bad, "a")
 
 
 @pytest.mark.parametrize(

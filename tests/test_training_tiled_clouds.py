@@ -10,7 +10,7 @@ import pytest
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.clouds import TiledCloud
 from pdal_stages.classifier.foresttraining import SHORT
-from pdal_stages.classifier.training import train_tiles
+from pdal_stages.classifier.training import reach
 
 QUICK = {
     "count": 120,
@@ -55,8 +55,8 @@ def cut(cloud, side, folder, seed=1):
 def same_forests(cloud, options, side, folder):
     """Trains on the whole and on tiles."""
     whole = train([cloud], options, progress=False)
-    (folder / "work").mkdir()
-    tiles = train_tiles([cut(cloud, side, folder / "raw")], options, folder / "work", progress=False)
+    each = cut(cloud, side, folder / "raw").clouds(reach(options))
+    tiles = train(each, options, progress=False)
     assert not (folder / "raw").exists()
     assert tiles.info["classes"] == whole.info["classes"]
     assert tiles.info["training"]["clouds"] == whole.info["training"]["clouds"]
@@ -90,9 +90,10 @@ def test_other_options(tmp_path, more):
 
 def test_neighbors_beyond_the_halo_are_counted(tmp_path):
     """At one point on 40 m2 the fifty nearest lie 25 m around."""
-    (tmp_path / "work").mkdir()
     options = TrainingOptions(**{**QUICK, "neighborhoods": "k50", "thin": 0.01})
-    model = train_tiles([cut(scene(900, 190.0), 21.0, tmp_path / "raw")], options, tmp_path / "work", False)
+    model = train(
+        cut(scene(900, 190.0), 21.0, tmp_path / "raw").clouds(reach(options)), options, progress=False
+    )
     assert model.info["training"][SHORT] > 0
 
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from ..base.asprs import NAMES, class_name
 from ..base.errors import StageError
 
-#: Largest class code; LAS itself stops at 255, other label dimensions do not.
-MAX_CODE = 65535
+#: The largest label; LAS itself stops at 255, other dimensions that hold classes do not.
+MAX_LABEL = 65535
 #: A dimension with more different values than this is not a class dimension.
 MAX_CLASSES = 256
 #: Points looked at in one go, which bounds the memory.
@@ -21,30 +21,22 @@ CHUNK = 1 << 20
 
 
 def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
-    """The labels as an (n,) integer array, or an error that says what is wrong with them."""
+    """The labels as an (n,) uint16 array, or an error that says what is wrong with them."""
     a = np.asarray(labels)
     if a.ndim != 1:
         raise StageError(f"the {what} must be one label per point", found=f"shape {a.shape}")
-    if a.dtype.kind == "f":
-        bad = ~(np.isfinite(a) & (a == np.floor(a)))
-        if bad.any():
-            raise StageError(
-                f"the {what} has values that are not class codes",
-                found=a[bad][0],
-                cure="Compare a class dimension",
-            )
-        a = a.astype(np.int64)
-    elif a.dtype.kind not in "iu" and a.size:
+    if a.size and a.dtype.kind not in "iuf":
         raise StageError(f"the {what} is not a list of class codes", found=f"values of type {a.dtype}")
-    elif not a.size:
-        a = a.astype(np.int64)
-    if a.size and (a.min() < 0 or a.max() > MAX_CODE):
+    bad = (a < 0) | (a > MAX_LABEL) if a.size else np.zeros(0, bool)
+    if a.dtype.kind == "f":
+        bad |= a != np.floor(a)
+    if bad.any():
         raise StageError(
             f"the {what} has values that are not class codes",
-            found=f"{a.min()} to {a.max()}",
-            cure=f"Class codes are whole numbers from 0 to {MAX_CODE}",
+            found=a[bad][0],
+            cure=f"Class codes are whole numbers from 0 to {MAX_LABEL}: choose a class dimension",
         )
-    return a.astype(np.int64) if a.dtype.itemsize == 8 else a
+    return a.astype(np.uint16, copy=False)
 
 
 def same_length(reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -64,7 +56,7 @@ def code_list(codes: Iterable[Any], option: str) -> list[int]:
     for code in codes:
         try:
             value = int(code)
-            good = value == (int(code) if isinstance(code, str) else code) and 0 <= value <= MAX_CODE
+            good = value == (int(code) if isinstance(code, str) else code) and 0 <= value <= MAX_LABEL
         except (TypeError, ValueError):
             good = False
         if not good or isinstance(code, bool):
@@ -92,7 +84,7 @@ class Merge:
 
         StageError for what is not a list of class codes, or a class sent to two others.
         """
-        to = np.arange(MAX_CODE + 1)
+        to = np.arange(MAX_LABEL + 1)
         members: dict[int, set[int]] = {}
         for key, value in (mapping or {}).items():
             if not isinstance(value, list | tuple | set | np.ndarray):
@@ -134,7 +126,7 @@ def pair_counts(
     """Codes of the reference (R,) and of the prediction (C,), ascending, and how often each pair occurs (R, C)."""
     codes, positions = [], []
     for what, labels in (("reference", reference), ("prediction", predicted)):
-        there = np.zeros(MAX_CODE + 1, bool)
+        there = np.zeros(MAX_LABEL + 1, bool)
         there[labels] = True
         codes.append(np.flatnonzero(there))
         positions.append(np.cumsum(there) - 1)

@@ -7,7 +7,6 @@ same circles as the whole cloud. What a circle holds follows from the coordinate
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,19 +20,6 @@ COVERAGE = 4.0
 REACH = 1.5
 #: How often a cell may be halved.
 DEEPEST = 24
-
-
-def density(clouds: Sequence[npt.NDArray[np.float64]]) -> float:
-    """Points per square meter of the ground that is covered, over several clouds."""
-    points, area = 0, 0.0
-    for xyz in clouds:
-        if not len(xyz):
-            continue
-        span = np.maximum(np.ptp(xyz[:, :2], axis=0), 1.0)
-        side = max(math.sqrt(16.0 * span[0] * span[1] / len(xyz)), 0.1)  # some 16 points a cell
-        area += len(np.unique(np.floor(xyz[:, :2] / side), axis=0)) * side * side
-        points += len(xyz)
-    return points / area if area else 1.0
 
 
 def spacing_for(points: int, per_square_meter: float) -> float:

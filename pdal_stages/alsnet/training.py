@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import os
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict
 from io import BytesIO
@@ -22,9 +21,9 @@ from ..base.files import write_whole
 from ..base.outputs import CHECKPOINT, Output
 from ..base.progress import Progress
 from ..base.resources import map_blocks, resolve_threads
-from ..base.version import __version__
+from ..classifier.algorithms import versions
 from ..classifier.classes import ClassMap
-from ..classifier.clouds import TrainingCloud, densities, label_classes
+from ..classifier.clouds import TrainingCloud, densities, density, label_classes, listed
 from ..classifier.dimensions import gather, with_returns
 from ..classifier.holdout import figures
 from ..classifier.model import Model, load_model
@@ -32,7 +31,7 @@ from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
 from . import batches
 from .algorithm import AlsNet, make_pyramid, scaled
-from .circles import Circles, density, spacing_for
+from .circles import Circles, spacing_for
 from .configuration import NetworkOptions
 from .geometry import stack
 from .weights import Weights, check, fresh
@@ -43,7 +42,6 @@ FORMAT = "pdal-stages alsnet checkpoint 4"
 COORDINATES = ("X", "Y", "Z")
 
 optional_inputs: dict[str, tuple[str, ...]] = {}
-reports_training = True
 
 
 def outputs(options: TrainingOptions) -> list[Output]:
@@ -102,7 +100,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
             options, ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
         ),
         "training": {
-            "clouds": [{"name": os.path.basename(c.name), "points": len(c.xyz)} for c in clouds],
+            "clouds": listed(clouds),
             "count": int(count.sum()),
             "seed": options.seed,
             "samples": int(count.sum()),
@@ -112,12 +110,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         "voxel": options.voxel,
         "accuracy": {"cross_validation": None},
         "passes": [{"importances": None}],
-        "created_by": {
-            "pdal_stages": __version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "torch": str(torch.__version__),
-        },
+        "created_by": versions("numpy", "torch"),
     }
     classes = list(zip(known.classes.codes, known.classes.names, strict=True))
     return Model((net,), classes, info)
@@ -164,7 +157,9 @@ class _Session:
         else:
             self.mean, self.scale = source.algorithm.mean, source.algorithm.scale
         points = options.configuration.points
-        self.spacing = options.spacing or spacing_for(points, density(clouds))
+        self.spacing = options.spacing or spacing_for(
+            points, float(np.median([density(xyz) for xyz in clouds]))
+        )
         self.xyz = batches.side_by_side(clouds, self.spacing)
         self.columns = scaled(self.xyz, values, names, self.mean, self.scale)
         self.circles = Circles(self.xyz, points, self.spacing, self.columns)

@@ -4,15 +4,17 @@ A kind is a class with ``name``, ``rules`` (of its arrays in a model file; a nam
 ``plan``, ``features`` and ``context`` (None without), ``from_file(entry, arrays, codes)``, ``to_file(codes)``, ``arrays()``
 and ``columns(codes)``. It has ``probabilities(read, rows)`` where it has features, and else ``predict(request, finish)``,
 which yields (rows, what `finish` made of their probabilities) block by block. What trains it is a module with
-``optional_inputs`` (each with the dimensions it needs), ``reports_training``, ``own_options(given)``, ``inputs(options)``,
+``optional_inputs`` (each with the dimensions it needs), ``own_options(given)``, ``inputs(options)``,
 ``outputs(options)`` and ``train(clouds, options, progress)``.
 """
 
 from __future__ import annotations
 
 import pkgutil
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import metadata
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +23,7 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError
 from ..base.report import Report
+from ..base.version import __version__
 from ..features.index import CellGrid
 
 #: Each kind by its word in manifests and options: its class, and what trains it, imported when asked for.
@@ -128,3 +131,9 @@ def algorithm(name: str) -> Any:
 def trainer(name: str) -> Any:
     """What trains a kind, one of :data:`ALGORITHMS`."""
     return pkgutil.resolve_name(ALGORITHMS[name][1])
+
+
+def versions(*packages: str) -> dict[str, str]:
+    """Of this package, Python and others, for a manifest."""
+    used = {name: metadata.version(name) for name in packages}
+    return {"pdal_stages": __version__, "python": platform.python_version(), **used}

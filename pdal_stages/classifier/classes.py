@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..accuracy.labels import MAX_LABEL
 from ..base import checks
 from ..base.asprs import NAMES, UNINFORMATIVE, class_name
 from ..base.errors import OptionError, suggest
 
 #: The largest code a point can carry.
 MAX_CODE = 255
-#: The largest label.
-MAX_LABEL = 65535
 
 # Words people use where ASPRS has another.
 _WORDS = {
@@ -114,24 +113,6 @@ class ClassMap:
         for position, part in enumerate(self.labels):
             table[list(part)] = position
         return table[np.minimum(labels, highest + 1)]
-
-
-def as_labels(labels: npt.ArrayLike, where: str) -> npt.NDArray[Any]:
-    """The labels as a non-negative integer array, or an error naming the cloud."""
-    array = np.asarray(labels)
-    if array.ndim != 1:
-        raise OptionError("labels must be one number per point", where=where, found=f"shape {array.shape}")
-    if array.dtype.kind == "f" and len(array):
-        if not np.all(np.isfinite(array)) or np.any(array != np.floor(array)):
-            raise OptionError("labels must be whole numbers", where=where, cure="Choose a class dimension")
-        array = array.astype(np.int64)
-    elif array.dtype.kind not in "iu" and len(array):
-        raise OptionError("labels must be whole numbers", where=where, found=f"type {array.dtype}")
-    if len(array) and (array.min() < 0 or array.max() > MAX_LABEL):
-        raise OptionError(
-            f"labels must be from 0 to {MAX_LABEL}", where=where, found=f"{array.min()} to {array.max()}"
-        )
-    return array.astype(np.uint16)
 
 
 def _labels(text: Any) -> tuple[int, ...]:

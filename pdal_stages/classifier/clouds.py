@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..accuracy.labels import as_codes
 from ..base.arrays import begins_run, coordinate_hash
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..features.cells import cell_keys
 from ..features.voxels import represent
-from .classes import MAX_LABEL, ClassMap, as_labels
+from .classes import MAX_LABEL, ClassMap
 from .dimensions import known
 from .trainoptions import TrainingOptions
 
@@ -49,6 +50,11 @@ class TrainingCloud:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @property
+    def codes(self) -> npt.NDArray[np.uint16]:
+        """The labels, or StageError where they are none."""
+        return as_codes(self.labels, f"label of {self.name}")
 
     @property
     def flight(self) -> str:
@@ -106,7 +112,7 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     named: set[int] = set()
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
-    labels = as_labels(cloud.labels, cloud.name)
+    labels = cloud.codes
     if len(labels) != len(cloud):
         found = f"{len(labels)} and {len(cloud)}"
         raise OptionError("labels and points differ in number", where=cloud.name, found=found)
@@ -213,7 +219,7 @@ class Labeled:
 
     def __getitem__(self, number: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]:
         cloud = self.clouds[number]
-        position = self.classes.index(as_labels(cloud.labels, cloud.name))
+        position = self.classes.index(cloud.codes)
         position[~cloud.usable] = -1
         return cloud.xyz, position
 
@@ -241,8 +247,7 @@ def label_classes(
     number = np.zeros(MAX_LABEL + 1, np.int64)
     with Progress(sum(map(len, clouds)), "counting labels", enabled=progress) as bar:
         for cloud in clouds:
-            labels = as_labels(cloud.labels, cloud.name)
-            number += np.bincount(labels[cloud.usable], minlength=len(number))
+            number += np.bincount(cloud.codes[cloud.usable], minlength=len(number))
             bar.update(len(cloud))
     found = {int(label): int(number[label]) for label in np.flatnonzero(number)}
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"

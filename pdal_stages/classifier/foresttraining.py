@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,10 +15,9 @@ from ..base.errors import DimensionError, OptionError
 from ..base.outputs import Output
 from ..base.progress import Progress
 from ..base.resources import free_memory
-from ..base.version import __version__
 from ..features.engine import fit_clouds
 from ..features.returns import SOURCES
-from .algorithms import PredictRequest
+from .algorithms import PredictRequest, versions
 from .clouds import TrainingCloud, densities, label_classes, listed
 from .context import OWN, Context
 from .dimensions import WHERE_THERE, gather, required
@@ -41,7 +39,6 @@ PASS_FOLDS = 5
 SHORT = "short_of_neighbors"
 
 optional_inputs = {**{name: (name,) for name in WHERE_THERE}, "returns": SOURCES}
-reports_training = False
 
 
 def outputs(options: TrainingOptions) -> list[Output]:
@@ -190,7 +187,7 @@ class _ForestTraining:
             "voxel": o.voxel,
             "accuracy": {"cross_validation": validation},
             "passes": [{"importances": one} for one in importances],
-            "created_by": _versions(),
+            "created_by": versions("numpy", "scikit-learn", "numba"),
         }
         if validation is not None and self.sureness.right:
             info["sureness"] = self.sureness.to_dict()
@@ -387,16 +384,3 @@ class _ForestTraining:
 
 def _beside(values: npt.NDArray[np.float32], more: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return np.asfortranarray(np.concatenate([values, more], axis=1))
-
-
-def _versions() -> dict[str, str]:
-    import numba
-    import sklearn
-
-    return {
-        "pdal_stages": __version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "scikit-learn": sklearn.__version__,
-        "numba": numba.__version__,
-    }

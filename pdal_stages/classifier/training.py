@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from .algorithms import trainer
-from .clouds import TiledCloud, TrainingCloud, prepared, spooled
+from .clouds import TrainingCloud, prepared, spooled
 from .context import Context
 from .dimensions import ALWAYS, WHERE_THERE, preparing, required
 from .model import Model
@@ -26,6 +26,7 @@ def train(
     options: TrainingOptions | None = None,
     *,
     dimensions: Mapping[str, npt.ArrayLike] | None = None,
+    folder: Path | None = None,
     progress: bool = True,
 ) -> Model:
     """Train a model: ``train(xyz, labels)``, or ``train(clouds, options)``.
@@ -34,14 +35,18 @@ def train(
     ----------
     clouds : (n, 3) array, TrainingCloud, or iterable of TrainingCloud
         Coordinates in meters of points that have `labels`; or one cloud per file or view. Features see only their own
-        cloud. Of anything but a list or tuple one cloud at a time is in memory; all are kept in a temporary folder while
-        training lasts.
+        cloud. Of anything but a list or tuple one cloud at a time is in memory; all are kept in `folder` while training
+        lasts. With tiles (:meth:`TiledCloud.clouds`, as far around as :func:`reach` says) the model is that of the whole
+        cloud, but for points whose nearest neighbors lie farther away, and for thinned copies, which follow the density of
+        each tile.
     labels : (n,) int, optional
         Class codes, with coordinates; the options may stand here otherwise.
     options : TrainingOptions
     dimensions : mapping, optional
         With coordinates: name to (n,) values, as the options' `dimensions` need. Without, heights are made of the
         coordinates as ``filters.hag_morphological`` makes them, and the model knows how.
+    folder : Path, optional
+        Instead of a temporary one.
     progress : bool
         Whether to show progress on stderr.
 
@@ -59,35 +64,16 @@ def train(
         if dimensions is None:
             dimensions, options, preparation = _prepared(xyz, labels, options)
         sources = [TrainingCloud(xyz, labels, dimensions)]
-    with tempfile.TemporaryDirectory(prefix="pdal-stages-") as folder:
+    with tempfile.TemporaryDirectory(prefix="pdal-stages-") as temporary:
         each = prepared(sources, options)
-        made = list(each) if isinstance(sources, list | tuple) else spooled(each, Path(folder))
+        made = list(each) if isinstance(sources, list | tuple) else spooled(each, folder or Path(temporary))
+        made = [one for one in made if one.points]
         if not made:
             raise OptionError("no training cloud was given")
         model = trainer(options.algorithm).train(made, options, progress)
     if preparation:
         model.info["preparation"] = preparation
     return model
-
-
-def train_tiles(
-    clouds: Sequence[TiledCloud], options: TrainingOptions, folder: Path, progress: bool = True
-) -> Model:
-    """Train a forest on clouds in tiles, one of which is in memory at a time.
-
-    Files are written into `folder`, and those of `clouds` removed. The model is that of the whole clouds, but for points
-    whose nearest neighbors lie farther away than the halo of :func:`reach`, and for thinned copies, which follow the
-    density of each tile.
-
-    Raises
-    ------
-    OptionError, DimensionError
-    """
-    tiles = (tile for cloud in clouds for tile in cloud.clouds(reach(options)))
-    made = [one for one in spooled(prepared(tiles, options), folder) if one.points]
-    if not made:
-        raise OptionError("no training cloud was given")
-    return trainer(options.algorithm).train(made, options, progress)
 
 
 def reach(options: TrainingOptions) -> float:

@@ -278,8 +278,6 @@ classes.
         if summary.held_out(model.info):
             report.figures["score"] = summary.score(model.info)
             report.notes.append(report.figures["score"])
-        if self._trainer.reports_training:
-            report.figures["training"] = model.info["training"]
 
     def choice(self, parts: Iterable[Mapping[str, Any]]) -> CheckedChoice:
         """What chooses points to draw samples from, where some were checked by a person; `parts` as `looked` counts them."""

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 from ..base.outputs import check_outputs
 from ..base.report import Report
-from ..classifier import Model, TrainingCloud, train
+from ..classifier import Model, TrainingCloud, TrainingOptions, train
 from ..classifier.clouds import TiledCloud
 from ..classifier.summary import FILE_NUMBER
-from ..classifier.training import train_tiles
+from ..classifier.training import reach
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden
@@ -64,15 +64,14 @@ class TrainTask:
         files = list(self.files)
         writer = {"type": ClassifierModel.type, "filename": self.model, "files": files, **self.given}
         writer = overridden(writer, self.overrides)
-        stage = lowered_writer(writer)
-        told = {name: value for name in ("survey", "groups") if (value := getattr(stage, name))}
+        told = {name: value for name in ("survey", "groups") if (value := writer.get(name))}
         if told and (self.surveys or self.survey):
             raise OptionError(
                 "surveys are told by files or by a dimension, not both",
                 found=", ".join(f"{name}={value}" for name, value in told.items()),
             )
-        by_file = len(files) > 1 and stage.algorithm == "random_forest"
-        if by_file and not (told or self.surveys or self.survey):
+        forest = writer.get("algorithm", TrainingOptions.algorithm) == "random_forest"
+        if len(files) > 1 and forest and not (told or self.surveys or self.survey):
             writer["groups"] = FILE_NUMBER
         return writer
 
@@ -160,7 +159,8 @@ class TrainTask:
             training = self.stage.training
             if self.stage.automatic:
                 training = replace(training, dimensions=tuple(dimensions or ()))
-            return train_tiles(clouds, training, Path(folder))
+            tiles = (tile for cloud in clouds for tile in cloud.clouds(reach(training)))
+            return train(tiles, training, folder=Path(folder))
 
     def _plan(self, folder: Path, heights: Sequence[Mapping[str, Any]]) -> TilePlan:
         tail = {"type": "writers.null", "filename": str(folder / "#.npz")}
