@@ -26,7 +26,7 @@ import numpy as np
 
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.dimensions import ALWAYS, WHERE_THERE
+from pdal_stages.classifier.algorithms import ALWAYS, WHERE_THERE
 from pdal_stages.classifier.model import load_model
 from pdal_stages.features.names import SURFACES
 from pdal_stages.terrain import filtered_ground

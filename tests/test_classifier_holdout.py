@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.holdout import Folds, split
+from pdal_stages.classifier.sampling import Folds, split
 
 
 def block_folds(xy, label, folds, side):

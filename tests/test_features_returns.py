@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.dimensions import gather, required, welcome, with_returns
+from pdal_stages.classifier.algorithms import gather, required, welcome, with_returns
 from pdal_stages.features import FeaturePlan, returns
 
 

@@ -22,8 +22,8 @@ from pdal_stages.classifier import (
 )
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.context import count_shares
+from pdal_stages.classifier.featureforest import EVEN, Blend, trust, weighed
 from pdal_stages.classifier.passes import predict
-from pdal_stages.classifier.refinement import EVEN, Blend, trust, weighed
 from pdal_stages.features import FeatureEngine
 from pdal_stages.features.cells import WHOLE
 

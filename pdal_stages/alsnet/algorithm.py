@@ -13,8 +13,7 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError, OptionError, StageError
 from ..base.resources import map_blocks, resolve_threads
-from ..classifier.algorithms import ArrayRule, Column, InputPlan, PredictRequest
-from ..classifier.dimensions import gather, with_returns
+from ..classifier.algorithms import ArrayRule, Column, InputPlan, PredictRequest, gather, with_returns
 from ..features.index import check_xyz
 from .circles import Circles, halo_m
 from .configuration import Configuration, parse_configuration

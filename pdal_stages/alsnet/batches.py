@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from ..classifier.holdout import Folds
+from ..classifier.sampling import Folds
 from .circles import REACH, Circles
 
 

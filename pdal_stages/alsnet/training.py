@@ -21,12 +21,11 @@ from ..base.files import write_whole
 from ..base.outputs import CHECKPOINT, Output
 from ..base.progress import Progress
 from ..base.resources import map_blocks, resolve_threads
-from ..classifier.algorithms import versions
+from ..classifier.algorithms import gather, versions, with_returns
 from ..classifier.classes import ClassMap
 from ..classifier.clouds import TrainingCloud, densities, density, label_classes, listed
-from ..classifier.dimensions import gather, with_returns
-from ..classifier.holdout import figures
 from ..classifier.model import Model, load_model
+from ..classifier.sampling import figures
 from ..classifier.trainoptions import TrainingOptions
 from ..features.index import check_xyz
 from . import batches

@@ -20,8 +20,8 @@ from ..base.errors import OptionError, StageError
 from ..base.progress import Progress
 from ..features.cells import cell_keys
 from ..features.voxels import represent
+from .algorithms import known
 from .classes import MAX_LABEL, ClassMap
-from .dimensions import known
 from .trainoptions import TrainingOptions
 
 #: Side in meters of the cells that density is measured in.

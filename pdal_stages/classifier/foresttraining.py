@@ -17,17 +17,14 @@ from ..base.progress import Progress
 from ..base.resources import free_memory
 from ..features.engine import fit_clouds
 from ..features.returns import SOURCES
-from .algorithms import PredictRequest, versions
+from .algorithms import WHERE_THERE, PredictRequest, gather, required, versions
 from .clouds import TrainingCloud, densities, label_classes, listed
 from .context import OWN, Context
-from .dimensions import WHERE_THERE, gather, required
-from .featureforest import CloudFeatures, FeatureForest, Features
+from .featureforest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
 from .forest import Forest, grow_forest
-from .holdout import BLOCK, Folds, figures, split
 from .model import Model
 from .passes import FoldForests, sample_context
-from .refinement import Blend, on_top, trust, weighed
-from .sampling import draw_samples
+from .sampling import BLOCK, Folds, draw_samples, figures, split
 from .sureness import Sureness
 from .trainoptions import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 

@@ -18,11 +18,20 @@ from ..features import FeaturePlan
 from ..features.index import build_grid, check_xyz
 from ..features.voxels import check_side, represent
 from . import modelfile, summary
-from .algorithms import InputPlan, Prediction, PredictionOptions, PredictRequest, algorithm
+from .algorithms import (
+    InputPlan,
+    Prediction,
+    PredictionOptions,
+    PredictRequest,
+    algorithm,
+    known,
+    preparing,
+    required,
+    welcome,
+)
 from .clouds import density
-from .dimensions import known, preparing, required, welcome
+from .featureforest import weighed
 from .passes import plan_of, predict
-from .refinement import weighed
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1

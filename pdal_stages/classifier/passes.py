@@ -19,8 +19,7 @@ from ..features import FeaturePlan
 from ..features.index import cell_numbers
 from .algorithms import InputPlan, PredictRequest
 from .context import Context, around, count_shares
-from .featureforest import CloudFeatures, FeatureForest
-from .refinement import weighed
+from .featureforest import CloudFeatures, FeatureForest, weighed
 
 #: Points of a band at most, but for a band of one strip.
 BAND = 75_000

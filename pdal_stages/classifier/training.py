@@ -12,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from .algorithms import trainer
+from .algorithms import ALWAYS, WHERE_THERE, preparing, required, trainer
 from .clouds import TrainingCloud, prepared, spooled
 from .context import Context
-from .dimensions import ALWAYS, WHERE_THERE, preparing, required
 from .model import Model
 from .trainoptions import TrainingOptions, feature_plan
 

@@ -16,7 +16,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import OptionError, StageError
 from ..base.files import whole_files
 from ..base.outputs import Output, check_outputs
-from ..classifier.dimensions import CHECKED
+from ..classifier.algorithms import CHECKED
 from ..objects.outlines import vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
 from .inputs_outputs import reference_of_file

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..base.arrays import coordinate_hash
 from ..base.errors import StageError
 from ..base.report import Report
-from ..classifier.dimensions import CHECKED
+from ..classifier.algorithms import CHECKED
 
 #: A base is sure of a point from this reliability on.
 SURE = 0.95

@@ -16,9 +16,8 @@ from ..base.files import check_writable
 from ..base.outputs import MODEL, Output
 from ..base.report import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
-from ..classifier.algorithms import ALGORITHMS, trainer
+from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, required, trainer, welcome
 from ..classifier.classes import ClassMap
-from ..classifier.dimensions import ALWAYS, CHECKED, required, welcome
 from ..classifier.foresttraining import SHORT
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import digest_of, find
