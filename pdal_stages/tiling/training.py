@@ -17,7 +17,6 @@ from ..base.errors import OptionError, StageError
 from ..base.outputs import check_outputs
 from ..base.report import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, train
-from ..classifier.algorithms import CHECKED
 from ..classifier.clouds import TiledCloud
 from ..classifier.summary import FILE_NUMBER
 from ..classifier.training import reach
