@@ -5,13 +5,8 @@ Source: ASPRS LAS specification 1.4-R15, tables 9 and 17.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
-
-from .errors import OptionError
 
 _CLASSES: dict[int, tuple[str, tuple[int, int, int]]] = {
     0: ("Created, never classified", (150, 150, 150)),
@@ -73,29 +68,6 @@ def class_color(code: int) -> tuple[int, int, int]:
 
 #: ASPRS codes of low, medium and high vegetation.
 LOW, MEDIUM, HIGH = 3, 4, 5
-
-
-def bands(values: Sequence[Any]) -> tuple[float, float] | None:
-    """Below these heights in meters vegetation is low, and medium; None where no values are given.
-
-    Raises
-    ------
-    OptionError
-        If the values are not two heights, the lower one first.
-    """
-    if not values:
-        return None
-    try:
-        low, medium = (float(one) for one in values)
-    except (TypeError, ValueError):
-        low = medium = 0.0
-    if not 0.0 < low < medium < 1000.0:
-        raise OptionError(
-            "option 'vegetation_heights' must be two heights in meters, the lower one first",
-            found=", ".join(map(str, values)),
-            cure="For example 0.5,2",
-        )
-    return low, medium
 
 
 def by_height(

@@ -32,18 +32,6 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _swept: set[str] = set()
 
 
-def open_to_append(path: str | os.PathLike) -> Any:
-    """A text file at whose end lines go, made where it is not there; a device or pipe is written into.
-
-    Raises
-    ------
-    OSError
-    """
-    return open(
-        path if is_stream(path) else real_path(path), "a", encoding="utf-8", errors="backslashreplace"
-    )
-
-
 def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -> Path:
     """Write a file so that it is either complete or absent; its path.
 

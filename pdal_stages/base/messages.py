@@ -12,8 +12,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from .errors import StageError
-from .files import open_to_append
-from .outputs import kind_of
 from .version import __version__
 
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
@@ -67,21 +65,16 @@ class RunLog:
     Raises
     ------
     StageError
-        The file cannot be written, or is one of another kind.
+        The file cannot be written.
     """
 
     def __init__(self, path: str, arguments: Sequence[str], stderr: Any) -> None:
         self._stderr, self._one = stderr, threading.Lock()
-        if kind := kind_of(path):
-            raise StageError(f"the log would be added to {kind}", where="--log", found=path)
         try:
-            self._file: Any = open_to_append(path)
-        except StageError as error:
-            raise error.at("--log") from None
+            self._file: Any = open(path, "a", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115
         except OSError as error:
-            raise StageError(
-                "the log cannot be written", where="--log", found=f"{path}: {error.strerror}"
-            ) from None
+            found = f"{path}: {error.strerror}"
+            raise StageError("the log cannot be written", where="--log", found=found) from None
         self._started = time.monotonic()
         self.add(f"pdal-stages {__version__}: {shlex.join(arguments)}")
 

@@ -84,12 +84,8 @@ def map_blocks(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-#: Bytes of each unit, by its first letter.
-_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 #: Taken where the system does not say what is free.
 _UNKNOWN = 4 * 10**9
-
-
 #: Nobody means so few bytes.
 _FEWEST = 1e6
 
@@ -103,17 +99,12 @@ def parse_size(text: str) -> int:
         For anything else.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
-    if match is None or float(match[1]) <= 0:
+    size = 0.0
+    if match is not None:
+        size = float(match[1]) * (1024 if match[3] else 1000) ** " KMGT".index(match[2].upper() or " ")
+    if size < _FEWEST:
         raise OptionError("an amount of memory is a number and a unit", found=text, cure="For example 4GB")
-    letter = match[2].upper()
-    if not letter and float(match[1]) < _FEWEST:
-        raise OptionError(
-            "an amount of memory is a number and a unit",
-            found=text,
-            cure=f"Write {match[1]}GB, if that is meant",
-        )
-    unit = 1024 ** "KMGT".index(letter) * 1024 if match[3] and letter else _UNITS[letter]
-    return int(float(match[1]) * unit)
+    return int(size)
 
 
 def free_memory() -> int:

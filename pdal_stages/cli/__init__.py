@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = str(int(options.progress))
         if getattr(options, "log", None):
-            check_outputs([Output(options.log, "log", "")], [])
+            check_outputs([Output(options.log, "log", "a log")], [])
             log = RunLog(options.log, arguments, sys.stderr)
             sys.stdout, sys.stderr = LoggedStream(sys.stdout, log), LoggedStream(sys.stderr, log)  # type: ignore[assignment]
         code = int(options.run(options) or 0)

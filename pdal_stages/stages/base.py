@@ -74,7 +74,7 @@ class Stage(ABC):
     #: What a stage that cannot run without points does with them, as a message says it.
     needs_points: ClassVar[str] = ""
     #: For a stage that needs all points at once: what to do instead of running it in tiles.
-    instead_of_tiles: ClassVar[str] = ""
+    instead_of_tiles: str = ""
     #: For a stage that a model file may carry, to be run by whoever applies it: the options that the file may give. Model
     #: files come from strangers, so none that holds a path.
     in_models: ClassVar[tuple[str, ...]] = ()
@@ -156,9 +156,6 @@ class Stage(ABC):
     def largest_class(self) -> int:
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0
-
-    def check_tiled(self) -> None:
-        """Refuse options whose result depends on all points at once."""
 
     def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
         """How far around a box lie the points that decide the results of the wanted ones, for an open-ended stage.

@@ -92,6 +92,12 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
 
     def check(self) -> None:
         check_side(self.voxel)
+        fits = self.plan.shapes or any(one.kind == "copt" for one in self.plan.neighborhoods)
+        if fits and not (self.bins and Path(self.bins).exists()):
+            self.instead_of_tiles = (
+                'Thresholds are fitted to the points: give "bins": "thresholds.json", and run the pipeline once without '
+                "--tile on one typical file, which writes it"
+            )
         for name in self.columns:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(
@@ -107,18 +113,6 @@ time per point bounded, whatever the radius: see [dense clouds](../features.md#d
 
     def halo_m(self) -> float:
         return self.plan.halo_m + self.voxel
-
-    def check_tiled(self) -> None:
-        if self.bins and Path(self.bins).exists():
-            return
-        if self.plan.shapes or any(one.kind == "copt" for one in self.plan.neighborhoods):
-            what = "shape distributions" if self.plan.shapes else "copt"
-            raise OptionError(
-                f"the thresholds of {what} are fitted to the points, so every tile would have its own",
-                found=f"bins {self.bins!r}, which does not exist" if self.bins else "no option 'bins'",
-                cure='Give "bins": "thresholds.json", and run the pipeline once without --tile on one typical file, '
-                "which writes it; a model file has its thresholds within",
-            )
 
     def run(self, points: Points) -> dict[str, NDArray]:
         plan, names = self.plan, self.columns

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from ..base import checks
-from ..base.asprs import OVERLAP, bands
+from ..base.asprs import OVERLAP
 from ..base.errors import OptionError, suggest
 from .selection import UNWANTED, Selection
 
@@ -133,7 +133,16 @@ class Option:
         return [self._parse_number(one) for one in self._parse_list(value)]
 
     def _parse_bands(self, value: Any) -> tuple[float, float] | None:
-        return bands(self._parse_list(value))
+        heights = self._parse_numbers(value)
+        if not heights:
+            return None
+        if len(heights) != 2 or not 0.0 < heights[0] < heights[1] < 1000.0:
+            raise OptionError(
+                f"option '{self.name}' must be two heights in meters, the lower one first",
+                found=", ".join(map(str, heights)),
+                cure="For example 0.5,2",
+            )
+        return heights[0], heights[1]
 
     def _parse_codes(self, value: Any) -> list[int]:
         chosen = self._parse_selection(value)

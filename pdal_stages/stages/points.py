@@ -151,12 +151,10 @@ class Points:
         self.xyz  # noqa: B018  before they are gone
         self.__dict__.pop("axes", None)
         kept, lent = set(names), self.arrays
-        if isinstance(lent, dict):
-            kept |= {name for name, array in lent.items() if array is self._own}
         self.arrays = {name: lent[name] for name in lent if name in kept}
         if self.lent_by_pdal:  # which makes these arrays for this one call, and frees them after it
-            for name in lent.keys() - kept:
-                give_back(lent[name])
+            for array in (lent[name] for name in lent.keys() - kept if lent[name] is not self._own):
+                give_back(array)
 
     def take_xyz(self) -> NDArray[np.float64]:
         """:attr:`xyz`, not kept here: who takes it may let go of it."""

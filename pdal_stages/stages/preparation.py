@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, StageError
+from ..base.las import number_type
 from . import registry
 from .options import Option, split_list
 
@@ -170,8 +171,7 @@ def made_of_coordinates(
         return {}
     options = {name: value for name, value in preparation[0].items() if name != "type"}
     stage = registry.get(preparation[0]["type"])({**options, "ignore": "withheld", "threads": threads or 0})
-    there = {name: np.zeros(len(xyz), kind.removesuffix("_t")) for name, kind in stage.creates().items()}
-    there = {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in there.items()}
+    there = {name: np.zeros(len(xyz), number_type(kind)) for name, kind in stage.creates().items()}
     withheld = np.zeros(len(xyz), np.uint8) if usable is None else (~usable).view(np.uint8)
     columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **there}
     made = stage.run(stage.points(columns))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import PipelineError, StageError
+from ..base.errors import PipelineError
 from ..base.outputs import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
 from ..pipeline import pdal as pdal_env
@@ -291,12 +291,7 @@ def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
             where=step.where,
             cure=instead or "Leave it out, or run the pipeline without --tile",
         )
-    if step.ours is not None:
-        try:
-            step.ours.check_tiled()
-        except StageError as error:
-            raise error.at(step.type) from None
-    elif step.sees_neighbors and buffer is None:
+    if step.ours is None and step.sees_neighbors and buffer is None:
         raise PipelineError(
             f"{step.type} may look at neighbors, and PDAL does not say how far",
             where=step.where,
