@@ -18,6 +18,7 @@ from ..base.arrays import coordinate_hash
 from ..base.errors import StageError
 from ..base.report import Report
 from ..classifier.algorithms import CHECKED
+from .points import class_counts
 
 #: A base is sure of a point from this reliability on.
 SURE = 0.95
@@ -32,15 +33,8 @@ class Looked(NamedTuple):
 
     def counts(self, checked: int) -> dict[str, Any]:
         """Points, those that a person checked wherever they lie, and how many of each class there are, as JSON has it."""
-        per_class = (
-            {str(code): n for code, n in Counter(self.codes[mask].tolist()).items()}
-            for mask in (self.wanted, self.sure)
-        )
-        return {
-            "points": len(self.codes),
-            "checked": checked,
-            **dict(zip(("wanted", "sure"), per_class, strict=True)),
-        }
+        wanted, sure = (class_counts(self.codes[mask]) for mask in (self.wanted, self.sure))
+        return {"points": len(self.codes), "checked": checked, "wanted": wanted, "sure": sure}
 
 
 class CheckedChoice:
@@ -49,21 +43,22 @@ class CheckedChoice:
     def __init__(self, known: Collection[int] | None, seed: int, parts: Iterable[Mapping[str, Any]]) -> None:
         self._known, self._seed = known, seed
         self._points = self._checked = 0
-        self._wanted, sure = Counter[int](), Counter[int]()
+        wanted, sure = Counter[str](), Counter[str]()
         for part in parts:
             self._points += part["points"]
             self._checked += part["checked"]
-            for sums, name in ((self._wanted, "wanted"), (sure, "sure")):
-                sums.update({int(code): n for code, n in part[name].items()})
+            wanted.update(part["wanted"])
+            sure.update(part["sure"])
+        self._wanted = wanted.total()
         if self._checked and not self._wanted:
             raise StageError(
                 "no checked point lies inside 'where'", found=f"{self._checked:,} checked points"
             )
-        both = self._wanted.keys() & set(known or ())
-        most = max((self._wanted[code] for code in both), default=0)
+        both = [code for code in known or () if wanted[str(code)]]
+        most = max((wanted[str(code)] for code in both), default=0)
         #: Of each class the share of points of which the base is sure, and about how many these are.
-        self._shares = {code: min(1.0, most / sure[code]) for code in both if sure[code]}
-        self._beside = sum(min(most, sure[code]) for code in self._shares)
+        self._shares = {code: min(1.0, most / n) for code in both if (n := sure[str(code)])}
+        self._beside = sum(min(most, sure[str(code)]) for code in self._shares)
 
     def __bool__(self) -> bool:
         """Whether any point was checked."""
@@ -79,7 +74,7 @@ class CheckedChoice:
 
     def say(self, report: Report) -> None:
         """What is to be known of it."""
-        number = report.figures["checked"] = sum(self._wanted.values())
+        number = report.figures["checked"] = self._wanted
         said = f"{number:,} of {self._points:,} points were checked by a person ({CHECKED}): samples are drawn from these"
         if self._known is not None:
             report.figures["anchors"] = self._beside
