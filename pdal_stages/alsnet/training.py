@@ -18,8 +18,8 @@ import numpy.typing as npt
 from ..base.arrays import coordinate_hash
 from ..base.errors import DependencyError, ModelError, OptionError
 from ..base.files import write_whole
+from ..base.messages import Progress
 from ..base.outputs import CHECKPOINT, Output
-from ..base.progress import Progress
 from ..base.resources import map_blocks, resolve_threads
 from ..classifier.algorithms import gather, versions, with_returns
 from ..classifier.classes import ClassMap

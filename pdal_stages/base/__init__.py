@@ -1,1 +1,1 @@
-"""What every room stands on: errors, checks, files, LAS headers, threads, progress, units."""
+"""What every room stands on: errors, checks, files, LAS headers, threads, messages, units."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .errors import DependencyError
-from .progress import Progress
+from .messages import Progress
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})

@@ -1,14 +1,17 @@
-"""What a command says: text that is safe for terminals, and the log file of a run."""
+"""What the user is told: messages that are safe for terminals, progress, what was found on the way, and a run's log."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shlex
 import sys
 import threading
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from typing import Any
 
 from .errors import StageError
@@ -49,6 +52,148 @@ class PlainStream:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
+
+
+def duration(seconds: float) -> str:
+    """Seconds up to two minutes, then minutes, then hours: ``95 s``, ``12 min``, ``3 h 20 min``."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+class Progress(AbstractContextManager):
+    """A line of progress: what is done (`label`), so many `unit` of `total` (0: not known), rate, time left.
+
+    Silent until `delay` seconds have passed. On a terminal the line is redrawn; elsewhere (a log) a new line is written
+    every 15 seconds. The environment variable ``PDAL_STAGES_PROGRESS=0`` silences it, as ``enabled=False`` does;
+    ``PDAL_STAGES_PROGRESS=lines`` writes a line every second, for a program that shows a bar of its own.
+    """
+
+    delay = 2.0
+
+    def __init__(self, total: int, label: str, unit: str = "points", *, enabled: bool | None = None) -> None:
+        self.total, self.label, self.unit = int(total), label, unit
+        # filters.python redirects sys.stdout, never stderr: stderr is always the user's.
+        self.stream = sys.__stderr__
+        wanted = os.environ.get("PDAL_STAGES_PROGRESS", "1")
+        silenced = enabled is False or wanted == "0"
+        self.enabled = self.stream is not None and not silenced
+        self.count = 0
+        self.started = time.monotonic()
+        self._terminal = self.stream is not None and self.enabled and self.stream.isatty()
+        if wanted == "lines":
+            self._terminal, self._every, self.delay = False, 1.0, 0.5
+        else:
+            self._every = 0.2 if self._terminal else 15.0
+        self._next = self.started + self.delay
+        self._shown = False
+
+    def update(self, amount: int = 1) -> None:
+        """Add finished work, and draw the line when it is due."""
+        self.count += int(amount)
+        now = time.monotonic()
+        if self.enabled and now >= self._next:
+            self._next = now + self._every
+            self._draw(now)
+
+    def _draw(self, now: float, end: bool = False) -> None:
+        seconds = max(now - self.started, 1e-9)
+        rate = self.count / seconds
+        text = f"{self.label}: {self.count:,}"
+        if self.total:
+            text += f" of {self.total:,} {self.unit} ({100.0 * self.count / self.total:.0f} %)"
+        else:
+            text += f" {self.unit if self.count != 1 else self.unit.removesuffix('s')}"
+        text += f", {rate:,.0f} {self.unit}/s" if rate >= 10 else f", {rate:.2g} {self.unit}/s"
+        if end:
+            text += f", {seconds:.1f} s"
+        elif self.total and 100 * self.count >= self.total:  # before, it is mostly what starting took
+            text += f", {duration(max(self.total - self.count, 0) / rate)} left"
+        if self.stream is None:
+            return
+        try:
+            self.stream.write(f"\r{text}\x1b[K" if self._terminal else f"{text}\n")
+            self.stream.flush()
+        except (OSError, ValueError):  # a closed or full stderr must not stop the work
+            self.enabled = False
+        self._shown = True
+
+    def clear(self) -> None:
+        """Take the line away, for something else to be printed; it comes back when it is due."""
+        if self._terminal and self._shown and self.stream is not None and self.enabled:
+            self.stream.write("\r\x1b[K")
+            self.stream.flush()
+
+    def close(self) -> None:
+        """Draw the last state, if anything was drawn at all."""
+        if self._shown and self.enabled:
+            self._draw(time.monotonic(), end=True)
+            if self._terminal and self.stream is not None:
+                self.stream.write("\n")
+        self.enabled = False
+
+    def __exit__(self, *exc) -> None:
+        self.close()
+
+
+@dataclass
+class Report:
+    """What a stage, a prediction or a feature engine reports beside its results.
+
+    Attributes
+    ----------
+    figures : dict
+        Counts and other JSON-able values by name, e.g. ``points`` or ``classes``.
+    notes : list of str
+        What the user should know; nothing is wrong.
+    warnings : list of str
+        What is likely wrong, and the cure.
+    beyond_halo : dict of str to int
+        By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile of that halo their
+        values may differ from those of the whole cloud.
+    reach : float
+        How far away the farthest of these lay, in meters; not in the metadata.
+    codes : dict of str to int or None
+        The points of each class code after a stage that gives classes, whichever it looked at; not in the metadata.
+    """
+
+    figures: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    beyond_halo: dict[str, int] = field(default_factory=dict)
+    reach: float = 0.0
+    codes: dict[str, int] | None = None
+
+    def merge(self, other: Report) -> None:
+        """Take over what another has. Of figures of one name, its own stay; dicts are merged by their keys."""
+        _merge(self.figures, other.figures)
+        _merge(self.beyond_halo, other.beyond_halo)
+        self.reach = max(self.reach, other.reach)
+        for mine, theirs in ((self.notes, other.notes), (self.warnings, other.warnings)):
+            mine += [text for text in theirs if text not in mine]
+
+    @property
+    def messages(self) -> list[str]:
+        """Warnings, then notes."""
+        return [*self.warnings, *self.notes]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as metadata: figures, and ``beyond_halo``, ``warning`` and ``note`` where there are any."""
+        texts = {"warning": self.warnings, "note": self.notes}
+        return (
+            self.figures
+            | ({"beyond_halo": self.beyond_halo} if self.beyond_halo else {})
+            | {name: ". ".join(lines) for name, lines in texts.items() if lines}
+        )
+
+
+def _merge(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
+    for name, value in theirs.items():
+        if isinstance(value, dict) and isinstance(mine.get(name), dict):
+            mine[name] = {**value, **mine[name]}
+        else:
+            mine.setdefault(name, dict(value) if isinstance(value, dict) else value)
 
 
 class RunLog:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import DimensionError, ModelError
-from ..base.report import Report
+from ..base.messages import Report
 from ..base.version import __version__
 from ..features import returns
 from ..features.index import CellGrid

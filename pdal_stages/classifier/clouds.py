@@ -17,7 +17,7 @@ from ..accuracy.labels import as_codes
 from ..base.arrays import begins_run, coordinate_hash
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
-from ..base.progress import Progress
+from ..base.messages import Progress
 from ..features.cells import cell_keys
 from ..features.voxels import represent
 from .algorithms import known

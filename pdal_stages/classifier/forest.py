@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.jit import njit
-from ..base.progress import Progress
+from ..base.messages import Progress
 from ..base.resources import map_blocks
 from .algorithms import ArrayRule
 

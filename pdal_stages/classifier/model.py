@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, ModelError, OptionError, suggest
-from ..base.report import Report
+from ..base.messages import Report
 from ..features import FeaturePlan
 from ..features.index import build_grid, check_xyz
 from ..features.voxels import check_side, represent

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from ..accuracy.measures import Accuracy
 from ..base.arrays import coordinate_hash
 from ..base.errors import OptionError
-from ..base.progress import Progress
+from ..base.messages import Progress
 
 #: Side of a cell of the curve in meters.
 CELL = 0.5

@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.progress import Progress
-from ..base.report import Report
+from ..base.messages import Progress, Report
 from ..base.resources import map_blocks, resolve_threads
 from .bins import ShapeBins
 from .index import CellGrid, build_grid, check_xyz

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..base.errors import optional_import, suggest
-from ..base.report import Report
+from ..base.messages import Report
 from .bins import ShapeBins
 
 

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, StageError, suggest
+from ..base.messages import Progress, Report
 from ..base.outputs import check_outputs
-from ..base.progress import Progress
-from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from .classify_request import ClassifyRequest

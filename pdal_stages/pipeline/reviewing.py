@@ -17,9 +17,8 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.las import read_header
-from ..base.messages import print_messages
+from ..base.messages import Progress, print_messages
 from ..base.outputs import HTML, JSON, Output, check_outputs
-from ..base.progress import Progress
 from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD

@@ -15,8 +15,8 @@ from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import whole_files
 from ..base.las import odd_text, supersede_copc
 from ..base.lascheck import check_complete, check_readable
+from ..base.messages import Report
 from ..base.outputs import Output, check_outputs
-from ..base.report import Report
 from ..stages import registry
 from . import las_output, runtime
 from . import pdal as pdal_env

@@ -22,7 +22,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
-from ..base.report import Report
+from ..base.messages import Report
 from ..stages import registry
 from ..stages.base import Stage
 from ..stages.points import Points

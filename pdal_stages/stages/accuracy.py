@@ -17,9 +17,8 @@ from ..accuracy.text import by_file, summary
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import check_writable, write_whole
-from ..base.messages import plain
+from ..base.messages import Report, plain
 from ..base.outputs import HTML, JSON, Output
-from ..base.report import Report
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
 from .base import Stage, files_read

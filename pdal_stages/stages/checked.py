@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import coordinate_hash
 from ..base.errors import StageError
-from ..base.report import Report
+from ..base.messages import Report
 from ..classifier.algorithms import CHECKED
 from .points import class_counts
 

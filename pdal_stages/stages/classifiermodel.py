@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..base.errors import ModelError, OptionError
 from ..base.files import check_writable
+from ..base.messages import Report
 from ..base.outputs import MODEL, Output
-from ..base.report import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, required, trainer, welcome
 from ..classifier.classes import ClassMap

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..base.asprs import HIGH as HIGH_VEGETATION
 from ..base.asprs import LOW, MEDIUM, by_height
 from ..base.errors import OptionError
-from ..base.progress import Progress
+from ..base.messages import Progress
 from ..classifier import Model
 from ..classifier.model import UNCLASSIFIED, loaded_model
 from ..classifier.modelfile import find

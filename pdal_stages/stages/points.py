@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.report import Report
+from ..base.messages import Report
 from ..base.resources import give_back
 from ..base.units import Units, reprojection_cure, units_of_wkt
 from .selection import Expression, Selection

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base import checks
 from ..base.errors import OptionError, suggest
-from ..base.progress import Progress
+from ..base.messages import Progress
 from ..base.resources import map_blocks
 from .districts import fill
 from .solids import VEGETATION, build_scene, cast

@@ -17,8 +17,7 @@ from ..base import lascheck
 from ..base.errors import DependencyError, StageError
 from ..base.files import sweep
 from ..base.jit import kept_kernels
-from ..base.messages import print_messages
-from ..base.progress import Progress
+from ..base.messages import Progress, print_messages
 from ..base.version import build
 from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.read import Override, PipelineSource
