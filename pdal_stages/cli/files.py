@@ -282,6 +282,6 @@ def _review(options: argparse.Namespace) -> None:
 def _corrections(options: argparse.Namespace) -> None:
     from ..pipeline.correcting import write_corrections
 
-    done = write_corrections(options.before, options.out, options.after or "", options.area, options.around)
-    print("\n".join(done.lines))
+    told = write_corrections(options.before, options.out, options.after or "", options.area, options.around)
+    print("\n".join(told))
     print(f"written to {options.out}; next: pdal-stages train --base MODEL {options.out} --model NEW")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,7 @@ from ..base.errors import OptionError, StageError
 from ..base.files import whole_files
 from ..base.outputs import Output, check_outputs
 from ..classifier.algorithms import CHECKED
-from ..objects.outlines import vector
+from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
 from .inputs_outputs import reference_of_file
 from .parts import las_chunks, reads_in_parts
@@ -28,20 +26,10 @@ _MOST_LOST = 0.1
 _PATCHES, _DONE = "patches", "done"
 
 
-@dataclass
-class Corrections:
-    """What was found."""
-
-    points: int
-    changed: int  #: points with another class now
-    checked: int  #: points that a person has checked, then or now
-    lines: list[str]  #: all that is to be told
-
-
 def write_corrections(
     before: str, output: str, after: str = "", areas: Sequence[str] = (), around: float = 1.0
-) -> Corrections:
-    """Mark what was checked, and write the points of `before` with the classes of `after`.
+) -> list[str]:
+    """Mark what was checked, and write the points of `before` with the classes of `after`; what is to be told.
 
     All else stays as it is in `before`, whatever the program of the person dropped.
 
@@ -61,6 +49,8 @@ def write_corrections(
     StageError
         If a file cannot be read, or the two do not hold the same points.
     """
+    import laspy
+
     checks.number("'--around'", around, 0, 100, unit="m")
     if not after and not areas:
         raise OptionError(
@@ -100,13 +90,17 @@ def write_corrections(
             found=f"class {int(new.max())}",
             cure="Convert it to LAS 1.4 first (minor_version 4, dataformat_id 6)",
         )
-    _write(output, las, new, checked)
-    counts = len(codes), int(changed.sum()), int(checked.sum())
-    share = 100.0 * counts[2] / counts[0]
-    lines = [f"{counts[0]:,} points, {counts[1]:,} changed, {counts[2]:,} checked ({share:.2f} %)"]
+    if CHECKED not in las.point_format.extra_dimension_names:
+        las.add_extra_dim(laspy.ExtraBytesParams(CHECKED, "uint8", "1: a person has checked it"))
+    las.classification, las[CHECKED] = new, checked.astype(np.uint8)
+    with whole_files(output) as (part,):
+        las.write(str(part))
+    lines = [
+        f"{len(codes):,} points, {changed.sum():,} changed, {checked.sum():,} checked ({checked.mean():.2%})"
+    ]
     moves = Counter(zip(codes[changed].tolist(), new[changed].tolist(), strict=True))
     lines += [f"  {one} became {other}{n:>14,}" for (one, other), n in moves.most_common()]
-    return Corrections(*counts, [*lines, *notes])
+    return [*lines, *notes]
 
 
 def _read(path: str) -> Any:
@@ -115,13 +109,11 @@ def _read(path: str) -> Any:
 
     with laspy.open(path) as reader:
         header = reader.header
-    header.vlrs[:] = [one for one in header.vlrs if one.user_id != "copc"]
-    if header.evlrs:
-        header.evlrs[:] = [one for one in header.evlrs if one.user_id != "copc"]
-    records = list(las_chunks(path))
+    for records in filter(None, (header.vlrs, header.evlrs)):
+        records[:] = [one for one in records if one.user_id != "copc"]
     out = laspy.LasData(header)
-    if records:
-        joined = np.concatenate([one.array for one in records])
+    if points := [one.array for one in las_chunks(path)]:
+        joined = np.concatenate(points)
         out.points = laspy.ScaleAwarePointRecord(joined, header.point_format, header.scales, header.offsets)
     return out
 
@@ -155,16 +147,12 @@ def _codes_of(
 def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> NDArray[np.bool_]:
     """Which points lie in the polygons of a file; of the patches of ``review`` those that were looked at."""
     file, _, layer = area.partition("|layername=")
-    done = ""
-    if Path(file).exists():
-        pyogrio = vector("pyogrio")
-        try:
-            layers = [str(name) for name, _ in pyogrio.list_layers(file)]
-            layer = layer or (_PATCHES if _PATCHES in layers else "")
-            about = pyogrio.read_info(file, **({"layer": layer} if layer else {}))
-            done = f"{_DONE} = 1" if _DONE in about["fields"] else ""
-        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
-            raise StageError("the polygons cannot be read", where=file, found=str(error)) from None
+    pyogrio = vector("pyogrio")
+    with reading(file):
+        if not layer and _PATCHES in [str(name) for name, _ in pyogrio.list_layers(file)]:
+            layer = _PATCHES
+        fields = pyogrio.read_info(file, layer=layer or None)["fields"]
+    done = f"{_DONE} = 1" if _DONE in fields else ""
     x, y = xyz[:, 0], xyz[:, 1]
     box = float(x.min()), float(y.min()), float(x.max()), float(y.max())
     shapes, note = polygons_of(Overlay(file, layer, 0, ()), wkt, box, where=done)
@@ -182,22 +170,9 @@ def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> 
             cure="Check its reference system; GeoJSON without one is in degrees",
         )
     inside = points_inside(x, y, shapes)
-    notes += [note] if note else []
-    notes.append(
-        f"{int(inside.sum()):,} points lie in the {len(shapes):,} polygons of {file} that were looked at"
-    )
+    told = f"{inside.sum():,} points lie in the {len(shapes):,} polygons of {file} that were looked at"
+    notes += [*filter(None, [note]), told]
     return inside
-
-
-def _write(output: str, las: Any, codes: NDArray[np.uint8], checked: NDArray[np.bool_]) -> None:
-    import laspy
-
-    if CHECKED not in las.point_format.extra_dimension_names:
-        las.add_extra_dim(laspy.ExtraBytesParams(CHECKED, "uint8", "1: a person has checked it"))
-    las.classification = codes
-    las[CHECKED] = checked.astype(np.uint8)
-    with whole_files(output) as (part,):
-        las.write(str(part))
 
 
 def partners(
