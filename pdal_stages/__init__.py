@@ -18,7 +18,7 @@ _WHERE = {
     "Model": "classifier",
     "ObjectSettings": "objects",
     "FeatureTable": "features",
-    "Pipeline": "pipeline",
+    "Pipeline": "pipeline.run",
     "PointClassifier": "classifier.estimator",
     "StageError": "base.errors",
     "TrainingCloud": "classifier",
@@ -34,7 +34,7 @@ _WHERE = {
     "object_frames": "reports.objectlayers",
     "object_layers": "reports.objectlayers",
     "parse_neighborhoods": "features.neighborhoods",
-    "run_pipeline": "pipeline",
+    "run_pipeline": "pipeline.run",
     "run_stage": "pipeline.runtime",
     "run_tiled": "tiling",
     "TilingOptions": "tiling.settings",
@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
     from .objects import Cells, ObjectSettings, find_objects
-    from .pipeline import Pipeline, run_pipeline
     from .pipeline.native import Filter, Writer
+    from .pipeline.run import Pipeline, run_pipeline
     from .reports.accuracypage import write_accuracy_report
     from .reports.objectlayers import object_frames, object_layers
     from .synthetic import make_town

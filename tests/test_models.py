@@ -14,7 +14,7 @@ from pdal_stages.base.errors import DimensionError, OptionError, StageError
 from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.modelfile import STANDARD, find, shipped
 from pdal_stages.cli import main
-from pdal_stages.pipeline import Pipeline
+from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.stages.preparation import made_of_coordinates, preparation_of
 from pdal_stages.synthetic import make_town, write_town
 from pdal_stages.tiling import run_tiled

@@ -7,6 +7,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import njit
+from ..terrain.linked import number_sets
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
 PLANE, NEAR = 0.12, 0.2
@@ -162,12 +163,9 @@ def connected(mask: NDArray, step: float, *values: NDArray) -> NDArray[np.int64]
 
 def _sets(a: NDArray, b: NDArray, count: int) -> NDArray[np.int64]:
     """Of each of `count` members the number of its set, in the order of their first members; a and b are joined."""
-    pairs = scipy.sparse.coo_matrix((np.ones(len(a), np.bool_), (a, b)), (count, count))
-    _, of = scipy.sparse.csgraph.connected_components(pairs, directed=False)
-    _, first, at = np.unique(of, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[at]
+    number = np.empty(count, np.int64)
+    number_sets(a, b, number)
+    return number
 
 
 def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int) -> NDArray[np.int64]:

@@ -13,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from ..accuracy.text import percent
 from ..base.asprs import class_color
 from ..base.messages import plain
+from ..base.progress import duration
 from ..base.version import __version__
 
 
@@ -59,15 +60,6 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.6g}"
     return "none" if value is None else str(value)
-
-
-def duration(seconds: float) -> str:
-    """Seconds as people say them: "9.5 s", "2:05 min", "3 h 07"."""
-    if round(seconds) < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d}" if hours else f"{minutes}:{rest:02d} min"
 
 
 def _today() -> str:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.messages import one_line
+from ..base.progress import duration
 from .objectlayers import qml
-from .page import duration, render
+from .page import render
 
 #: Rows in the page's tables, and in text.
 _ROWS, _WORST = 200, 10

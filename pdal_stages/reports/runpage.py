@@ -9,7 +9,8 @@ from typing import Any
 
 from ..base.asprs import class_name
 from ..base.files import write_whole
-from .page import duration, render
+from ..base.progress import duration
+from .page import render
 
 #: Most rows of the table of times.
 ROWS = 200
