@@ -12,8 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..accuracy.text import percent
 from ..base.asprs import class_color
-from ..base.messages import plain
-from ..base.progress import duration
+from ..base.messages import duration, plain
 from ..base.version import __version__
 
 

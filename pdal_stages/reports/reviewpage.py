@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.messages import one_line
-from ..base.progress import duration
+from ..base.messages import duration, one_line
 from .objectlayers import qml
 from .page import render
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..base.asprs import class_name
 from ..base.files import write_whole
-from ..base.progress import duration
+from ..base.messages import duration
 from .page import render
 
 #: Most rows of the table of times.
