@@ -76,9 +76,6 @@ def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
     read = sum(job.record["read"] for job in run.tiles)
     own = sum(job.record["points"] for job in run.tiles)
     assert read <= 1.01 * own  # what noise marked is kept
-    steps = run.summary["cpu_seconds_by_step"]
-    assert set(steps) == {"index", "first_rounds", "tiles", "outputs"} and min(steps.values()) > 0
-    assert run.summary["cpu_seconds"] == pytest.approx(sum(steps.values()))
     assert not list((tmp_path / "out" / ".pdal-stages" / "kept").glob("*.np[yz]"))
 
 

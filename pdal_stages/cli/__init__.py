@@ -184,3 +184,15 @@ class Parser(argparse.ArgumentParser):
 def switch(takes: Callable, flag: str, default: bool, help: str) -> None:
     """Add ``--flag`` and ``--no-flag``."""
     takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
+
+
+def takes_options(takes: Callable, stage: str, *names: str) -> None:
+    """Add flags for options of a stage, in the words that these are declared in."""
+    from ..stages import registry
+
+    kinds = {"integer": int, "number": float}
+    for option in registry.get(stage).all_options():
+        if option.name in names:
+            what, choices = option.help.replace("%", "%%"), option.choices or None
+            how = {"type": kinds.get(option.kind), "choices": choices, "help": what}
+            takes(f"--{option.name.replace('_', '-')}", **how)

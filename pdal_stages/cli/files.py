@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ..base.asprs import class_name
 from ..base.errors import StageError
 from ..base.messages import one_line, print_messages
-from . import INPUTS, Parser, switch, tiles
+from . import INPUTS, Parser, switch, takes_options, tiles
 
 if TYPE_CHECKING:
     from ..tiling.classify import ClassifyTask
@@ -81,19 +81,7 @@ def add_commands(parser: Parser) -> None:
         True,
         "Mend classes that contradict their surroundings at the end (filters.consistency)",
     )
-    takes(
-        "--vegetation-heights",
-        default="",
-        metavar="LOW,MEDIUM",
-        help="Vegetation below these heights in meters, e.g. 0.5,2, is low (3) and medium (4), the rest high (5)",
-    )
-    takes(
-        "--keep-sure",
-        type=float,
-        metavar="SHARE",
-        help="Leave points unclassified (1) where the model is not sure enough for this share of each class to be right, "
-        "e.g. 0.98, as measured on ground it had not seen",
-    )
+    takes_options(takes, "filters.modelclassifier", "vegetation_heights", "keep_sure")
     takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     tiles.add_arguments(parser.commands["classify"], survey=True)
@@ -107,9 +95,7 @@ def add_commands(parser: Parser) -> None:
     )
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    takes("--outlines", choices=("straight", "cells"), help="Outlines along walls (default) or along cells")
-    cell = "Side of the grid's cells (0.5, where points are fewer than 4 or so per m2 1, 2 or 4)"
-    takes("--cell", type=float, metavar="METERS", help=cell)
+    takes_options(takes, "writers.objects", "outlines", "cell")
     takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
@@ -183,7 +169,7 @@ def _classify(options: argparse.Namespace) -> int:
         others = [one for one in others if one not in own]
     listed = options.dimensions
     named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
-    same = ("noise", "bridges", "towers", "consistency", "vegetation_heights", "keep_sure")
+    same = ("noise", "bridges", "towers", "consistency", "keep_sure")
     request = ClassifyRequest(
         options.model,
         tuple(others),
@@ -191,6 +177,7 @@ def _classify(options: argparse.Namespace) -> int:
         named,
         wires=options.wires or options.towers,
         polygons=tuple(options.polygons),
+        vegetation_heights=options.vegetation_heights or "",
         **{name: getattr(options, name) for name in same},
     )
     print_messages(*request.cost)

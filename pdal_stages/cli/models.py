@@ -9,7 +9,10 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.messages import print_messages
 from ..base.outputs import JSON, Output, check_outputs
-from . import INPUTS, OVERRIDES, Parser, tiles
+from . import INPUTS, OVERRIDES, Parser, takes_options, tiles
+
+#: Options of ``writers.classifiermodel`` that ``train`` has flags for.
+_OF_TRAINING = ("base", "passes", "classes", "neighborhoods", "feature_set", "count", "trees")
 
 
 def add_commands(parser: Parser) -> None:
@@ -19,24 +22,7 @@ def add_commands(parser: Parser) -> None:
     takes = parser.command("train", _train, "Train a model on labeled clouds", overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help=f"Labeled: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write")
-    takes(
-        "--base", metavar="MODEL", help="A model to build on: standard, or a file; then few labels are enough"
-    )
-    takes(
-        "--passes",
-        type=int,
-        help="Forests one after the other (default: 2; on top of --base 1, for few labels: take 2 for a labeled survey)",
-    )
-    takes(
-        "--classes",
-        metavar="MAP",
-        help="Codes (2,5,6), or a JSON mapping of labels to classes with their names, e.g. "
-        '\'{"2": "2 Ground", "3,4,5": "5 Vegetation", "6": "6 Building"}\'',
-    )
-    takes("--neighborhoods", help="Preset or tokens, e.g. s5,k10,k50")
-    takes("--feature-set", help="Groups or single features, e.g. covariance,geometric")
-    takes("--count", type=int, help="Samples of each class")
-    takes("--trees", type=int, help="Number of trees")
+    takes_options(takes, "writers.classifiermodel", *_OF_TRAINING)
     takes(
         "--surveys",
         nargs="*",
@@ -116,8 +102,7 @@ def _train(options: argparse.Namespace) -> None:
     from ..pipeline.training import surveys_of
     from ..tiling.training import TrainTask
 
-    named = ("classes", "neighborhoods", "feature_set", "count", "trees", "base", "passes")
-    extra = {name: value for name in named if (value := getattr(options, name)) is not None}
+    extra = {name: value for name in _OF_TRAINING if (value := getattr(options, name)) is not None}
     files, surveys = input_files(options.inputs), {}
     if options.surveys is not None:
         surveys = surveys_of(files, options.surveys)

@@ -34,7 +34,7 @@ MAKERS = {
 }
 #: How the warnings begin that a `where` chooses no point, and that none of a file's polygons is near; in tiles they are
 #: told where it is so in all.
-HOLDS_NOWHERE = "'where' holds for none of the"
+HOLDS_NOWHERE = "'where' holds for none of the points:"
 TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
@@ -91,7 +91,7 @@ class Points:
             self.mask = where.evaluate(freed)
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             if self.count and not self.report.figures["where"]:
-                self.report.warnings.append(f"{HOLDS_NOWHERE} {self.count:,} points: {where.text}")
+                self.report.warnings.append(f"{HOLDS_NOWHERE} {where.text}")
 
     @property
     def inside(self) -> NDArray[np.bool_]:

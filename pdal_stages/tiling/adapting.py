@@ -22,6 +22,7 @@ from ..classifier.model import load_model
 from ..classifier.modelfile import digest_of
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las
+from ..pipeline.parts import las_chunks
 from .classify import ClassifyTask
 from .settings import TilingOptions
 from .training import TrainTask
@@ -119,12 +120,9 @@ def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]
 
 def sure_points(files: Sequence[str], sure: float, codes: Sequence[int]) -> dict[int, int]:
     """Of each class, the points of classified files whose ``Reliability`` is at least `sure`."""
-    import laspy
-
     total = np.zeros(256, np.int64)
     for name in files:
-        with laspy.open(name) as file:
-            for points in file.chunk_iterator(1_000_000):
-                good = np.asarray(points["Reliability"]) >= sure
-                total += np.bincount(np.asarray(points.classification)[good], minlength=256)
+        for points in las_chunks(name):
+            good = np.asarray(points["Reliability"]) >= sure
+            total += np.bincount(np.asarray(points.classification)[good], minlength=256)
     return {code: int(total[code]) for code in codes}

@@ -16,7 +16,7 @@ from ..base.files import write_whole
 from ..base.outputs import JSON, Output, check_outputs
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
-from .inputs import ept_format, read_ept
+from .inputs import ept_form, read_ept
 from .plan import plan_of_files
 from .report import Job, TiledRun, left_alone
 from .run import run_plan
@@ -180,11 +180,9 @@ def one_format(paths: Sequence[str]) -> dict[str, Any]:
     for path in paths:
         try:
             if is_ept(path):
-                described = read_ept(path)
-                axes = {one["name"]: one for one in described["schema"]}
-                formats.add(ept_format(described))
-                found = [axes.get(axis, {}).get(name) for name in ("scale", "offset") for axis in "XYZ"]
-                places.add(tuple(float(v or (0.001, 0.0)[n > 2]) for n, v in enumerate(found)))
+                form = ept_form(read_ept(path))
+                formats.add(form["dataformat_id"])
+                places.add(tuple(form[f"{what}_{axis}"] for what in ("scale", "offset") for axis in "xyz"))
             elif is_las(path) and (header := las.read_header(path)) and header.count:
                 formats.add(header.point_format)
                 places.add((*header.scales, *header.offsets))

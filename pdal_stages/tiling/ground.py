@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..pipeline.runtime import points_of
 from ..stages.hag_morphological import HagMorphological, inside_block
 from .inputs import CloudIndex, InputSource
+from .outputs import arrays_of
 from .pieces import Piece, cut_all
 from .plan import OUTSIDE, FirstRound, TilePlan
 from .settings import Box, TileGrid
@@ -58,10 +59,7 @@ class FirstRoundTask:
     target: str  #: file for what is left of its points
 
     def run(self) -> dict[str, Any]:
-        """Write what is left of the tile's own points, and what the stages before the one that wants it made of them.
-
-        The latter as arrays named ``INPUT/index`` (the points' numbers) and ``INPUT/DIMENSION``.
-        """
+        """Write what is left of the tile's own points, and what the stages before the one that wants it made of them."""
         context, plan, first = self.context, self.context.plan, self.first
         stage, left = stage_of(plan), [{"around": np.empty((0, 3))}]
 
@@ -80,10 +78,8 @@ class FirstRoundTask:
             name: np.concatenate([one[name] for one in left if name in one])
             for name in {name for one in left for name in one}
         }
-        for result in head.results if first.kept else ():
-            key = result.piece.source.key
-            arrays[f"{key}/index"] = result.piece.index[result.rows]
-            arrays |= {f"{key}/{name}": values for name, values in result.values.items()}
+        if first.kept:
+            arrays |= arrays_of(head.results)
         save_arrays(self.target, arrays)
         return {"outputs": written([self.target]), "messages": head.messages}
 
@@ -157,6 +153,6 @@ def _changed(names: Sequence[str], left: list[str], piece: Piece) -> Changed:
             rows = np.searchsorted(piece.index, kept["index"])
             rows[rows == len(piece.index)] = 0
             there = piece.index[rows] == kept["index"]
-            parts.append((rows[there], *(kept[name][there] for name in names)))
+            parts.append((rows[there], *(kept[f"dim/{name}"][there] for name in names)))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     return {name: (columns[0], column) for name, column in zip(names, columns[1:], strict=False)}

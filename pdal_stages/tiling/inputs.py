@@ -165,10 +165,15 @@ def read_ept(path: str) -> dict[str, Any]:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
 
 
-def ept_format(described: Mapping[str, Any]) -> int:
-    """The LAS point format that has the colors of an EPT source."""
-    names = {dimension["name"] for dimension in described["schema"]}
-    return 8 if "Infrared" in names else 7 if "Red" in names else 6
+def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of ``writers.las`` for an EPT source: its scales, offsets and colors."""
+    axes = {dimension["name"]: dimension for dimension in described["schema"]}
+    colored = 8 if "Infrared" in axes else 7 if "Red" in axes else 6
+    form = {"minor_version": 4, "dataformat_id": colored}
+    for axis in "XYZ":
+        form[f"scale_{axis.lower()}"] = float(axes.get(axis, {}).get("scale") or 0.001)
+        form[f"offset_{axis.lower()}"] = float(axes.get(axis, {}).get("offset") or 0.0)
+    return form
 
 
 def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
@@ -176,15 +181,10 @@ def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
 
     Scales and offsets are the source's, so coordinates stay what they are; other dimensions become extra dimensions.
     """
-    described = read_ept(source.path)
-    form = {"minor_version": 4, "dataformat_id": ept_format(described), "extra_dims": "all"}
-    for dimension in described["schema"]:
-        if dimension["name"] in ("X", "Y", "Z"):
-            axis = dimension["name"].lower()
-            form[f"scale_{axis}"] = dimension.get("scale", 0.001)
-            form[f"offset_{axis}"] = dimension.get("offset", 0.0)
-    writer = {"type": "writers.las", "filename": target, **form}
-    run = pdal_env.execute([source.within(box), writer], arrays=False)
+    form = {**ept_form(read_ept(source.path)), "extra_dims": "all"}
+    run = pdal_env.execute(
+        [source.within(box), {"type": "writers.las", "filename": target, **form}], arrays=False
+    )
     return bool(run.count and las_extent(target).count)
 
 

@@ -27,7 +27,7 @@ from .inputs import InputSource
 from .pieces import BLOCK, Piece, header_of, record_blocks, write_records
 from .plan import TilePlan
 from .settings import MOST_AT_ONCE
-from .store import load_arrays, save_arrays, written
+from .store import load_arrays, written
 
 #: PDAL's names of types that are not NumPy's with ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}
@@ -86,8 +86,8 @@ def changed_in(
     return out
 
 
-def save_results(path: str | Path, results: Iterable[PieceResults]) -> None:
-    """Write a tile's results, for the files that outputs are put together from."""
+def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
+    """Results of a tile as they are kept, by the key of each input."""
     content: dict[str, NDArray] = {}
     for result in results:
         piece, key = result.piece, result.piece.source.key
@@ -95,7 +95,7 @@ def save_results(path: str | Path, results: Iterable[PieceResults]) -> None:
             content[f"{key}/index"] = piece.index[result.rows]
             content[f"{key}/own"] = np.array(len(piece.own))
             content |= {f"{key}/dim/{name}": values for name, values in result.values.items()}
-    save_arrays(path, content)
+    return content
 
 
 def read_results(tiles: Iterable[str], source: InputSource, count: int, start: int, end: int) -> NewValues:
@@ -167,7 +167,8 @@ def run_tail(
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
     with Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
-        stages = merged(callbacks, readers, new, flags)
+        stages, inputs = read_with(callbacks, readers, new, flags)
+        stages.append({"type": "filters.merge", "inputs": inputs})
         waiting = iter(partials)
         for stage in tail:
             stage = {k: v for k, v in stage.items() if k != "inputs"}
@@ -179,22 +180,25 @@ def run_tail(
     return {"outputs": written(outputs), "written": run.count}
 
 
-def merged(
+def read_with(
     callbacks: Callbacks,
     readers: list[dict[str, Any]],
     new: list[NewValues],
     flags: Sequence[bool],
-) -> list[dict[str, Any]]:
-    """Stages that read points, give them their new values, and merge them."""
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Stages that read points and give them their new values, and the tags of the last ones.
+
+    `flags`: of each reader, whether flags must be split from the class (old PDAL); empty for none.
+    """
     stages: list[dict[str, Any]] = []
-    inputs = []
+    last = []
     for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
         holds_flags = flags_in_classes(reader["filename"])
         stages += [{**reader, "tag": f"in{number}"}, *_put(callbacks, values, number, holds_flags)]
         if flags and flags[number]:
             stages.append(las_output.flag_splitter([True], inputs=[stages[-1]["tag"]], tag=f"split{number}"))
-        inputs.append(stages[-1]["tag"])
-    return [*stages, {"type": "filters.merge", "inputs": inputs}]
+        last.append(stages[-1]["tag"])
+    return stages, last
 
 
 def _put(callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool) -> Iterator[dict[str, Any]]:

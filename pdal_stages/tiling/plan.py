@@ -13,7 +13,7 @@ from ..base.outputs import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import writes_las
-from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of
+from ..pipeline.inputs_outputs import MOVING, is_ept, named_outputs, outputs_of
 from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
 from ..stages.base import Stage
@@ -32,8 +32,6 @@ _PER_POINT = _filters(
     "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay projpipeline range "
     "reprojection transformation"
 )
-#: Of them, those that move points: tiles are cut before, so they may only come after all stages of ours.
-MOVING = _filters("reprojection transformation projpipeline")
 #: Filters whose result depends on all points at once.
 _GLOBAL = _filters(
     "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad mortonorder "

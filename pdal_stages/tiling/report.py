@@ -49,7 +49,6 @@ class Job:
         None  #: what the writers write; None for a tile whose points go into outputs of files
     )
     jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is put together from
-    step: str = "tiles"  #: of the run: ``index``, ``first_rounds``, ``tiles``, ``outputs``
     mark: str = ""  #: fingerprint of all that decides its result
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
     state: str = "waiting"
@@ -57,6 +56,11 @@ class Job:
     record: dict[str, Any] = field(default_factory=dict)
     reason: str = ""  #: why it failed
     blocked_by: str = ""  #: the unreadable input that it failed for, where that is the reason
+
+    @property
+    def is_output(self) -> bool:
+        """Whether it is an output that is put together from tiles."""
+        return self.source is not None and self.outputs is not None
 
     def fail(self, reason: str, blocked_by: str = "") -> None:
         """It cannot be done."""
@@ -150,8 +154,8 @@ class TiledRun:
         }
 
 
-def summarize(tiles: list[Job], cpu_seconds: Mapping[str, float], seconds: float) -> dict[str, Any]:
-    """Figures of all tiles together, and of the processor time by step, for :attr:`TiledRun.summary`."""
+def summarize(tiles: list[Job], cpu_seconds: float, seconds: float) -> dict[str, Any]:
+    """Figures of all tiles together, for :attr:`TiledRun.summary`."""
     worked = [job.record for job in tiles if job.state == "done"]
     classes: Counter[str] = Counter()
     alone: Counter[str] = Counter()
@@ -168,8 +172,7 @@ def summarize(tiles: list[Job], cpu_seconds: Mapping[str, float], seconds: float
         "dropped": total("dropped"),
         "seconds": seconds,
         "points_per_second": total("points") / seconds if seconds else 0.0,
-        "cpu_seconds": sum(cpu_seconds.values()),
-        "cpu_seconds_by_step": dict(cpu_seconds),
+        "cpu_seconds": cpu_seconds,
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
         "left_alone": {key: alone[key] for key in LEFT_ALONE if alone[key]},

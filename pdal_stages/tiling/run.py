@@ -178,7 +178,7 @@ class _Run:
         self.plan, self.survey, self.store, self.workers, self.show = plan, survey, store, workers, show
         self.tiles: list[Job] = []  #: with points of their own, row by row
         self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
-        self.cpu_seconds: dict[str, float] = {}  #: of tasks, tries that failed too, by step
+        self.cpu_seconds = 0.0  #: of tasks, tries that failed too
         self.peak_mb = 0.0  #: the most memory that a process held
         self.messages_before: list[list[str]] = []  #: warnings and notes of the rounds before the tiles
         #: How far around a tile, in units of the coordinates, inputs are at hand: it may have to be read wider.
@@ -196,12 +196,11 @@ class _Run:
         """
         for job in waiting:
             self.store.forget(job.name)
-        counted = [job for job in waiting if job.step != "outputs"]
+        counted = [job for job in waiting if not job.is_output]
         done, failures = 0, []
         with Progress(sum(job.points for job in counted), what, enabled=self.show) as progress:
             for job, answer in run_tasks(self.workers, waiting, task_of):
-                spent = self.cpu_seconds.get(job.step, 0.0)
-                self.cpu_seconds[job.step] = spent + answer.cost.get("cpu_seconds", 0.0)
+                self.cpu_seconds += answer.cost.get("cpu_seconds", 0.0)
                 self.peak_mb = max(self.peak_mb, answer.cost.get("peak_mb", 0.0))
                 if answer.reason:
                     job.fail(answer.reason)
@@ -209,7 +208,7 @@ class _Run:
                     job.state, job.record = "done", answer.result | answer.cost
                     with contextlib.suppress(OSError):  # no room: a later run does it again
                         self.store.finish(job.name, job.mark, job.record)
-                if job.step != "outputs":
+                if not job.is_output:
                     done += not answer.reason
                     failures += [answer.reason] if answer.reason else []
                     failed = f", {len(failures)} failed" if failures else ""
@@ -242,7 +241,7 @@ class _Run:
                 survey.indexes[source.path] = CloudIndex.of(known, copy)
             else:
                 points = survey.extents[source.path].count
-                waiting.append(Job(name, points, source=source, step="index", mark=copy))
+                waiting.append(Job(name, points, source=source, mark=copy))
 
         def task_of(job: Job) -> Callable[[], Any]:
             assert job.source is not None
@@ -297,7 +296,7 @@ class _Run:
             return
         by_tile = {job.tile: job for job in self.tiles}
         for source, paths in zip(survey.sources, survey.outputs, strict=True):
-            out = Job(f"file-{source.key}", source=source, outputs=paths, step="outputs")
+            out = Job(f"file-{source.key}", source=source, outputs=paths)
             if index := survey.indexes.get(source.path):
                 out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
             out.mark = fingerprint(survey.seen([source]), tail, [job.mark for job in out.jobs], paths)
@@ -408,7 +407,7 @@ class _Run:
         for tile in sorted({tile for tiles in near.values() for tile in tiles}):
             of = by_tile[tile]
             mark = fingerprint(common, tile, survey.seen([source for source, _ in sources(tile)]))
-            firsts[tile] = Job(left_name(of.name), of.points, tile, step="first_rounds", mark=mark)
+            firsts[tile] = Job(left_name(of.name), of.points, tile, mark=mark)
         for job in self._do("lowest points of cells", self._unkept(firsts.values()), first_task):
             self.messages_before.append(job.record.get("messages", []))
 
@@ -420,7 +419,7 @@ class _Run:
         blocks: dict[tuple[int, int], Job] = {}
         for block, tiles in near.items():
             mark = fingerprint(common, block, [firsts[tile].mark for tile in tiles])
-            job = blocks[block] = Job(block_name(block), 1, block, step="first_rounds", mark=mark)
+            job = blocks[block] = Job(block_name(block), 1, block, mark=mark)
             job.fail_with(firsts[tile] for tile in tiles)
         for _ in self._do("ground by blocks", self._unkept(blocks.values()), block_task):
             pass

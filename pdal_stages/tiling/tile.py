@@ -14,29 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
-from ..base.errors import NoTerrainError, PipelineError, StageError
+from ..base.errors import NoTerrainError, PipelineError
 from ..pipeline.inputs_outputs import NO_REFERENCE
-from ..pipeline.las_output import check_writers, flag_splitter
+from ..pipeline.las_output import check_writers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages import registry
 from ..stages.hag_morphological import HagMorphological
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
 from .inputs import CloudIndex, InputSource
-from .outputs import PieceResults, changed_in, class_counts, flags_in_classes, save_results, write_tile
+from .outputs import NewValues, PieceResults, arrays_of, class_counts, flags_in_classes, read_with, write_tile
 from .pieces import Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, TilePlan
 from .report import left_alone
 from .settings import Box, TileGrid, inside
-from .store import written
+from .store import save_arrays, written
 
 #: How often a tile is read again with a wider halo.
 _WIDENINGS = 3
-_MARK_TYPES = {ROW: "uint32_t", INPUT: "uint32_t", OUTSIDE: "double"}
+_MARKS = (ROW, INPUT, OUTSIDE)
 #: The warning of `Points` in a tile: of the user's `where` with what was added for the tile, or of that alone.
-_NOWHERE = re.compile(rf"{HOLDS_NOWHERE} [\d,]+ points: (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
+_NOWHERE = re.compile(rf"{HOLDS_NOWHERE} (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
 
-Changed = dict[str, tuple[NDArray[np.int64], NDArray]]
+Changed = dict[str, tuple[NDArray[np.int64] | None, NDArray]]
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,11 @@ def run_head(
     plan, first = context.plan, context.plan.first
     if not plan.head and last is None:
         return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts])
-    marks = [_Mark(number, piece, context) for number, piece in enumerate(cuts)]
-    begin = 0
+    begin, changed = 0, [Changed()] * len(cuts)
     if before is not None and first is not None and first.kept is not None:
-        begin = first.at
-        for mark, changed in zip(marks, before.changed, strict=True):
-            mark.changed = changed
+        begin, changed = first.at, before.changed
+    new = [_marked(n, piece, context.unit, changed[n]) for n, piece in enumerate(cuts)]
+    flags = [flags_in_classes(piece.path) for piece in cuts]
     needs = [0.0]
     views: list[dict[str, NDArray]] = []  # of the tile's own points: far less than all arrays of all points
 
@@ -99,12 +98,13 @@ def run_head(
 
     def take(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         wanted = ins if plan.creates is None else plan.creates
-        names = [name for name in wanted if name in ins and name not in _MARK_TYPES]
+        names = [name for name in wanted if name in ins and name not in _MARKS]
         mine = np.flatnonzero(ins[OUTSIDE] < 0)
         views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
 
     with Callbacks() as callbacks:
-        stages = _marked(callbacks, marks)
+        readers = [{**piece.reader, "filename": piece.path} for piece in cuts]
+        stages, inputs = read_with(callbacks, readers, new, flags if len(set(flags)) > 1 else [])
         begins = len(stages)
         for number in range(begin, len(plan.head)):
             stages.append(_with_threads(plan.head[number], context.threads))
@@ -112,7 +112,7 @@ def run_head(
             if kind is not None and kind.open_ended and not everything:
                 stages.append(callbacks.filter(partial(reach, len(stages) - 1, plan.later[number])))
         stages += [callbacks.filter(function) for function in (take, last) if function is not None]
-        stages[begins]["inputs"] = [f"mark{number}" for number in range(len(marks))]
+        stages[begins]["inputs"] = inputs
         pipeline = Pipeline(stages, whole=False)
         ours = {one.number: one for one in pipeline.expanded.ours}
         check_writers(
@@ -129,7 +129,7 @@ def run_head(
     if reports and not everything:
         needs += [plan.halo_m + report.reach for report in reports]
     alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
-    return HeadRun(_collect(views, marks), max(needs), _messages(pipeline, context.scratch), alone)
+    return HeadRun(_collect(views, cuts), max(needs), _messages(pipeline, context.scratch), alone)
 
 
 def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
@@ -143,26 +143,20 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
         elif nowhere := _NOWHERE.search(text):
             if nowhere[1] is None:  # the tile has no point of its own: nothing that the user asked for
                 continue
-            text = f"{HOLDS_NOWHERE} points: {nowhere[1]}"
+            text = f"{HOLDS_NOWHERE} {nowhere[1]}"
         lines.append(text)
     return lines
 
 
-def _marked(callbacks: Callbacks, marks: list[_Mark]) -> list[dict[str, Any]]:
-    """Readers of the pieces, whose points are numbered.
-
-    Where old PDAL reads the flags of some pieces as bits of the class, and of others apart, all have them apart.
-    """
-    mixed = len({mark.holds_flags for mark in marks}) > 1
-    stages: list[dict[str, Any]] = []
-    for mark in marks:
-        number, piece = mark.number, mark.piece
-        stages.append({**piece.reader, "filename": piece.path, "tag": f"in{number}"})
-        if mixed and mark.holds_flags:
-            stages.append(flag_splitter([True], inputs=[f"in{number}"], tag=f"split{number}"))
-        before = [stages[-1]["tag"]]
-        stages.append(callbacks.filter(mark, _MARK_TYPES, inputs=before, tag=f"mark{number}"))
-    return stages
+def _marked(number: int, piece: Piece, unit: float, changed: Changed) -> NewValues:
+    """What numbers a piece's points, and what the rounds before made of them."""
+    count = len(piece.index)
+    marks = {
+        ROW: np.arange(count, dtype=np.uint32),
+        INPUT: np.full(count, number, np.uint32),
+        OUTSIDE: np.where(piece.away < 0, -1.0, piece.away * unit),
+    }
+    return NewValues(np.ones(count, bool), {name: (None, values) for name, values in marks.items()} | changed)
 
 
 def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
@@ -172,32 +166,12 @@ def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
     return {**given, "threads": min(asked, threads) if asked else threads}
 
 
-class _Mark:
-    """Numbers a reader's points, and gives them what the rounds before made."""
-
-    def __init__(self, number: int, piece: Piece, context: RunContext) -> None:
-        self.number, self.piece = number, piece
-        self.changed: Changed = {}
-        self.away = np.where(piece.away < 0, -1.0, piece.away * context.unit)
-        self.holds_flags = flags_in_classes(piece.path)
-
-    def __call__(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        count = len(ins["X"])
-        if count != len(self.away):
-            raise StageError(f"the reader gave {count:,} points of {len(self.away):,}")
-        outs[ROW] = np.arange(count, dtype=np.uint32)
-        outs[INPUT] = np.full(count, self.number, np.uint32)
-        outs[OUTSIDE] = self.away
-        for name, (rows, values) in self.changed.items():
-            outs[name] = changed_in(name, ins[name], rows, values, self.holds_flags)
-
-
-def _collect(views: list[dict[str, NDArray]], marks: list[_Mark]) -> list[PieceResults]:
+def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceResults]:
     """Results of the tile's own points, sorted as their pieces are."""
-    names = [name for view in views[:1] for name in view if name not in _MARK_TYPES]
+    names = [name for view in views[:1] for name in view if name not in _MARKS]
     results = []
-    for mark in marks:
-        mine = [(view, np.flatnonzero(view[INPUT] == mark.number)) for view in views]
+    for number, piece in enumerate(cuts):
+        mine = [(view, np.flatnonzero(view[INPUT] == number)) for view in views]
         rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
@@ -207,9 +181,9 @@ def _collect(views: list[dict[str, NDArray]], marks: list[_Mark]) -> list[PieceR
                 cure="Run the pipeline without --tile",
             )
         values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
-        if mark.holds_flags and "Classification" in values:  # which old PDAL reads as bits of it
+        if flags_in_classes(piece.path) and "Classification" in values:  # which old PDAL reads as bits of it
             values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
-        results.append(PieceResults(mark.piece, rows, values))
+        results.append(PieceResults(piece, rows, values))
     return results
 
 
@@ -236,8 +210,9 @@ class TileTask:
         with TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
             results, record = self._settled(folder)
             if self.outputs is not None:
-                return record | write_tile(results, context.plan, self.outputs, context.scratch)
-            save_results(self.result, results)
+                wrote = write_tile(results, context.plan, self.outputs, context.scratch)
+                return record | wrote | {"messages": [*record["messages"], *wrote.get("messages", [])]}
+            save_arrays(self.result, arrays_of(results))
         return record | {"outputs": written([self.result])}
 
     def _settled(self, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:

@@ -28,11 +28,9 @@ from ..pipeline.runtime import Callbacks, points_of_views
 from ..pipeline.training import heights_for, lowered_writer, read_points
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
-from ..stages.points import HOLDS_NOWHERE
 from .inputs import find_sources, read_extent
-from .outputs import NewValues, PieceResults, merged, of_own_points
-from .plan import TilePlan, plan_of_files, readers_of
-from .report import TiledRun
+from .outputs import NewValues, PieceResults, of_own_points, read_with
+from .plan import plan_of_files, readers_of
 from .run import run_plan
 from .settings import TilingOptions, fits_whole
 from .store import load_arrays, save_arrays, written
@@ -162,29 +160,27 @@ class TrainTask:
             tiles = (tile for cloud in clouds for tile in cloud.clouds(reach(training)))
             return train(tiles, training, folder=Path(folder))
 
-    def _plan(self, folder: Path, heights: Sequence[Mapping[str, Any]]) -> TilePlan:
-        tail = {"type": "writers.null", "filename": str(folder / "#.npz")}
-        own = [one for one in self.overrides if one.selector != self.stage.type]
-        plan, _ = plan_of_files(self.files, [*map(dict, heights), tail], own)
-        numbers: dict[str, int] = {}
-        if self.stage.groups == FILE_NUMBER:
-            for number, name in enumerate(self.files, 1):
-                numbers[find_sources(readers_of([name]))[0].path] = number
-        return replace(plan, takes=Taking(self._writer, numbers), name=self.model)
-
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
     ) -> tuple[Report, list[TiledCloud], list[str]]:
         """What is to be known of the points; these, with heights, as clouds in parts; and the dimensions to train on."""
         tiles = folder / "tiles"
         tiles.mkdir()
-        run = run_plan(self._plan(tiles, heights), replace(self.options, per="tile"))
+        tail = {"type": "writers.null", "filename": str(tiles / "#.npz")}
+        own = [one for one in self.overrides if one.selector != self.stage.type]
+        plan, _ = plan_of_files(self.files, [*map(dict, heights), tail], own)
+        numbers: dict[str, int] = {}
+        if self.stage.groups == FILE_NUMBER:
+            for number, name in enumerate(self.files, 1):
+                numbers[find_sources(readers_of([name]))[0].path] = number
+        plan = replace(plan, takes=Taking(self._writer, numbers), name=self.model)
+        run = run_plan(plan, replace(self.options, per="tile"))
         if run.failures:
             named = "; ".join(f"{what}: {why}" for what, why in run.failures[:_NAMED])
             more = f", and {len(run.failures) - _NAMED} more" if len(run.failures) > _NAMED else ""
             raise StageError("not all points could be read, so nothing was trained", found=named + more)
-        report = Report({"points": run.summary["points"]}, list(run.messages))
-        _say(report, run)
+        ignored = sum(job.record.get("ignored", 0) for job in run.tiles)
+        report = Report({"points": run.summary["points"], "ignored": ignored}, list(run.messages))
         side = run.summary["tile"] * run.summary["meters_per_unit"]
         clouds: dict[float, TiledCloud] = {}
         dimensions: list[str] | None = None
@@ -219,19 +215,6 @@ def _check_same(found: Sequence[str], before: Sequence[str]) -> None:
         )
 
 
-def _say(report: Report, run: TiledRun) -> None:
-    """What the stage says of tiles, once each; that it takes no point of a tile only where it takes none of any."""
-    said = [job.record["said"] for job in run.tiles if "said" in job.record]
-    for text in dict.fromkeys(text for lines in said for text in lines):
-        if not text.startswith(HOLDS_NOWHERE):
-            report.notes.append(text)
-    nowhere = [line for lines in said for line in lines if line.startswith(HOLDS_NOWHERE)]
-    if nowhere and len(nowhere) == len(said):
-        report.warnings.append(nowhere[0])
-    ignored = sum(job.record.get("ignored", 0) for job in run.tiles)
-    report.figures["ignored"] = ignored
-
-
 def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCloud:
     """The points of a tile, as :class:`Taking` wrote them."""
     arrays = load_arrays(path)
@@ -254,8 +237,8 @@ class Taking:
         new = [self._new_values(result) for result in results]
         with Callbacks() as callbacks:
             flags = las_output.files_with_flags_to_split(readers)
-            stages = merged(callbacks, readers, new, flags)
-            run = pdal_env.execute(stages)
+            stages, inputs = read_with(callbacks, readers, new, flags)
+            run = pdal_env.execute([*stages, {"type": "filters.merge", "inputs": inputs}])
         if not run.count:
             return {"outputs": []}
         points = points_of_views(run.arrays, run.metadata, stage.points)
@@ -270,7 +253,7 @@ class Taking:
         return {
             "outputs": written(outputs),
             "written": run.count,
-            "said": points.report.messages,
+            "messages": points.report.messages,
             "ignored": int(points.report.figures.get("ignored", 0)),
             "dimensions": list(training.dimensions),
             **looked,
