@@ -25,16 +25,8 @@ def add_commands(parser: Parser) -> None:
         "classify", _classify, "Classify a cloud with a model file", overrides=True, logged=True
     )
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
-    takes(
-        "output",
-        help="A file; of several inputs a folder, which is made, or a name with # where the input's goes. Other dimensions "
-        "and the header are kept",
-    )
-    takes(
-        "--model",
-        default="standard",
-        help="A model file, or a shipped model's name (pdal-stages models); default standard",
-    )
+    takes("output", help="A file; of several inputs a folder, or a name with # where the input's goes")
+    takes("--model", default="standard", help="A model file, or one of pdal-stages models; default standard")
     takes(
         "--dimensions",
         metavar="LIST",
@@ -51,36 +43,12 @@ def add_commands(parser: Parser) -> None:
         "bridges.gpkg=17:2,6; may be repeated (filters.polygons)",
     )
     takes(
-        "--objects",
-        metavar="FILE",
-        help="Then write buildings, trees, spans and decks of all outputs to this vector file (.gpkg, ...), as "
-        "pdal-stages objects does; its options too: --writers.objects.tree_height=5",
+        "--objects", metavar="FILE", help="Then write objects of all outputs to a vector file (see objects)"
     )
-    switch(
-        takes,
-        "--bridges",
-        True,
-        "Find bridge decks (17), which leave ground and buildings (filters.bridges), with models whose heights "
-        "filters.hag_morphological makes",
-    )
-    switch(
-        takes,
-        "--wires",
-        False,
-        "Find wires (14), whatever they were called (filters.wires); tiles are read with 85 m more around them",
-    )
-    switch(
-        takes,
-        "--towers",
-        False,
-        "Find wires, and towers and poles (15) where they meet; tiles are read with 145 m more around them",
-    )
-    switch(
-        takes,
-        "--consistency",
-        True,
-        "Mend classes that contradict their surroundings at the end (filters.consistency)",
-    )
+    switch(takes, "--bridges", True, "Find bridge decks (17), with heights of filters.hag_morphological")
+    switch(takes, "--wires", False, "Find wires (14); tiles take 85 m more around them")
+    switch(takes, "--towers", False, "Find wires, and towers and poles (15) with them; tiles take 145 m more")
+    switch(takes, "--consistency", True, "Mend classes that contradict their surroundings, at the end")
     takes_options(takes, "filters.modelclassifier", "vegetation_heights", "keep_sure")
     takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
@@ -106,26 +74,10 @@ def add_commands(parser: Parser) -> None:
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes("--html", metavar="FILE", help="A page; default: beside the vector file, under its name")
     takes("--json", metavar="FILE", help="Write figures to a JSON file")
-    takes(
-        "--share",
-        type=float,
-        default=0.95,
-        metavar="SHARE",
-        help="Write patches until they hold this share of the errors that are expected (0.95)",
-    )
-    takes(
-        "--cell",
-        type=float,
-        default=0.0,
-        metavar="METERS",
-        help="Side of the cells that are judged; default: by the density, 1 m at least",
-    )
+    takes("--share", type=float, default=0.95, metavar="SHARE", help="Expected errors that are listed (0.95)")
+    takes("--cell", type=float, default=0.0, metavar="METERS", help="Side of the cells (by the density)")
     takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
-    takes(
-        "--model",
-        default="standard",
-        help="What tells how reliable classes are where the files have no Reliability; default standard",
-    )
+    takes("--model", default="standard", help="What says how reliable classes are, where files do not")
 
     takes = parser.command(
         "corrections",
@@ -134,12 +86,7 @@ def add_commands(parser: Parser) -> None:
     )
     takes("before", help="The file as it was classified (LAS or LAZ)")
     takes("after", nargs="?", help="The same points, in any order, as the person left them")
-    takes(
-        "--out",
-        required=True,
-        metavar="FILE",
-        help="The points of the first with the classes of the second, and Checked",
-    )
+    takes("--out", required=True, metavar="FILE", help="The points with the new classes, and Checked")
     takes(
         "--area",
         action="append",
@@ -148,13 +95,7 @@ def add_commands(parser: Parser) -> None:
         help="Polygons inside of which all was looked at: what was not changed there is right. Of the patches of review, "
         "those whose 'done' is 1; may be repeated",
     )
-    takes(
-        "--around",
-        type=float,
-        default=1.0,
-        metavar="METERS",
-        help="So far around a changed point all was looked at (1)",
-    )
+    takes("--around", type=float, default=1.0, metavar="METERS", help="Around changes all was looked at (1)")
 
 
 def _classify(options: argparse.Namespace) -> int:

@@ -47,35 +47,18 @@ def add_commands(parser: Parser) -> None:
     takes("inputs", nargs="+", metavar="input", help=f"One survey's: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write, for classify --model")
     takes("--teacher", default="standard", metavar="MODEL", help="The model that is asked; default standard")
-    takes(
-        "--sure",
-        type=float,
-        default=0.7,
-        metavar="SHARE",
-        help="How sure it must be of a point (Reliability) to be believed; default 0.7",
-    )
+    takes("--sure", type=float, default=0.7, metavar="SHARE", help="Least Reliability to be believed (0.7)")
     tiles.add_sizes(parser.commands["adapt"])
 
     takes = parser.command(
         "accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True, logged=True
     )
     takes("inputs", nargs="+", metavar="input", help=f"Classified: {INPUTS[0].lower()}{INPUTS[1:]}")
-    takes(
-        "--reference",
-        action="append",
-        metavar="FILE",
-        help="The same points, in the same order, with true classes: a file, a folder or a pattern, paired by name; "
-        "may be repeated",
-    )
+    takes("--reference", action="append", metavar="FILE", help="True classes of the same points, in order")
     takes("--model", help="Score this model on labeled files: a model file, or a shipped model's name")
     takes("--dimension", default="Classification", help="Classes to judge")
     takes("--reference-dimension", help="Dimension with the true classes")
-    takes(
-        "--objects",
-        metavar="FILE",
-        help="Compare objects instead: the input is a vector file of pdal-stages objects, this one has true buildings "
-        "(polygons) or trees (points; 'height')",
-    )
+    takes("--objects", metavar="FILE", help="Compare objects: true buildings (polygons) or trees (points)")
     takes("--area", metavar="FILE", help="With --objects: polygons inside of which objects count")
     takes("--json", help="Write figures to this file")
     takes("--html", help="Write a report to this file")

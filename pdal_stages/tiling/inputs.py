@@ -169,7 +169,7 @@ def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
     """Options of ``writers.las`` for an EPT source: its scales, offsets and colors."""
     axes = {dimension["name"]: dimension for dimension in described["schema"]}
     colored = 8 if "Infrared" in axes else 7 if "Red" in axes else 6
-    form = {"minor_version": 4, "dataformat_id": colored}
+    form: dict[str, Any] = {"minor_version": 4, "dataformat_id": colored}
     for axis in "XYZ":
         form[f"scale_{axis.lower()}"] = float(axes.get(axis, {}).get("scale") or 0.001)
         form[f"offset_{axis.lower()}"] = float(axes.get(axis, {}).get("offset") or 0.0)
