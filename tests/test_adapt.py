@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import laspy
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from pdal_stages.tiling.adapting import spread, sure_points
 
 pytestmark = pytest.mark.pdal
 
-TOWN = ps.make_town(64.0, 4.0, seed=5)
+MADE = functools.cache(lambda: ps.make_town(64.0, 4.0, seed=5, progress=False))
 
 
 def run(capsys, *words):
@@ -27,14 +29,14 @@ def town(tmp_path_factory, write_las):
     """A town in two files with classes of its own, and the same without any."""
     folder = tmp_path_factory.mktemp("town")
     random = np.random.default_rng(0)
-    east = TOWN.xyz[:, 0] > 500_033.0
+    east = MADE().xyz[:, 0] > 500_033.0
     for name, codes in (
         ("labeled", random.choice([0, 1, 2, 5, 6], len(east))),
         ("bare", np.zeros(len(east))),
     ):
         (folder / name).mkdir()
         for number, mine in enumerate((east, ~east)):
-            points = dict(zip("XYZ", TOWN.xyz[mine].T, strict=True))
+            points = dict(zip("XYZ", MADE().xyz[mine].T, strict=True))
             points["Classification"] = codes[mine].astype(np.uint8)
             write_las(folder / name / f"t{number}.laz", points, point_format=6)
     return folder
@@ -67,7 +69,7 @@ def test_is_a_model_that_says_what_it_is_of(model, town, tmp_path, capsys):
     code, said = run(capsys, "classify", source, target, "--model", model, "--keep-sure", "0.9")
     assert code == 1 and "it was never scored" in said and "Its labels are another model's answers" in said
     assert run(capsys, "classify", source, target, "--model", model)[0] == 0
-    truth = TOWN.classification[TOWN.xyz[:, 0] > 500_033.0]
+    truth = MADE().classification[MADE().xyz[:, 0] > 500_033.0]
     found = np.asarray(laspy.read(target).classification)
     known = np.isin(truth, (2, 5, 6))
     assert (found == truth)[known].mean() > 0.9
@@ -91,8 +93,8 @@ def test_only_what_is_sure_is_learned(tmp_path, write_las):
 
 
 def test_a_class_that_is_not_there(town, tmp_path, write_las, capsys):
-    wood = (TOWN.classification != 6) & (TOWN.classification != 1)
-    write_las(tmp_path / "wood.laz", dict(zip("XYZ", TOWN.xyz[wood].T, strict=True)), point_format=6)
+    wood = (MADE().classification != 6) & (MADE().classification != 1)
+    write_las(tmp_path / "wood.laz", dict(zip("XYZ", MADE().xyz[wood].T, strict=True)), point_format=6)
     code, said = run(capsys, "adapt", tmp_path / "wood.laz", "--model", tmp_path / "o.model")
     assert code == 0 and "too few points of a class" in said and "class 6" in said
     assert ps.load_model(tmp_path / "o.model").codes.tolist() == [2, 5]

@@ -126,7 +126,7 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     made, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
     network = {"configuration": TINY.to_dict(), "epochs": 16, "validation": 0, "learning_rate": 0.01}
     network["checkpoint"] = str(tmp_path / "a.checkpoint")
-    writer = {"type": WRITER, "filename": made, "algorithm": "alsnet", "alsnet": network}
+    writer = {"type": WRITER, "filename": made, "algorithm": "alsnet", "alsnet": network, "threads": 1}
     ps.run_pipeline([reader, {**writer, "dimensions": "Red,EchoWidth"}])
     assert load_model(made).required_dimensions == ("Red", "EchoWidth")
     ps.run_pipeline([reader, {"type": "filters.modelclassifier", "model": made}, out])

@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 
 from pdal_stages import cli
-from pdal_stages.synthetic import make_town, write_town
 
 pytestmark = pytest.mark.pdal
 MADE = {"HeightAboveGround": 32, "Reliability": 64}
 
 
-def test_outputs_are_half_as_large_again_at_most(tmp_path):
-    town = tmp_path / "town.laz"
-    write_town(make_town(60, 12, seed=4, progress=False), town)
+def test_outputs_are_half_as_large_again_at_most(ready_town, tmp_path):
+    town = ready_town
     words = ["--where", "X > 500020", "--dimensions", "HeightAboveGround,Reliability,Margin"]
     for name, more in (("small", []), ("exact", ["--filters.modelclassifier.compact=false"])):
         assert cli.main(["classify", str(town), str(tmp_path / f"{name}.laz"), *more]) == 0

@@ -10,14 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pdal_stages as ps
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.modelfile import find
 from pdal_stages.classifier.sureness import BINS, Sureness, of_the_base, said, sureness_of
 from pdal_stages.cli import main
 from pdal_stages.pipeline.classify_request import ClassifyRequest
-from pdal_stages.synthetic import write_town
 
 
 @settings(max_examples=60, deadline=None)
@@ -119,10 +117,9 @@ def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
 
 
 @pytest.mark.pdal
-def test_classify_keeps_only_what_is_sure_in_tiles_too(tmp_path, capsys):
+def test_classify_keeps_only_what_is_sure_in_tiles_too(ready_town, tmp_path, capsys):
     """What is rejected is counted once, not with each tile's surroundings again."""
-    write_town(ps.make_town(60.0, 4.0, seed=2, progress=False), tmp_path / "town.laz")
-    source = str(tmp_path / "town.laz")
+    source = str(ready_town)
     counted = []
     for words in ([str(tmp_path / "whole.laz")], [str(tmp_path / "tiles"), "--tile", "30", "--workers", "0"]):
         assert main(["classify", source, *words, "--keep-sure", "0.98"]) == 0

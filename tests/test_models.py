@@ -16,15 +16,12 @@ from pdal_stages.classifier.modelfile import STANDARD, find, shipped
 from pdal_stages.cli import main
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.stages.preparation import made_of_coordinates, preparation_of
-from pdal_stages.synthetic import make_town, write_town
 from pdal_stages.tiling import run_tiled
 
 
-@pytest.fixture(scope="module")
-def town(tmp_path_factory):
-    path = tmp_path_factory.mktemp("models") / "town.laz"
-    write_town(make_town(64, 5, seed=3, progress=False), path)
-    return path
+@pytest.fixture
+def town(ready_town):
+    return ready_town
 
 
 def test_every_shipped_model_loads_says_its_preparation_and_is_small(tmp_path):
@@ -175,7 +172,3 @@ def test_a_shipped_model_by_name_in_tiles(town, tmp_path, monkeypatch):
     assert not run.failures
     whole, tiles = laspy.read("whole.laz"), laspy.read("tiles.laz")
     assert np.array_equal(whole.classification, tiles.classification)
-    path = tmp_path / "job.json"
-    path.write_text(json.dumps(job(str(tmp_path / "tiles2.laz"))))
-    assert main(["pipeline", str(path), "--tile", "40", "--workers", "0"]) == 0
-    assert np.array_equal(whole.classification, laspy.read("tiles2.laz").classification)

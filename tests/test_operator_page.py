@@ -21,7 +21,7 @@ PAGE = Path(__file__).resolve().parent.parent / "docs" / "operator.md"
 def test_the_hour_of_an_operator(tmp_path, monkeypatch, capsys):
     pyogrio, shapely = pytest.importorskip("pyogrio"), pytest.importorskip("shapely")
     monkeypatch.chdir(tmp_path)
-    write_town(ps.make_town(80.0, 4.0, seed=5, progress=False), tmp_path / "truth.laz")
+    write_town(ps.make_town(64.0, 4.0, seed=5, progress=False), tmp_path / "truth.laz")
     truth = laspy.read("truth.laz")
     raw = laspy.read("truth.laz")
     raw.classification[:] = 0

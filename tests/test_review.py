@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sqlite3
 
 import laspy
@@ -11,10 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pdal_stages as ps
 from pdal_stages import cli
 from pdal_stages.accuracy.expected import BLOCK, ReviewCells, find_patches
-from pdal_stages.synthetic import write_town
 
 
 def cloud(seed, n=3000, wide=60.0):
@@ -67,10 +66,10 @@ def test_patches_hold_each_cell_once_and_come_best_first():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(ready_town, tmp_path_factory):
     """A town whose buildings are half called vegetation in the east, in two files, with reliabilities."""
     folder = tmp_path_factory.mktemp("review")
-    write_town(ps.make_town(70.0, 5.0, seed=3, progress=False), folder / "town.laz")
+    shutil.copy(ready_town, folder / "town.laz")
     las = laspy.read(folder / "town.laz")
     las.add_extra_dim(laspy.ExtraBytesParams("Reliability", "float32"))
     east = np.asarray(las.x) > np.median(las.x)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from pdal_stages.tiling.settings import TilingOptions
 pytestmark = pytest.mark.pdal
 
 WORDS = ["--count", "150", "--trees", "4", "--neighborhoods", "s2,k9", "--no-progress", "--classes", "2,5,6"]
-TOWN = ps.make_town(56.0, 4.0, seed=5)
+MADE = functools.cache(lambda: ps.make_town(56.0, 4.0, seed=5, progress=False))
 #: LAS 1.2 and 1.4, as they come; not one scale and offset.
 FORMATS = (1, 6, 6, 3)
 
@@ -24,13 +25,15 @@ FORMATS = (1, 6, 6, 3)
 def town(tmp_path_factory, write_las):
     """Four files that adjoin, with odd offsets."""
     folder = tmp_path_factory.mktemp("town")
-    xyz, random = TOWN.xyz, np.random.default_rng(0)
+    xyz, random = MADE().xyz, np.random.default_rng(0)
     east, north = xyz[:, 0] > 500_028.0, xyz[:, 1] > 5_400_033.0
     number = random.integers(1, 3, len(xyz)).astype(np.uint8)
     for k, point_format in enumerate(FORMATS):
         mine = (east * 2 + north) == k
         points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")}
-        points |= {"Classification": np.where(random.random(mine.sum()) < 0.02, 7, TOWN.classification[mine])}
+        points |= {
+            "Classification": np.where(random.random(mine.sum()) < 0.02, 7, MADE().classification[mine])
+        }
         points |= {"ReturnNumber": number[mine], "NumberOfReturns": np.full(mine.sum(), 2, np.uint8)}
         points |= {"PointSourceId": random.integers(1, 4, mine.sum()).astype(np.uint16)}
         points["Classification"] = points["Classification"].astype(np.uint8)
@@ -110,8 +113,8 @@ def test_surveys_that_do_not_see_each_other(town, tmp_path, capsys):
 
 def test_one_file_and_feet(tmp_path, capsys, write_las):
     pyproj = pytest.importorskip("pyproj")
-    xyz = (TOWN.xyz - (499_000.0, 5_399_000.0, 0.0)) / 0.3048
-    points = {axis: xyz[:, n] for n, axis in enumerate("XYZ")} | {"Classification": TOWN.classification}
+    xyz = (MADE().xyz - (499_000.0, 5_399_000.0, 0.0)) / 0.3048
+    points = {axis: xyz[:, n] for n, axis in enumerate("XYZ")} | {"Classification": MADE().classification}
     wkt = pyproj.CRS("EPSG:2994").to_wkt("WKT1_GDAL")
     write_las(tmp_path / "feet.laz", points, point_format=6, wkt=wkt)
     words = ["train", str(tmp_path / "feet.laz"), *WORDS]
@@ -156,9 +159,9 @@ def corrected(tmp_path_factory, write_las):
     """Four files that adjoin; of one nobody looked at any point, and it does not say so. Some points are there twice."""
     folder = tmp_path_factory.mktemp("corrected")
     random = np.random.default_rng(3)
-    twice = random.permutation(len(TOWN.xyz))[:400]
-    xyz = np.concatenate([TOWN.xyz, TOWN.xyz[twice]])
-    codes = np.concatenate([TOWN.classification, TOWN.classification[twice]]).astype(np.uint8)
+    twice = random.permutation(len(MADE().xyz))[:400]
+    xyz = np.concatenate([MADE().xyz, MADE().xyz[twice]])
+    codes = np.concatenate([MADE().classification, MADE().classification[twice]]).astype(np.uint8)
     codes[random.random(len(codes)) < 0.02] = 7
     east, north = xyz[:, 0] > 500_028.0, xyz[:, 1] > 5_400_033.0
     near = np.hypot(xyz[:, 0] - 500_025.0, xyz[:, 1] - 5_400_030.0) < 22.0

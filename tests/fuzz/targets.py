@@ -169,7 +169,7 @@ def _notes() -> list[bytes]:
     with Store(folder()) as keeping:
         for name, note in _NOTES.items():
             keeping.finish(name, str(note["fingerprint"]), note)
-        return [keeping.path(f"{name}.json").read_bytes() for name in _NOTES]
+        return [Path(keeping.path(name, ".json")).read_bytes() for name in _NOTES]
 
 
 @target(_notes)
@@ -178,7 +178,7 @@ def store(data: bytes) -> str:
     found = []
     with Store(folder()) as keeping:
         for name in _NOTES:
-            keeping.path(f"{name}.json").write_bytes(data)
+            Path(keeping.path(name, ".json")).write_bytes(data)
             found.append(keeping.note(name))
             assert isinstance(found[-1], dict)
         if found[0].get("outputs"):

@@ -34,7 +34,7 @@ def written(folder, *words: object) -> set[str]:
     """What a command opened for writing, made, renamed or removed beyond what is its own."""
     log = folder / "trace.txt"
     calls = "trace=open,openat,creat,rename,renameat,renameat2,link,linkat,symlink,symlinkat,truncate,unlink,unlinkat,mkdir,mkdirat,rmdir"
-    strace = ["strace", "-f", "-qq", "-y", "-s", "4096", "-o", str(log), "-e", calls]
+    strace = ["strace", "-f", "--seccomp-bpf", "-qq", "-y", "-s", "4096", "-o", str(log), "-e", calls]
     command = [*strace, sys.executable, "-m", "pdal_stages.cli"]
     done = subprocess.run(
         [*command, *map(str, words)], cwd=folder, capture_output=True, text=True, timeout=500
