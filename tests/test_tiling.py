@@ -540,18 +540,18 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
 
 
 def test_odd_headers_are_said_of_the_inputs_alone(tmp_path, town_file):
-    """Pieces that are cut out for tiles have the input's header; of many some are named."""
+    """Pieces that are cut out for tiles have the input's header; of many one is named."""
     data = bytearray(town_file.read_bytes())
     data[179:227] = bytes(48)  # no box
     for n in range(8):
         (tmp_path / f"odd{n}.laz").write_bytes(data)
-    for inputs, times, dry in (("odd0.laz", 1, False), ("odd*.laz", 5, True)):
+    for inputs, more, dry in (("odd0.laz", "", False), ("odd*.laz", "7 more inputs", True)):
         writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
         job = [str(tmp_path / inputs), {"type": "filters.hag_minima", "cell": 5}, writer]
         run = run_tiled(job, 30, workers=0, dry_run=dry)
         said = [message for message in run.messages if "box in its header" in message]
-        assert not run.failures and len(said) == times and said[0].startswith(f"{tmp_path}/odd0.laz: ")
-    assert any("3 more inputs: their headers are odd" in message for message in run.messages)
+        assert not run.failures and len(said) == 1 and said[0].startswith(f"{tmp_path}/odd0.laz: ")
+        assert more in said[0]
 
 
 def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):

@@ -83,13 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
-    """The command, its arguments, and the stages' options among them; leaves the program where usage is wrong.
-
-    Raises
-    ------
-    StageError
-        Where a stage's option is incomplete, or the command takes none.
-    """
+    """The command, its arguments, and the stages' options among them; leaves the program where usage is wrong."""
     # Imported here, so that an environment that lacks something is told in a sentence.
     from ..pipeline.read import parse_overrides
 

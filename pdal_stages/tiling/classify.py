@@ -36,29 +36,15 @@ class Written:
 
 @dataclass(frozen=True)
 class ClassifyTask:
-    """What is to be classified, how, and where to.
+    """What is to be classified, how, and where to."""
 
-    Attributes
-    ----------
-    inputs : tuple of str
-        Files, folders, patterns, tile indexes, EPT sources.
-    output : str
-        A file; of several inputs a folder, or a name with ``#`` for the input's.
-    request : ClassifyRequest
-    options : TilingOptions
-    metadata, log : str
-        Files that are written beside, empty for none.
-    reports : bool
-        Whether reports are wanted, which only runs in tiles have.
-    """
-
-    inputs: tuple[str, ...]
-    output: str
+    inputs: tuple[str, ...]  #: files, folders, patterns, tile indexes, EPT sources
+    output: str  #: a file; of several inputs a folder, or a name with ``#`` for the input's
     request: ClassifyRequest = field(default_factory=ClassifyRequest)
     options: TilingOptions = field(default_factory=TilingOptions)
-    metadata: str = ""
-    log: str = ""
-    reports: bool = False
+    metadata: str = ""  #: a file that is written beside
+    log: str = ""  #: another one
+    reports: bool = False  #: whether reports are wanted, which only runs in tiles have
 
     @cached_property
     def files(self) -> list[str]:
@@ -126,13 +112,7 @@ class ClassifyTask:
         return Written(target, count, codes[-1] if codes else {}, alone, messages)
 
     def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
-        """Classify all inputs in tiles; `finished` hears of every output that was written.
-
-        Raises
-        ------
-        StageError
-            For whatever is wrong with names, model or options, before any point is read.
-        """
+        """Classify all inputs in tiles; `finished` hears of every output that was written."""
         if odd := [name for name in self.files if not is_las(name) and not is_ept(name)]:
             raise OptionError(
                 "several inputs, and the options of tiles, are for LAS, LAZ, COPC and EPT: others cannot be cut into tiles",

@@ -41,8 +41,6 @@ _LARGEST = 16 << 20
 _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
 #: Bytes looked at, at the beginning and the end.
 _ENDS = 1 << 16
-#: Inputs with odd headers that are named.
-_ODD = 5
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,7 @@ class InputSource:
 
 
 def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
-    """The inputs behind readers: names, patterns, EPT addresses, tile indexes.
-
-    Raises
-    ------
-    PipelineError
-        Where nothing is found, or a reader cannot be cut into tiles.
-    """
+    """The inputs behind readers: names, patterns, EPT addresses, tile indexes; PipelineError where none can be cut."""
     found: dict[str, InputSource] = {}
     for reader in readers:
         given, kind = reader.get("filename", ""), reader["type"]
@@ -111,13 +103,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
 
 
 def read_extent(source: InputSource) -> Extent:
-    """Number of points and bounding box, from the first bytes.
-
-    Raises
-    ------
-    StageError
-        If the input cannot be read.
-    """
+    """Number of points and bounding box, from the first bytes; StageError where these cannot be read."""
     if source.kind != "ept":
         return las_extent(source.path)
     described = read_ept(source.path)
@@ -256,9 +242,8 @@ class Survey:
                     odd.append(said)
             except StageError as error:
                 self.unreadable[source.path] = str(error)
-        self.messages += odd[:_ODD]
-        if len(odd) > _ODD:
-            self.messages.append(f"so it is with {len(odd) - _ODD:,} more inputs: their headers are odd, too")
+        more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
+        self.messages += [f"{said}{more}" for said in odd[:1]]
         if lost := len(self.sources) - len(self.extents):
             self.messages.append(
                 f"{lost:,} of the inputs without a readable header: where they lie is not known, and tiles beside them may "

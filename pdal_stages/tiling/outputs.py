@@ -101,10 +101,7 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
 def read_results(tiles: Iterable[str], source: InputSource, count: int, start: int, end: int) -> NewValues:
     """Results of points `start` to `end` of a file with `count` points, out of the files of its tiles.
 
-    Raises
-    ------
-    StageError
-        If the tiles do not hold each of the file's points once.
+    StageError where these do not hold each of the file's points once.
     """
     kept = np.zeros(end - start, bool)
     seen = 0

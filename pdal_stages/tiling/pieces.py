@@ -79,13 +79,7 @@ def _copy_type(header: laspy.LasHeader) -> np.dtype:
 
 
 def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
-    """Read a file once, write its points into a copy, sorted by place, and say where they lie (:class:`CloudIndex`).
-
-    Raises
-    ------
-    StageError
-        If any of it cannot be read, or the copy cannot be written.
-    """
+    """Read a file once, write its points into a copy, sorted by place, and say where they lie (:class:`CloudIndex`)."""
     header = header_of(path)
     dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)

@@ -45,7 +45,6 @@ class FirstRound:
 
     at: int  #: number of the stage in the head
     halo_m: float  #: halo that the stages before it need
-    far_m: float  #: meters around a tile within which any point matters to the stages from it on
     blocks: Blocks
     #: Dimensions that the stages before it change, kept for the tiles, which then leave these stages out; None where they
     #: have to run in each tile again.
@@ -113,10 +112,7 @@ class _Step:
 def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     """Check that a pipeline can be run in tiles, and cut it; `buffer`: how far PDAL's filters look, meters.
 
-    Raises
-    ------
-    PipelineError, OptionError
-        For pipelines whose result tiles cannot give, with the reason and the cure.
+    PipelineError or OptionError where tiles cannot give its result, with the reason and the cure.
     """
     source = pipeline.source
     ours = {expanded.number: expanded for expanded in pipeline.expanded.ours}
@@ -192,7 +188,7 @@ def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) 
     for at, step in enumerate(head):
         if isinstance(step.ours, HagMorphological):
             kept = _kept(readers, head[:at])
-            found = FirstRound(at, sum(reaches[:at]), sum(reaches[at:]), step.ours.blocks(), kept)
+            found = FirstRound(at, sum(reaches[:at]), step.ours.blocks(), kept)
             reaches[at] = 0.0
             if kept is not None:
                 reaches[:at] = [0.0] * at
@@ -321,13 +317,7 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
 
 
 def outputs_for(plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None) -> list[list[str]]:
-    """For every input, or every tile by its name, what each of the writers writes.
-
-    Raises
-    ------
-    StageError
-        Where several would be one file, or one is an input, or cannot be written.
-    """
+    """For every input, or every tile by its name, what each of the writers writes; StageError where it cannot be."""
     found = []
     for writer in plan.writers:
         name = os.path.abspath(writer["filename"])

@@ -82,32 +82,15 @@ class InterruptedRun(KeyboardInterrupt):
 
 @dataclass
 class TiledRun:
-    """What a tiled run did.
-
-    Attributes
-    ----------
-    tiles : list of Job
-    outputs : list of Job
-        Empty where each tile is an output.
-    unreadable : dict of str to str
-        Inputs that could not be read, and why.
-    changed : list of str
-        Files that changed while they were worked on.
-    messages : list of str
-        What the user should know.
-    summary : dict
-        Figures for people; see :meth:`to_dict`.
-    objects : dict, optional
-        Those of the outputs, where they were asked for: the files they were written to, and counts by kind.
-    """
+    """What a tiled run did."""
 
     tiles: list[Job]
-    outputs: list[Job]
-    unreadable: dict[str, str]
-    changed: list[str]
-    messages: list[str]
-    summary: dict[str, Any]
-    objects: dict[str, Any] | None = None
+    outputs: list[Job]  #: empty where each tile is an output
+    unreadable: dict[str, str]  #: inputs that could not be read, and why
+    changed: list[str]  #: files that changed while they were worked on
+    messages: list[str]  #: what the user should know
+    summary: dict[str, Any]  #: figures for people; see :meth:`to_dict`
+    objects: dict[str, Any] | None = None  #: those of the outputs: the files they are in, and counts by kind
 
     @property
     def failures(self) -> list[tuple[str, str]]:

@@ -75,13 +75,6 @@ def run_tiled(
         For what is wrong before any tile, or with every tile.
     InterruptedRun
         A KeyboardInterrupt with what was done until then.
-
-    Examples
-    --------
-    >>> from pdal_stages.tiling import run_tiled
-    >>> run = run_tiled("classify.json", 500, workers=2)             # doctest: +SKIP
-    >>> run.failures                                                 # doctest: +SKIP
-    []
     """
     chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
     pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
@@ -189,10 +182,7 @@ class _Run:
     ) -> Iterator[Job]:
         """Do jobs as workers are free, note what is done, and yield each; outputs may be put in after every one.
 
-        Raises
-        ------
-        StageError
-            If the first jobs all fail for one reason.
+        StageError where the first ones all fail for one reason.
         """
         for job in waiting:
             self.store.forget(job.name)
@@ -262,7 +252,7 @@ class _Run:
         """Inputs whose points tiles read that are to be run."""
         far = self.farthest
         if first := self.plan.first:
-            far += (first.far_m + first.blocks.side + first.blocks.reach) / self.survey.unit
+            far += (self.plan.sees_m + first.blocks.side + first.blocks.reach) / self.survey.unit
             far += self.survey.grid.size
         waiting = [job.tile for job in self.tiles if job.state == "waiting" and job.tile]
         return {source.path for tile in waiting for source in self.survey.near(tile, far)}

@@ -169,13 +169,7 @@ def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool
 def settled(
     options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
 ) -> TilingOptions:
-    """The options with a side of tiles and a number of workers that the memory allows; the halo is in the coordinates' unit.
-
-    Raises
-    ------
-    OptionError
-        Where no tile fits.
-    """
+    """The options with a side of tiles and a number of workers that the memory allows; OptionError where no tile fits."""
     whole = options.memory or free_memory() // 2
     local = 0 if options.scheduler else options.local_workers
     fixed = options.workers is not None or local <= 1
@@ -256,13 +250,7 @@ class TileGrid:
         return "_".join(f"{n * self.size:.10g}" for n in tile)
 
     def covering(self, box: Box) -> list[tuple[int, int]]:
-        """Every tile that a box touches, row by row.
-
-        Raises
-        ------
-        StageError
-            For more than :data:`MOST_TILES`.
-        """
+        """Every tile that a box touches, row by row; StageError for more than :data:`MOST_TILES`."""
         x0, y0, x1, y1 = (int(self.index(np.array([v]))[0]) for v in box)
         check_number((x1 - x0 + 1) * (y1 - y0 + 1), f"bounds {box}, tiles of {self.size:g}")
         return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]

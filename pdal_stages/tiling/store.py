@@ -31,13 +31,7 @@ def fingerprint(*parts: Any) -> str:
 
 
 class Store:
-    """The folder of one run, locked while it is used; `outputs` is the folder beside whose files it is made.
-
-    Raises
-    ------
-    StageError
-        If another run works there, or it cannot be written to.
-    """
+    """The folder of one run, locked while it is used; `outputs` is the folder beside whose files it is made."""
 
     def __init__(self, outputs: Path) -> None:
         self.folder = outputs / FOLDER
