@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.sampling import draw_samples, spread
+from pdal_stages.classifier.sampling import draw_samples
 
 
 def chosen(clouds, samples):
@@ -72,16 +70,6 @@ def test_spread_over_space_and_not_clumped():
 
     drawn = random.choice(len(xyz), 1600, replace=False)
     assert nearest(xyz[samples.row, :2]) > 1.1 * nearest(xyz[drawn, :2])
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.integers(1, 400), st.integers(1, 900), st.integers(0, 10**6))
-def test_spread_is_exact(n, count, seed):
-    places, weight = spread(n, count, np.random.default_rng(seed))
-    assert weight.sum() == count
-    assert len(places) == min(n, count)
-    assert (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < n
-    assert weight.max() - weight.min() <= 1
 
 
 def test_a_class_without_points_is_an_error(random_cloud):

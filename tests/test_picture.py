@@ -18,7 +18,6 @@ from pdal_stages.reports.views import (
     CLASS_COLORS,
     RIGHT,
     WRONG,
-    nice_step,
     paint,
     png,
     shading,
@@ -152,13 +151,6 @@ def test_triptych(even_light):
     assert abs(image.shape[1] - 500) <= 3
     assert all(has_color(image, color) for color in (*map(class_color, (2, 5, 6)), RIGHT, WRONG))
     assert not has_color(triptych(x, y, z, predicted, width=500), WRONG)
-
-
-@pytest.mark.parametrize("step", [0.013, 0.9, 1.0, 17.0, 4999.0])
-def test_nice_step(step):
-    nice = nice_step(step)
-    assert step * 0.99 <= nice < 2.6 * step
-    assert f"{nice:e}"[0] in "125"
 
 
 def test_what_cannot_be_drawn_is_told():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import laspy
@@ -22,7 +21,7 @@ from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.classify import ClassifyTask, one_format
 from pdal_stages.tiling.inputs import CloudIndex, InputSource, find_sources, las_extent
 from pdal_stages.tiling.pieces import cut_all, sort_points
-from pdal_stages.tiling.settings import TileGrid, inside, touching
+from pdal_stages.tiling.settings import TileGrid
 
 pytestmark = pytest.mark.pdal
 
@@ -55,32 +54,6 @@ def whole(tmp_path_factory, town_file, model_file):
     path = tmp_path_factory.mktemp("tiling") / "whole.laz"
     ps.Pipeline(clouds.stages([town_file], path, model_file)).execute(arrays=False)
     return path
-
-
-# ---- the grid --------------------------------------------------------------------------------------------
-
-
-@given(
-    st.floats(1e-3, 1e4),
-    st.lists(st.floats(-1e7, 1e7), min_size=1, max_size=20),
-    st.integers(-1000, 1000),
-)
-def test_every_point_has_one_tile(size, values, edge):
-    grid = TileGrid(size)
-    x = np.array([*values, edge * size])
-    at = grid.index(x)
-    for value, i in zip(x.tolist(), at.tolist(), strict=True):
-        assert i * size <= value < (i + 1) * size or math.isclose(value, i * size, rel_tol=1e-12)
-    assert at[-1] == edge  # a point on an edge belongs to the tile it begins
-
-
-def test_boxes_touch_on_their_edges():
-    grid = TileGrid(10)
-    boxes = [grid.box((1, 1)), grid.box((2, 0)), grid.box((0, -1))]
-    assert touching(boxes, grid.box((0, 0))) == [0, 2]
-    assert inside(grid.box((0, 0)), grid.box((0, 0), 1)) and not inside(grid.box((0, 0), 1), grid.box((0, 0)))
-    assert grid.covering((0, 0, 10, 5)) == [(0, 0), (1, 0)]
-    assert TileGrid(500).name((1000, -1)) == "500000_-500"
 
 
 # ---- reading parts of files ------------------------------------------------------------------------------
@@ -354,6 +327,7 @@ def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):
 @pytest.mark.parametrize(
     "stage, message",
     [
+        ({"type": "filters.reprojection", "out_srs": "EPSG:25833"}, "moves points"),
         ({"type": "filters.sort", "dimension": "X"}, "all points at once"),
         ({"type": "filters.outlier"}, "--buffer"),
         ({"type": "filters.multiscalefeatures", "feature_set": "shapes"}, "fitted to the points"),
@@ -361,17 +335,8 @@ def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):
 )
 def test_global_stages_are_refused(tmp_path, town_file, stage, message):
     with pytest.raises((PipelineError, OptionError), match=message) as caught:
-        run_tiled([str(town_file), stage, str(tmp_path / "out.laz")], 30)
+        run_tiled([str(town_file), stage, {"type": "filters.hag_minima"}, str(tmp_path / "out.laz")], 30)
     assert caught.value.cure or "all points" in caught.value.what
-
-
-def test_moving_points_before_our_stages_is_refused(tmp_path, town_file):
-    with pytest.raises(PipelineError, match="moves points"):
-        run_tiled(
-            [str(town_file), {"type": "filters.reprojection", "out_srs": "EPSG:25833"}, {"type": "filters.hag_minima"},
-             str(tmp_path / "out.laz")],
-            30,
-        )  # fmt: skip
 
 
 @pytest.mark.parametrize(
