@@ -197,8 +197,7 @@ def _objects(options: argparse.Namespace) -> None:
 
 
 def _review(options: argparse.Namespace) -> None:
-    from ..pipeline.reviewing import write_review
-    from ..reports.reviewpage import lines
+    from ..pipeline.reviewing import lines, write_review
 
     html = str(Path(options.output).with_suffix(".html")) if options.html is None else options.html
     how = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}

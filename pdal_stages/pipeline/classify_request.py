@@ -27,48 +27,22 @@ WRITTEN = ("HeightAboveGround", "Reliability")
 
 @dataclass(frozen=True)
 class ClassifyRequest:
-    """How points are classified, whichever they are.
+    """How points are classified, whichever they are."""
 
-    Attributes
-    ----------
-    model : str
-        A model file, or the name of a shipped one.
-    overrides : tuple of Override
-        Options of stages set from outside; they may name another model.
-    where : str, optional
-        Classify only the points for which this holds.
-    dimensions : tuple of str
-        Which of the dimensions made on the way are written beside the input's own; ``all`` and ``none`` are known.
-    noise : bool
-        Whether low and high noise is marked first.
-    bridges : bool
-        Whether bridge decks are found, where heights are made by ``filters.hag_morphological``.
-    wires : bool
-        Whether wires are found, where heights are made.
-    towers : bool
-        Whether the towers and poles that hold them are found with them.
-    consistency : bool
-        Whether classes that contradict their surroundings are mended at the end.
-    polygons : tuple of str
-        Files of polygons and the class of what is inside, as ``filters.polygons`` takes them.
-    vegetation_heights : str
-        Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
-    keep_sure : float, optional
-        Points keep their class only where this share of such points is right; see ``filters.modelclassifier``.
-    """
-
-    model: str = STANDARD
-    overrides: tuple[Override, ...] = ()
-    where: str | None = None
+    model: str = STANDARD  #: a model file, or the name of a shipped one
+    overrides: tuple[Override, ...] = ()  #: options of stages set from outside; they may name another model
+    where: str | None = None  #: classify only the points for which this holds
+    #: Dimensions made on the way that are written beside the input's own; ``all`` and ``none`` are known.
     dimensions: tuple[str, ...] = WRITTEN
-    noise: bool = True
-    bridges: bool = True
-    wires: bool = False
-    towers: bool = False
-    consistency: bool = True
-    polygons: tuple[str, ...] = ()
+    noise: bool = True  #: mark low and high noise first
+    bridges: bool = True  #: find bridge decks, where heights are made by ``filters.hag_morphological``
+    wires: bool = False  #: find wires, where heights are made
+    towers: bool = False  #: and what holds them
+    consistency: bool = True  #: mend classes that contradict their surroundings
+    polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
+    #: Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
     vegetation_heights: str = ""
-    keep_sure: float | None = None
+    keep_sure: float | None = None  #: see ``filters.modelclassifier``
 
     @property
     def _inside(self) -> dict[str, str]:

@@ -66,9 +66,10 @@ def decode(data: bytes, name: str) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-        found = "UTF-16" if wide else f"byte {error.start} is 0x{data[error.start]:02x}"
-        what = "the pipeline file is not UTF-8 text"
+        what, found = (
+            "the pipeline file is not UTF-8 text",
+            f"byte {error.start} is 0x{data[error.start]:02x}",
+        )
         raise PipelineError(what, where=name, found=found, cure="Save it as UTF-8") from None
 
 
@@ -84,7 +85,7 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             f"the pipeline is not valid JSON: {error.msg}",
             where=f"{name or 'pipeline'}, line {error.lineno}, column {error.colno}",
             found=repr(clean[max(0, error.pos - 20) : error.pos + 20].strip()),
-            cure=_cure(clean, error),
+            cure="JSON is one list or object, with double quotes, a comma between values, and none before a bracket",
         ) from None
     except (ValueError, RecursionError) as error:
         found = str(error)[:200]
@@ -184,19 +185,6 @@ def _without_comments(text: str, name: str) -> str:
         return re.sub(r"[^\n]", " ", match[0])
 
     return _STRING_OR_COMMENT.sub(blank, text)
-
-
-def _cure(text: str, error: json.JSONDecodeError) -> str | None:
-    before = text[: error.pos].rstrip()
-    after = text[error.pos :].lstrip()[:1]
-    closing = after in ("]", "}")
-    if (before.endswith(",") and (closing or after == ",")) or (closing and "trailing comma" in error.msg):
-        return "Remove the comma before the closing bracket"
-    if after == "'":
-        return 'JSON wants double quotes: "text"'
-    if error.msg == "Extra data":
-        return "A pipeline is one list or object; remove what follows it"
-    return None
 
 
 # ---- options set from outside: --stage.TAG.option=value and --filters.name.option=value --------------

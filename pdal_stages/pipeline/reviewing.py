@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,14 +17,14 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.files import write_whole
 from ..base.las import read_header
-from ..base.messages import Progress, print_messages
+from ..base.messages import Progress, duration, one_line, print_messages
 from ..base.outputs import HTML, JSON, Output, check_outputs
 from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..objects.outlines import vector
-from ..reports.objectlayers import Layer, check_target, write_layers
-from ..reports.reviewpage import review_page, styles
+from ..reports.objectlayers import Layer, check_target, qml, write_layers
+from ..reports.page import render
 from ..stages.preparation import PREPARATION, made_of_coordinates
 from .inputs_outputs import check_one_reference, input_files, reference_of_file
 from .parts import Part, parts_of, reads_in_parts
@@ -32,6 +32,11 @@ from .workers import each_file
 
 #: What is written, in this order.
 LAYERS = ("patches", "tiles")
+#: Rows in the page's tables, and in text.
+_ROWS, _WORST = 200, 10
+#: Fill of patches, from those with least to expect to those with most; of those looked at.
+_INKS = ("255,237,160,110", "254,178,76,150", "240,59,32,170", "165,0,38,190")
+_LOOKED_AT = "120,170,120,90"
 
 
 @dataclass
@@ -210,18 +215,8 @@ def write_review(
     if json_file:
         write_whole(json_file, (json.dumps(found.to_dict(), indent=1) + "\n").encode())
     if html:
-        write_whole(html, review_page(found.to_dict(), _minutes(found)).encode())
+        write_whole(html, review_page(found).encode())
     return found
-
-
-def _minutes(found: Review) -> list[tuple[float, float]]:
-    """(share of the expected errors, minutes to look at the patches that hold it)."""
-    held, spent = np.cumsum(found.patches.errors), np.cumsum(found.patches.minutes)
-    if not len(held) or held[-1] <= 0:
-        return []
-    shares = (0.25, 0.5, 0.75, 0.9)
-    places = [min(int(np.searchsorted(held, share * held[-1])), len(spent) - 1) for share in shares]
-    return [(share, float(spent[place])) for share, place in zip(shares, places, strict=True)]
 
 
 def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
@@ -247,3 +242,77 @@ def _fields(rows: Sequence[dict[str, Any]]) -> dict[str, NDArray]:
     names = [name for name in (rows[0] if rows else {}) if name not in ("box", "file")]
     kinds_of = {name: object if isinstance(rows[0][name], str) else None for name in names}
     return {name: np.array([row[name] for row in rows], kinds_of[name]) for name in names}
+
+
+# ---- what people see: a page, lines of text, styles of the layers for QGIS -----------------------------
+
+
+def review_page(review: Review) -> str:
+    """The page: figures, the minutes of looking that find shares of the expected errors, tiles, patches."""
+    found = review.to_dict()
+    points, expected = found["points"], found["expected"]
+    figures = [
+        ("Points judged", f"{points:,}", "", "ground, vegetation and buildings"),
+        ("Expected wrong", f"{expected:,.0f}", "", f"{100 * expected / max(points, 1):.2f} % of them"),
+        ("Patches", f"{found['listed']:,}", "", "in the vector file, worst first"),
+    ]
+    held, spent = np.cumsum(review.patches.errors), np.cumsum(review.patches.minutes)
+    for share in (0.25, 0.5, 0.75, 0.9) if expected > 0 else ():
+        place = min(int(np.searchsorted(held, share * held[-1])), len(spent) - 1)
+        figures.append((f"{100 * share:.0f} % of these", duration(60 * spent[place]), "", "of looking"))
+    return render(
+        "review.html",
+        title="Where to look",
+        subtitle=f"{len(found['tiles']):,} file{'s' * (len(found['tiles']) > 1)}",
+        figures=figures,
+        tiles=found["tiles"][:_ROWS],
+        hidden=max(0, len(found["tiles"]) - _ROWS),
+        patches=found["worst"][:_ROWS],
+    )
+
+
+def lines(found: Mapping[str, Any]) -> list[str]:
+    """The same in a few lines of text: the worst tiles and the worst patches."""
+    points, expected = found["points"], found["expected"]
+    out = [
+        f"{points:,} points judged, {expected:,.0f} expected wrong ({100 * expected / max(points, 1):.2f} %), "
+        f"{found['listed']:,} patches to look at",
+        "",
+        f"{'tile':<40}{'points':>14}{'expected wrong':>16}{'%':>8}{'patches':>9}{'minutes':>9}",
+    ]
+    for row in found["tiles"][:_WORST]:
+        out.append(
+            f"{one_line(row['tile'])[-40:]:<40}{row['points']:>14,}{row['expected']:>16,.0f}{row['percent']:>8.2f}"
+            f"{row['patches']:>9,}{row['minutes']:>9.1f}"
+        )
+    if len(found["tiles"]) > _WORST:
+        out.append(f"... and {len(found['tiles']) - _WORST:,} more")
+    out += ["", f"{'patch':>5}{'expected':>10}{'m2':>8}  why, where"]
+    for row in found["worst"][:_WORST]:
+        x, y = (0.5 * (row["box"][k] + row["box"][k + 2]) for k in (0, 1))
+        out.append(
+            f"{row['rank']:>5}{row['expected']:>10,.0f}{row['area']:>8,.0f}  {row['reason']}; "
+            f"{one_line(row['tile'])} at {x:.0f}, {y:.0f}"
+        )
+    return out
+
+
+def styles(errors: NDArray[np.float64]) -> dict[str, str]:
+    """Of layer ``patches`` in four steps of the points expected wrong, green where ``done`` is 1; of ``tiles`` outlines."""
+    positive = errors[errors > 0]
+    steps = np.quantile(positive, [0.5, 0.8, 0.95]) if len(positive) else np.array([1.0, 2.0, 3.0])
+    low, middle, high = (f"{value:.0f}" for value in steps)
+    rules = {
+        f"below {low} points expected wrong": f"done = 0 and expected < {low}",
+        f"{low} to {middle}": f"done = 0 and expected >= {low} and expected < {middle}",
+        f"{middle} to {high}": f"done = 0 and expected >= {middle} and expected < {high}",
+        f"{high} and more": f"done = 0 and expected >= {high}",
+        "looked at": "done = 1",
+    }
+    patches = [(*rule, ink) for rule, ink in zip(rules.items(), (*_INKS, _LOOKED_AT), strict=True)]
+    return {
+        "patches": qml("MultiPolygon", patches, outline_color="80,40,20,255", outline_width=0.3),
+        "tiles": qml(
+            "MultiPolygon", [("tile", "", "0,0,0,0")], outline_color="60,60,60,255", outline_width=0.5
+        ),
+    }
