@@ -271,17 +271,18 @@ class FileTask:
 
     def _in_parts(self, tail: list[dict[str, Any]]) -> dict[str, Any]:
         """Each part goes through the tail into an uncompressed file; these are joined under the first one's header."""
+        import laspy
+
         classes: Counter[str] = Counter()
+        out: Any = None
+        count = 0
         tail = [{k: v for k, v in stage.items() if k != "compression"} for stage in tail]
 
         def check(made: Path, final: Path, number: int) -> None:
-            check_complete(made, final, {"type": "writers.las", "filename": final}, joined.count)
+            check_complete(made, final, {"type": "writers.las", "filename": final}, count)
 
-        with (
-            whole_files(*self.outputs, check=check) as (partial,),
-            contextlib.closing(_Joined(partial)) as joined,
-            TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True) as folder,
-        ):
+        with whole_files(*self.outputs, check=check) as (partial,), contextlib.ExitStack() as stack:
+            folder = stack.enter_context(TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True))
             piece, part = (os.path.join(folder, name) for name in ("part.las", "out.las"))
             for start in range(0, self.count, MOST_AT_ONCE):
                 end = min(self.count, start + MOST_AT_ONCE)
@@ -289,41 +290,22 @@ class FileTask:
                 new = self._new_values(start, end)
                 run_tail([{**self.source.reader, "filename": piece}], [new], tail, [part], self.scratch)
                 classes.update(_classes(new))
-                joined.add(part)
-        return {"outputs": written(self.outputs), "written": joined.count, "classes": dict(classes)}
+                with laspy.open(part) as made:
+                    if out is None:
+                        how = {"header": made.header, "do_compress": partial.suffix.lower() == ".laz"}
+                        out = stack.enter_context(laspy.open(partial, mode="w", **how))
+                    elif [*made.header.offsets] != [*out.header.offsets]:
+                        raise StageError(
+                            "internal: parts of a file have different offsets", found=str(partial)
+                        )
+                    for points in made.chunk_iterator(BLOCK):
+                        out.write_points(points)
+                    count += int(made.header.point_count)
+        return {"outputs": written(self.outputs), "written": count, "classes": dict(classes)}
 
 
 def _classes(new: NewValues) -> dict[str, int]:
     return class_counts([{name: values for name, (_, values) in new.values.items()}])
-
-
-class _Joined:
-    """A LAS or LAZ file made of others with one header."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.count = path, 0
-        self._writer: Any = None
-
-    def add(self, part: str) -> None:
-        """Append the points of a file."""
-        import laspy
-
-        with laspy.open(part) as reader:
-            header = reader.header
-            if self._writer is None:
-                compress = self.path.suffix.lower() == ".laz"
-                self._writer = laspy.open(self.path, mode="w", header=header, do_compress=compress)
-                self._places = [*header.scales, *header.offsets]
-            elif [*header.scales, *header.offsets] != self._places:
-                raise StageError("internal: the parts of a file have different offsets", where=str(self.path))
-            self.count += int(header.point_count)
-            for points in reader.chunk_iterator(BLOCK):
-                self._writer.write_points(points)
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._writer is not None:
-            self._writer.close()
 
 
 # ---- an output for each tile ---------------------------------------------------------------------------------

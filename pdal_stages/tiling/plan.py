@@ -194,7 +194,7 @@ def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) 
                 reaches[:at] = [0.0] * at
             return found
         if step.ours is not None and step.ours.open_ended:
-            return None
+            break
     return None
 
 

@@ -213,10 +213,6 @@ class TileGrid:
 
     size: float  #: side of a tile, in the unit of the coordinates
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.size) and self.size > 0):
-            raise OptionError("the size of tiles must be a positive length", found=self.size)
-
     def index(self, coordinate: NDArray[np.float64]) -> NDArray[np.int64]:
         """Column or row of every coordinate.
 
