@@ -14,7 +14,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from pdal_stages.base.arrays import coordinate_hash
+from pdal_stages.base.arrays import hash_of
 from pdal_stages.terrain import filtered_ground
 
 GROUND, VEGETATION, BUILDING = 2, 5, 6
@@ -286,7 +286,7 @@ def thinned(cloud: Cloud, density: float) -> Cloud | None:
     share = density / cloud.density
     if share > 0.87:
         return None
-    kept = np.flatnonzero(coordinate_hash(cloud.xyz, 0) < np.uint64(share * 2.0**64))
+    kept = np.flatnonzero(hash_of(cloud.xyz.T, 0) < np.uint64(share * 2.0**64))
     return cloud.part(kept, f"{cloud.name}, {density:g} points per m2")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without_returns
 
-from pdal_stages.base.arrays import coordinate_hash
+from pdal_stages.base.arrays import hash_of
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.features.voxels import represent
 from pdal_stages.stages.preparation import PREPARATION
@@ -70,7 +70,7 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
     if representatives is not None:
         cloud = cloud.taken(representatives.rows)
     cloud = cloud.taken(strip(cloud.xyz, MOST, number * GOLDEN % 1.0))
-    order = np.argsort(coordinate_hash(cloud.xyz, 1), kind="stable")
+    order = np.argsort(hash_of(cloud.xyz.T, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
     whole = TrainingCloud(cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, survey=cloud.survey)
     usable = np.where(contradicted(cloud), 0, cloud.labels)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import coordinate_hash
+from ..base.arrays import hash_of
 from ..base.errors import DependencyError, ModelError, OptionError
 from ..base.files import write_whole
 from ..base.messages import Progress
@@ -308,7 +308,7 @@ class _Session:
             options.pop(free)
         options["start_from"] = options["start_from"] and os.path.basename(options["start_from"])
         labels = [list(self.classes.codes), [list(part) for part in self.classes.labels]]
-        data = [[len(xyz), str(coordinate_hash(xyz, 0).sum())] for xyz in self.clouds]
+        data = [[len(xyz), str(hash_of(xyz.T, 0).sum())] for xyz in self.clouds]
         data.append([int(self.position.astype(np.int64).sum())])
         return json.dumps([FORMAT, options, self.seed, self.inputs, labels, data])
 

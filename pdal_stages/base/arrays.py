@@ -32,20 +32,11 @@ def finalise(h):
     return h ^ (h >> np.uint64(31))
 
 
-def coordinate_hash(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[np.uint64]:
-    """A 64-bit hash of each point's own coordinates and the seed.
-
-    Parameters
-    ----------
-    xyz : (n, k) float64
-        Every bit counts, but -0.0 is 0.0.
-    seed : int
-    """
-    return hash_of(np.asarray(xyz).T, seed)
-
-
 def hash_of(columns: Iterable[npt.ArrayLike], seed: int) -> npt.NDArray[np.uint64]:
-    """The same of values that lie in an array each, (n,) of any type; there must be one at least."""
+    """A 64-bit hash of each point's values and the seed: every bit counts, but -0.0 is 0.0.
+
+    The values lie in an array each, (n,) of any type, such as the axes of coordinates; there must be one at least.
+    """
     arrays = [np.asarray(column) for column in columns]
     out = np.empty(len(arrays[0]), np.uint64)
     for start in range(0, len(out), _TOGETHER):

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..accuracy.labels import as_codes
-from ..base.arrays import begins_run, coordinate_hash
+from ..base.arrays import begins_run, hash_of
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
 from ..base.messages import Progress
@@ -102,7 +102,7 @@ def prepared(sources: Iterable[TrainingCloud], options: TrainingOptions) -> Iter
             if wanted < WORTH * there:
                 # A point stays or goes by a hash of its coordinates: the same ones in any order.
                 limit = np.uint64(wanted / there * (2.0**64 - 2048.0))
-                rows = np.flatnonzero(coordinate_hash(cloud.xyz, options.seed) <= limit)
+                rows = np.flatnonzero(hash_of(cloud.xyz.T, options.seed) <= limit)
                 if len(rows):
                     yield cloud.part(rows, f"thinned to {wanted:g} per m2")
 

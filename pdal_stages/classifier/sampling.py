@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..accuracy.measures import Accuracy
-from ..base.arrays import coordinate_hash
+from ..base.arrays import hash_of
 from ..base.errors import OptionError
 from ..base.messages import Progress
 
@@ -179,7 +179,7 @@ def curve_keys(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[Any]:
     cells = np.clip(np.floor(xyz[:, :2] / CELL) + 2**30, 0, 2**31 - 1).astype(np.uint64)
     keys = np.empty(len(xyz), dtype=[("cell", np.uint64), ("hash", np.uint64)])
     keys["cell"] = _spread_bits(cells[:, 0]) | (_spread_bits(cells[:, 1]) << np.uint64(1))
-    keys["hash"] = coordinate_hash(xyz, seed)
+    keys["hash"] = hash_of(xyz.T, seed)
     return keys
 
 

@@ -204,10 +204,8 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         if self.merge is not None or self.classes:
             return rule
         # Vegetation is one class where only one was predicted.
-        true, given = (
-            set(np.unique(np.concatenate([np.unique(getattr(one, side)) for one in sides])).tolist())
-            for side in ("reference", "predicted")
-        )
+        true = {code for one in sides for code in np.unique(one.reference).tolist()}
+        given = {code for one in sides for code in np.unique(one.predicted).tolist()}
         target = Merge.parse(rule["merge"]).target_of
         parts = [code for code in LOWER if code in true and target[code] == code]
         if (
@@ -237,10 +235,9 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
         settings = {"files": self.files, "reference system": systems, "model": self.model_file}
         settings |= {k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]}
         settings |= {k: rule[k] for k in ("classes", "ignore", "merge") if rule[k] is not None}
-        model = loaded_model(self.model_file) if self.model_file else None
-        known = (
-            model is not None and model.info["passes"][-1]["importances"] is not None
-        )  # networks have none
+        importances = None
+        if self.model_file and (model := loaded_model(self.model_file)).info["passes"][-1]["importances"]:
+            importances = model.importances("column")  # networks have none
         shown = [
             Place(name, points.xyz[one.inside], one.reference, one.predicted)
             for (name, points), one in zip(parts, sides, strict=True)
@@ -250,7 +247,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
             accuracy,
             places=places(shown, [points.wkt for _, points in parts]),
             subtitle="; ".join(map(str, filter(None, [*self.files[:3], systems, self.model_file]))),
-            importances=model.importances("column") if model is not None and known else None,
+            importances=importances,
             settings=settings,
         )
 

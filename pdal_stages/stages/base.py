@@ -174,11 +174,7 @@ class Stage(ABC):
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
         own = arrays.get(self.own_points)
-        points = Points(
-            arrays, wkt=wkt, where=self._condition, units=units, legacy_flags=legacy_flags, own=own
-        )
-        points.code_limit = self.code_limit
-        return points
+        return Points(arrays, wkt, self._condition, units, legacy_flags, own, self.code_limit)
 
     @abstractmethod
     def run(self, points: Points) -> dict[str, NDArray]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import coordinate_hash
+from ..base.arrays import hash_of
 from ..base.errors import StageError
 from ..base.messages import Report
 from ..classifier.algorithms import CHECKED
@@ -69,7 +69,7 @@ class CheckedChoice:
         out = looked.wanted.copy()
         for code, share in self._shares.items():
             mine = np.flatnonzero(looked.sure & (looked.codes == code))
-            out[mine[coordinate_hash(xyz[mine], self._seed) / 2.0**64 < share]] = True
+            out[mine[hash_of(xyz[mine].T, self._seed) / 2.0**64 < share]] = True
         return out
 
     def say(self, report: Report) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
 
@@ -42,56 +43,35 @@ _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 _HEIGHTS = "HeightAbove"
 
 
+@dataclass(eq=False)
 class Points:
-    """One view of points, as a stage sees it.
+    """One view of points, as a stage sees it."""
 
-    Parameters
-    ----------
-    arrays : mapping of str to ndarray
-        PDAL's dimensions, one value per point.
-    wkt : str
-        The spatial reference, empty where there is none.
-    where : Expression, optional
-        Points the stage acts on.
-    units : (str, str)
-        Names of the horizontal and the vertical unit; empty where the spatial reference says it.
-    legacy_flags : bool
-        True where the three flag bits of LAS 1.0-1.3 sit inside `Classification`.
-    own : (n,) ndarray, optional
-        Below zero for the points whose results are used: :meth:`counted` counts those alone.
-    """
-
-    #: Whether the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
-    lent_by_pdal = False
+    arrays: Mapping[str, NDArray]  #: PDAL's dimensions, one value per point
+    wkt: str = ""  #: the spatial reference, empty where there is none
+    where: Expression | None = None  #: points the stage acts on
+    #: Names of the horizontal and the vertical unit; empty where the spatial reference says it.
+    unit_names: tuple[str, str] = ("", "")
+    legacy_flags: bool = False  #: whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`
+    #: Below zero for the points whose results are used: :meth:`counted` counts those alone.
+    own: NDArray | None = None
     #: Where they will be written with codes up to 31 alone: what to say of others, and the cure.
     code_limit: tuple[str, str] | None = None
+    #: Whether the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
+    lent_by_pdal: bool = False
 
-    def __init__(
-        self,
-        arrays: Mapping[str, NDArray],
-        *,
-        wkt: str = "",
-        where: Expression | None = None,
-        units: tuple[str, str] = ("", ""),
-        legacy_flags: bool = False,
-        own: NDArray | None = None,
-    ) -> None:
-        self.arrays = arrays
-        self.wkt = wkt
-        self.legacy_flags = legacy_flags
-        self.count = len(arrays["X"]) if "X" in arrays else 0
+    def __post_init__(self) -> None:
+        self.count = len(self.arrays["X"]) if "X" in self.arrays else 0
         self.report = Report({"points": self.count})
-        self._units = units
-        self._own = own
         self.mask: NDArray[np.bool_] | None = None
-        if where is not None:
-            freed = arrays
-            if legacy_flags:
-                freed = ChainMap({"Classification": self.class_codes}, cast(dict, arrays))
-            self.mask = where.evaluate(freed)
+        if self.where is not None:
+            freed = self.arrays
+            if self.legacy_flags:
+                freed = ChainMap({"Classification": self.class_codes}, cast(dict, freed))
+            self.mask = self.where.evaluate(freed)
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             if self.count and not self.report.figures["where"]:
-                self.report.warnings.append(f"{HOLDS_NOWHERE} {where.text}")
+                self.report.warnings.append(f"{HOLDS_NOWHERE} {self.where.text}")
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -100,14 +80,16 @@ class Points:
 
     def counted(self, points: NDArray[np.bool_]) -> int:
         """How many points these are, for a report."""
-        return int(np.count_nonzero(points if self._own is None else points & (self._own < 0)))
+        return int(np.count_nonzero(points if self.own is None else points & (self.own < 0)))
 
     @cached_property
     def units(self) -> Units:
         """Meters per unit; refuses degrees. An assumption is put in the report."""
         x, y = (self.arrays[axis] for axis in "XY") if self.count else (np.zeros(0), np.zeros(0))
         place = (float(x[0]), float(y[0])) if self.count else None
-        units = units_of_wkt(self.wkt, horizontal=self._units[0], vertical=self._units[1], place=place)
+        units = units_of_wkt(
+            self.wkt, horizontal=self.unit_names[0], vertical=self.unit_names[1], place=place
+        )
         if units.assumed and self.count:
             self.report.notes.append("the points have no spatial reference: meters were assumed")
             if np.abs(x).max() <= 180.0 and np.abs(y).max() <= 90.0 and max(np.ptp(x), np.ptp(y)) < 0.2:
@@ -153,7 +135,7 @@ class Points:
         kept, lent = set(names), self.arrays
         self.arrays = {name: lent[name] for name in lent if name in kept}
         if self.lent_by_pdal:  # which makes these arrays for this one call, and frees them after it
-            for array in (lent[name] for name in lent.keys() - kept if lent[name] is not self._own):
+            for array in (lent[name] for name in lent.keys() - kept if lent[name] is not self.own):
                 give_back(array)
 
     def take_xyz(self) -> NDArray[np.float64]:

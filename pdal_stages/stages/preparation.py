@@ -155,17 +155,9 @@ def made_of_coordinates(
     usable: npt.NDArray[np.bool_] | None = None,
     threads: int | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
-    """The dimensions that a preparation's only stage makes; none where it is not one of ours.
+    """The dimensions that a preparation's only stage makes of coordinates in meters; none where it is not one of ours.
 
-    Parameters
-    ----------
-    preparation : sequence of mapping
-        As model files have it.
-    xyz : (n, 3) float64
-        Meters.
-    usable : (n,) bool, optional
-        Points that may form the ground; the others only receive heights.
-    threads : int, optional
+    `usable` (n,) are points that may form the ground; the others only receive heights.
     """
     if len(preparation) != 1 or "where" in preparation[0] or preparation[0]["type"] not in registry.stages():
         return {}
