@@ -238,28 +238,6 @@ def test_layers_are_written_all_or_none_and_nothing_older_is_left(folder, tmp_pa
 
 
 @pytest.mark.pdal
-def test_one_layer_that_fails_leaves_none(folder, tmp_path, monkeypatch):
-    from pdal_stages.reports import objectlayers
-
-    real = objectlayers._write
-
-    def failing(path, name, *rest):
-        if name == "spans":
-            raise StageError("objects could not be written", found="disk")
-        real(path, name, *rest)
-
-    monkeypatch.setattr(objectlayers, "_write", failing)
-    with pytest.raises(StageError, match="could not be written"):
-        Pipeline(
-            [
-                str(folder / "parts" / "0.laz"),
-                {"type": "writers.objects", "filename": str(tmp_path / "t.shp")},
-            ]
-        ).execute(arrays=False)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.pdal
 def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path, capsys, monkeypatch):
     from pdal_stages.tiling import objects
 

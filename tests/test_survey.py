@@ -131,21 +131,6 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, cla
     assert contents(target) == before
 
 
-def test_a_damaged_file_is_named_and_done_once_it_is_repaired(survey, classify, fresh, tmp_path):
-    (tmp_path / "in").mkdir()
-    for path in (survey / "in").iterdir():
-        (tmp_path / "in" / path.name).write_bytes(path.read_bytes())
-    whole = (tmp_path / "in" / "t3.laz").read_bytes()
-    (tmp_path / "in" / "t3.laz").write_bytes(whole[:1000])
-    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 45)
-    assert code == 1 and "t3.laz" in err and "failed" in out
-    assert not (tmp_path / "out" / "t3.laz").exists()
-    (tmp_path / "in" / "t3.laz").write_bytes(whole)
-    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 45, "--resume")
-    assert code == 0, err
-    assert contents(tmp_path / "out") == fresh
-
-
 def test_a_dry_run_writes_nothing_and_finds_what_is_wrong(survey, classify, tmp_path):
     code, out, err = classify(survey / "in", tmp_path / "out", "--dry-run")
     assert code == 0 and "4 inputs" in out and not list(tmp_path.iterdir()), err

@@ -93,9 +93,8 @@ def test_octrees_are_read_in_tiles_too(tmp_path, capsys):
             "--writers.classifiermodel.where=HeightAboveGround < 9",
         ),
         ("--writers.classifiermodel.survey=PointSourceId",),
-        ("--writers.classifiermodel.ignore=ReturnNumber[2:2]", "--filters.hag_morphological.window=20"),
     ],
-    ids=["groups", "surveys", "ignore"],
+    ids=["groups", "surveys"],
 )
 def test_with_other_options_too(town, tmp_path, capsys, more):
     (whole, tiles), _ = both(town, tmp_path, capsys, *more)
