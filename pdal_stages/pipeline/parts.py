@@ -80,28 +80,29 @@ def parts_of(path: str, wkt: str) -> Iterator[Part]:
     StageError
         If it cannot be read to its end.
     """
+    for arrays, flags in arrays_in_parts(path, WANTED):
+        yield _part(Points(arrays, wkt=wkt, legacy_flags=flags))
+
+
+def arrays_in_parts(
+    path: str, wanted: Sequence[str], only: Sequence[str] = ()
+) -> Iterator[tuple[dict[str, NDArray], bool]]:
+    """Coordinates, classes, what is withheld, and what there is of the `wanted` dimensions; whether classes hold flags.
+
+    A part of a LAS or LAZ file at a time, `only`: see :func:`las_chunks`; of others all, by PDAL.
+    """
+    named = {"X": "x", "Y": "y", "Z": "z", "Classification": "classification", "Withheld": "withheld"}
     if not reads_in_parts(path):
         ran = pdal_env.execute([reader_of(path, "input")])
         for array in ran.arrays:
+            names = [name for name in (*named, *wanted) if name in array.dtype.names]
             flags = pdal_env.flags_inside_classification(array.dtype.names, ran.metadata)
-            names = [
-                n for n in ("X", "Y", "Z", "Classification", "Withheld", *WANTED) if n in array.dtype.names
-            ]
-            yield _part(Points({n: np.asarray(array[n]) for n in names}, wkt=wkt, legacy_flags=flags))
+            yield {name: np.asarray(array[name]) for name in names}, flags
         return
-    for chunk in las_chunks(path):
-        arrays = {
-            "X": np.asarray(chunk.x),
-            "Y": np.asarray(chunk.y),
-            "Z": np.asarray(chunk.z),
-            "Classification": np.asarray(chunk.classification),
-            "Withheld": np.asarray(chunk.withheld),
-        }
+    for chunk in las_chunks(path, only=only):
         there = set(chunk.point_format.dimension_names)
-        for name in WANTED:
-            if (known := _LASPY.get(name, name)) in there:
-                arrays[name] = np.asarray(chunk[known])
-        yield _part(Points(arrays, wkt=wkt))
+        more = {name: known for name in wanted if (known := _LASPY.get(name, name)) in there}
+        yield {name: np.asarray(chunk[known]) for name, known in (named | more).items()}, False
 
 
 def las_chunks(

@@ -6,7 +6,7 @@ Each file is read once into records of cells; then objects are found in all.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,8 @@ from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import refuse_unclassified
-from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import check_one_reference, input_files, reference_of_file
-from ..pipeline.parts import las_chunks, reads_in_parts
+from ..pipeline.parts import arrays_in_parts, reads_in_parts
 from ..pipeline.read import Override
 from ..pipeline.workers import each_file
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
@@ -146,20 +145,8 @@ def _cells_of(path: str, stage: ObjectsWriter, wkt: str) -> tuple[Cells, NDArray
     """A file's records, and the points of each class code."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
-    for arrays in _points_of(path):
-        points = stage.points(arrays, wkt=wkt)
+    for arrays, flags in arrays_in_parts(path, ("Reliability",), _ONLY):
+        points = stage.points(arrays, wkt=wkt, legacy_flags=flags)
         seen += np.bincount(points.class_codes, minlength=256)
         cells = Cells.join([cells, stage.records(points)])
     return cells, seen
-
-
-def _points_of(path: str) -> Iterator[dict[str, NDArray]]:
-    """The dimensions that objects read, a part of a LAS or LAZ file at a time; of others all, by PDAL."""
-    if not reads_in_parts(path):
-        for points in pdal_env.execute([{"filename": path}]).arrays:
-            yield {name: np.asarray(points[name]) for name in points.dtype.names}
-        return
-    named = {"X": "x", "Y": "y", "Z": "z", "Classification": "classification", "Withheld": "withheld"}
-    for points in las_chunks(path, only=_ONLY):
-        extra = {"Reliability"} & set(points.point_format.extra_dimension_names)
-        yield {name: np.asarray(points[at]) for name, at in (named | {n: n for n in extra}).items()}
