@@ -39,18 +39,14 @@ class _Family:
                 options["merge"], merge = merge, True
             # Points of several readers must see each other; of one reader merging costs nothing.
             wired = {"inputs": options["inputs"]} if merge and "inputs" in options else {}
-            expanded = expand_stage(
-                {"type": kind.type, **{k: v for k, v in options.items() if k not in wired}}
-            )
+            own = {name: value for name, value in options.items() if name not in wired}
+            expanded = expand_stage({"type": kind.type, **own})
             runtime.remember_stdout()
             stages = [*([{"type": "filters.merge", **wired}] if merge else []), expanded.plain]
             shown = f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
             joined = _joined(stages, shown, expanded.stage)
-            joined.type, joined.tag, joined.options = (
-                kind.type,
-                options.get("tag"),
-                {"type": kind.type, **options},
-            )
+            joined.type, joined.tag = kind.type, options.get("tag")
+            joined.options = {"type": kind.type, **options}
             return joined
 
         make.__name__ = make.__qualname__ = name
@@ -65,23 +61,12 @@ class _Family:
 
 def _signature(kind: type[Stage]) -> inspect.Signature:
     """The required option first, by place or by name; the others by name, with their defaults."""
-    options = sorted(kind.all_options(), key=lambda option: not option.required)
-    parameters = [
-        inspect.Parameter(option.name, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        if option.required
-        else inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=option.default)
-        for option in options
-    ]
-    more = {"tag": None, "inputs": None, "merge": True}
+    needed = [option.name for option in kind.all_options() if option.required]
+    defaults = {option.name: option.default for option in kind.all_options() if not option.required}
+    by_name = {"tag": None, "inputs": None, "merge": True} | defaults
     return inspect.Signature(
-        [
-            *parameters,
-            *(
-                inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
-                for name, default in more.items()
-                if name not in {option.name for option in options}
-            ),
-        ]
+        [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in needed]
+        + [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d) for n, d in by_name.items()]
     )
 
 
@@ -89,9 +74,8 @@ def _help(kind: type[Stage]) -> str:
     lines = [f"{kind.summary}.", "", "Parameters", "----------"]
     for option in kind.all_options():
         lines += [f"{option.name} : {option.kind}", f"    {option.help}"]
-    return "\n".join(
-        [*lines, "tag, inputs", "    As for PDAL's stages", "merge : bool", "    False keeps views apart"]
-    )
+    lines += ["tag, inputs", "    As for PDAL's stages", "merge : bool", "    False keeps views apart"]
+    return "\n".join(lines)
 
 
 def _joined(stages: list[dict[str, Any]], shown: str, made_from: Stage):

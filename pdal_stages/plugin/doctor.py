@@ -18,6 +18,7 @@ from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..pipeline import pdal as pdal_env
+from ..pipeline import runtime
 from . import building
 
 #: Extra -> the package that it brings, and what for.
@@ -30,18 +31,15 @@ _EXTRAS = {
 #: What a job needs beside the cloud itself; less is told.
 _LITTLE_MEMORY = 2 * 2**30
 _SCRIPT = """
-def look(ins, outs):
+def stage(ins, outs):
+    import sys
     try:
-        import sys
-        try:
-            import pdal_stages
-            found = pdal_stages.__file__
-        except ImportError as error:
-            found = f"{type(error).__name__}: {error}"
-        with open(pdalargs["answer"], "w") as file:
-            file.write(sys.prefix + "\\n" + found)
-    except Exception:
-        pass
+        import pdal_stages
+        found = pdal_stages.__file__
+    except Exception as error:  # raised, it would end the process
+        found = f"{type(error).__name__}: {error}"
+    with open(pdalargs["answer"], "w") as file:
+        file.write(sys.prefix + "\\n" + found)
     return True
 """
 
@@ -62,10 +60,7 @@ class Finding:
 
 def examine() -> Iterator[Finding]:
     """Everything, one after the other; each looks by itself, so that one fault does not hide the next."""
-    looks: tuple[Callable[[], Iterator[Finding]], ...] = (
-        _package, _bindings, _program, _plugin, _machine, _extras
-    )  # fmt: skip
-    for look in looks:
+    for look in (_package, _bindings, _program, _plugin, _machine, _extras):
         try:
             yield from look()
         except StageError as error:
@@ -90,40 +85,33 @@ def _bindings() -> Iterator[Finding]:
 
 
 def _program() -> Iterator[Finding]:
-    program = pdal_env.program()
+    yield _python_of(f"filters.python in {pdal_env.program()}", _run_program)
 
-    def run(stages: list) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "job.json")
-            path.write_text(json.dumps(stages))
-            try:
-                pdal_env.ask_program("pipeline", str(path))
-            except PipelineError as error:
-                raise pdal_env.translate(str(error.found)) from None
 
-    yield _python_of(f"filters.python in {program}", run)
+def _run_program(stages: list) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "job.json")
+        path.write_text(json.dumps(stages))
+        try:
+            pdal_env.ask_program("pipeline", str(path))
+        except PipelineError as error:
+            raise pdal_env.translate(str(error.found)) from None
 
 
 def _python_of(what: str, run: Callable[[list], object]) -> Finding:
     """Which Python PDAL runs, and whether our package is there."""
+    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": "([1, 2], [1, 2], [1, 2])"}
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer")
-        points = {
-            "type": "readers.faux",
-            "mode": "constant",
-            "count": 1,
-            "bounds": "([1, 2], [1, 2], [1, 2])",
-        }
-        script = {"source": _SCRIPT, "function": "look", "module": "pdal_stages_doctor"}
-        run([points, {"type": "filters.python", **script, "pdalargs": {"answer": str(answer)}}])
+        run([point, runtime.python_filter("pdal_stages_doctor", _SCRIPT, {"answer": str(answer)}, {})])
         if not answer.is_file():
             cure = "Install pdal-plugins again, for this PDAL and this Python"
             return Finding(what, "the script did not run", cure)
         prefix, found = answer.read_text().splitlines()[:2]
-    python = f"Python of {prefix}"
+    python, here = f"Python of {prefix}", Path(__file__).resolve().parents[1]
     if not os.path.isabs(found):
         return Finding(what, f"{python}; {found}", f"{prefix}/bin/python -m pip install pdal-stages")
-    if Path(found).resolve().parent != Path(__file__).resolve().parents[1]:
+    if Path(found).resolve().parent != here:
         other = f"{python}, which has another pdal_stages: {found}"
         return Finding(what, other, "Keep one of them, or one version")
     return Finding(what, python)
