@@ -25,7 +25,6 @@ _LASPY = {
     "PointSourceId": "point_source_id",
     "ReturnNumber": "return_number",
     "NumberOfReturns": "number_of_returns",
-    "GpsTime": "gps_time",
 }
 
 
@@ -58,12 +57,6 @@ class Part:
             np.concatenate([part.xyz for part in parts]),
             np.concatenate([part.codes for part in parts]),
             {name: np.concatenate([part.arrays[name] for part in parts]) for name in parts[0].arrays},
-        )
-
-    def taken(self, chosen: NDArray[Any]) -> Part:
-        """Some of the points."""
-        return Part(
-            self.xyz[chosen], self.codes[chosen], {name: v[chosen] for name, v in self.arrays.items()}
         )
 
 

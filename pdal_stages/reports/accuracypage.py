@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from ..accuracy.labels import as_codes, same_length
 from ..accuracy.measures import Accuracy
-from ..accuracy.text import percent
 from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
@@ -23,8 +22,8 @@ from .views import IGNORED, RIGHT, WRONG, embedded, nice_step, paint, shading, s
 
 #: Files within so many meters share a map, and places that are drawn at most.
 TOGETHER, DRAWN = 1000.0, 12
-#: Most pixels across a map and in all of it, fewest along its longer side.
-MAP_WIDTH, MAP_PIXELS, MAP_LEAST = 820, 800_000, 240
+#: Most pixels across a map and in all of it.
+MAP_WIDTH, MAP_PIXELS = 820, 800_000
 
 
 @dataclass(frozen=True)
@@ -145,12 +144,8 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, An
     if min(across, up) < 0.02 * max(across, up) or max(across, up) == 0:
         return out
     x, y, z = points.T
-    # Three pixels to the distance of neighboring points, within the limits; see `surface` for what is tall.
-    width = min(
-        max(3 * across / math.sqrt(across * up / len(points)), MAP_LEAST * min(1.0, across / up)), MAP_WIDTH
-    )
-    width = max(16, min(width, math.sqrt(MAP_PIXELS * across / up)))
-    s = surface(x, y, z, math.ceil(max(width, width * up / across / 2.5)))
+    width = min(MAP_WIDTH, math.sqrt(MAP_PIXELS * across / up))
+    s = surface(x, y, z, max(16, math.ceil(width)))
     light, (tall, wide) = shading(s), s.which.shape
     length = nice_step(wide * s.pixel / 6)
 
@@ -158,18 +153,10 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, An
         scale = (100 * length / (wide * s.pixel), f"{length:g} m")
         return {"heading": heading, "alt": alt, "scale": scale, **embedded(paint(s, colors, light))}
 
-    def classes(codes: npt.NDArray[Any], heading: str, word: str) -> dict[str, Any]:
-        count = np.bincount(codes)
-        found = sorted(np.flatnonzero(count), key=lambda c: -count[c])[:8]
-        listed = ", ".join(f"{a.name(int(c))} {percent(count[c] / len(codes), 1)} %" for c in found)
-        colors = palette[np.searchsorted(there, s.spread(codes, there[0]))]
-        return picture(
-            colors, heading, f"Map of the {word} classes from above, by number of points: {listed}"
-        )
-
     alt = f"Map of the errors from above: {wrong.sum():,} of {n:,} compared points are wrong"
     there = np.union1d(true, given).tolist()
     palette = np.array([class_color(code) for code in there], np.uint8)
+    shown = [palette[np.searchsorted(there, s.spread(codes, there[0]))] for codes in (true, given)]
     return {
         **out,
         "caption": f"{len(points):,} points, {wide * s.pixel:,.0f} x {tall * s.pixel:,.0f} m, north up; lower left "
@@ -178,8 +165,8 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, An
         "classes": [(class_color(code), f"{code} {a.name(code)}") for code in there],
         "verdicts": [(RIGHT, "right"), (WRONG, "wrong"), (IGNORED, "not compared")][: 2 + (n < len(points))],
         "maps": [
-            classes(true, "Reference", "reference"),
-            classes(given, "Prediction", "predicted"),
+            picture(shown[0], "Reference", "Map of the reference classes from above"),
+            picture(shown[1], "Prediction", "Map of the predicted classes from above"),
             picture(verdict(s, x, y, z, wrong, ~compared), "Errors", alt),
         ],
         "in_a_row": wide < 1.7 * tall,
