@@ -82,8 +82,7 @@ def _models(options: argparse.Namespace) -> None:
 def _train(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
     from ..pipeline.inputs_outputs import input_files
-    from ..pipeline.training import surveys_of
-    from ..tiling.training import TrainTask
+    from ..tiling.training import TrainTask, surveys_of
 
     extra = {name: value for name in _OF_TRAINING if (value := getattr(options, name)) is not None}
     files, surveys = input_files(options.inputs), {}

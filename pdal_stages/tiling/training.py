@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,15 @@ from ..classifier.summary import FILE_NUMBER
 from ..classifier.training import reach
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import is_ept, is_las, overridden
+from ..pipeline.expansion import expand_stage
+from ..pipeline.inputs_outputs import check_readers, is_ept, is_las, overridden, reader_of
 from ..pipeline.read import Override
-from ..pipeline.runtime import Callbacks, points_of_views
-from ..pipeline.training import heights_for, lowered_writer, read_points
+from ..pipeline.run import Pipeline
+from ..pipeline.runtime import Callbacks, points_of_views, python_filter
 from ..stages.checked import CheckedChoice, Looked
 from ..stages.classifiermodel import ClassifierModel
+from ..stages.points import Points
+from ..stages.preparation import preparation_of
 from .inputs import find_sources, read_extent
 from .outputs import NewValues, PieceResults, of_own_points, read_with
 from .plan import plan_of_files, readers_of
@@ -41,6 +45,65 @@ TRAIN_POINT = 400
 _WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
+
+
+#: PDAL calls this for the points of one reader after the other.
+_NUMBER = f"""\
+import numpy as np
+number = 0
+def stage(ins, outs):
+    global number
+    number += 1
+    outs["{FILE_NUMBER}"] = np.full(len(ins["X"]), number, np.uint32)
+    return True
+"""
+
+
+def _lowered(given: Mapping[str, Any]) -> ClassifierModel:
+    """The stage that trains."""
+    return cast(ClassifierModel, expand_stage(dict(given)).stage)
+
+
+def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
+    """Name -> files of each survey.
+
+    Parameters
+    ----------
+    files : sequence of str
+    grouped : sequence of str
+        ``NAME=PATTERN``: files whose path or name is like the pattern are of that survey; each other one is its own.
+
+    Raises
+    ------
+    OptionError
+        If a group is not written so, or has no file, or a file is in two.
+    """
+    out: dict[str, list[str]] = {}
+    of: dict[str, str] = {}
+    for one in grouped:
+        name, mark, pattern = one.partition("=")
+        if not (mark and name.strip() and pattern.strip()):
+            raise OptionError(
+                "surveys are written NAME=PATTERN", found=one, cure="For example north='north/*.laz'"
+            )
+        parts = [part.strip() for part in pattern.split(",") if part.strip()]
+        mine = [f for f in files if any(_like(f, part) for part in parts)]
+        if not mine:
+            raise OptionError("a survey has no files", found=one, cure=f"There are {', '.join(files[:5])}")
+        for file in mine:
+            if of.setdefault(file, name) != name:
+                raise OptionError("a file is in two surveys", found=f"{file}: {of[file]} and {name}")
+        out[name] = mine
+    for file in files:
+        if file not in of:
+            name = Path(file).stem
+            out.setdefault(name if name not in out else file, []).append(file)
+    return out
+
+
+def _like(file: str, pattern: str) -> bool:
+    inside = Path(pattern).is_dir() and Path(pattern).resolve() in Path(file).resolve().parents
+    return inside or fnmatch.fnmatch(file, pattern) or fnmatch.fnmatch(Path(file).name, pattern)
 
 
 @dataclass(frozen=True)
@@ -85,7 +148,7 @@ class TrainTask:
     @cached_property
     def stage(self) -> ClassifierModel:
         """What trains."""
-        return lowered_writer(self._writer)
+        return _lowered(self._writer)
 
     def in_one_piece(self) -> bool:
         """Whether all points fit into the memory, those of each survey by themselves, or cannot be cut into tiles.
@@ -105,7 +168,9 @@ class TrainTask:
     def run(self) -> list[str]:
         """Train and write the model; what is to be told."""
         stage = self.stage
-        heights = [overridden(one, self.overrides) for one in heights_for(stage)]
+        base = stage.training.base
+        made_by = preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+        heights = [overridden(one, self.overrides) for one in made_by]
         told = [said] if (said := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
         stage.check()
@@ -115,6 +180,22 @@ class TrainTask:
         stage.finish(made, report)
         return [*told, *report.messages]
 
+    def _read(self, heights: Sequence[Mapping[str, Any]], stage: ClassifierModel) -> Points:
+        """The points with heights, and with the files' numbers where they are held out by these."""
+        readers = [reader_of(file, f"input{i}") for i, file in enumerate(self.files, 1)]
+        told = check_readers(readers)
+        number = python_filter("pdal_stages_file_number", _NUMBER, {}, {FILE_NUMBER: "uint32_t"})
+        numbers = [number] if stage.groups == FILE_NUMBER else []
+        own = [one for one in self.overrides if one.selector != stage.type]
+        pipeline = Pipeline([*readers, *numbers, *map(dict, heights)], own)
+        pipeline.execute()
+        if not any(map(len, pipeline.arrays)):
+            raise StageError("there are no points to train on", where=", ".join(self.files[:3]))
+        points = points_of_views(pipeline.arrays, pipeline.metadata, stage.points)
+        points.report.warnings += [*told, *(f"PDAL says: {line}" for line in pipeline.log_lines[:10])]
+        points.report.warnings += pipeline.messages
+        return points
+
     def _whole(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
         """Trained on all points of a survey at once, one survey after the other."""
         each = self._each()
@@ -123,7 +204,7 @@ class TrainTask:
         def clouds() -> Iterator[TrainingCloud]:
             nonlocal training
             for task in each:
-                points = read_points(task.files, heights, self.overrides, self.stage)
+                points = task._read(heights, self.stage)
                 found = self.stage.training_on(points)
                 training = training or found
                 _check_same(found.dimensions, training.dimensions)
@@ -232,7 +313,7 @@ class Taking:
     numbers: Mapping[str, int]  #: of inputs by path, where points are to have the number of theirs
 
     def __call__(self, results: list[PieceResults], outputs: list[str], scratch: str) -> dict[str, Any]:
-        stage = lowered_writer(self.writer)
+        stage = _lowered(self.writer)
         readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
         new = [self._new_values(result) for result in results]
         with Callbacks() as callbacks:
