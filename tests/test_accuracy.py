@@ -250,7 +250,7 @@ def test_table_is_ascii_and_aligned():
         ({"reference": [2, 6], "predicted": [2]}, "another length.*1 and 2"),
         ({"reference": [2, 6], "predicted": [2, 6], "reliability": [1.0]}, "reliability has another length"),
         ({"reference": [2.0, np.nan], "predicted": [2, 2]}, "not class codes.*nan"),
-        ({"reference": [2], "predicted": [2], "classes": ["ground"]}, "'classes' has an entry.*'ground'"),
+        ({"reference": [2], "predicted": [2], "classes": ["ground"]}, "a class in 'classes'.*'ground'"),
         (
             {"reference": [2], "predicted": [2], "merge": {5: [3], 6: [3]}},
             "to two others.*class 3 to 5 and 6",

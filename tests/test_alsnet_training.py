@@ -75,7 +75,7 @@ def test_ground_held_out_is_whole_blocks_with_all_classes():
     assert 0.1 < mask.mean() < 0.3
     assert set(position[mask]) == {0, 1, 2}
     assert not hold_out(xyz, position, 0.0, 12.0).any()
-    with pytest.raises(OptionError, match="validation to 0"):
+    with pytest.raises(OptionError, match="smaller blocks"):
         hold_out(xyz, position, 0.2, 1000.0)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base import checks
 from ..base.asprs import NAMES, class_name
 from ..base.errors import StageError
 
@@ -50,19 +51,16 @@ def same_length(reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[An
             )
 
 
+def code_of(what: str, value: Any, most: int = MAX_LABEL) -> int:
+    """A class code; digits as text (JSON keys) are allowed."""
+    if isinstance(value, str) and value.strip().isdecimal():
+        value = int(value)
+    return checks.whole(what, value, 0, most)
+
+
 def code_list(codes: Iterable[Any], option: str) -> list[int]:
-    """Class codes as ints; strings of digits (JSON keys) are allowed."""
-    out = []
-    for code in codes:
-        try:
-            value = int(code)
-            good = value == (int(code) if isinstance(code, str) else code) and 0 <= value <= MAX_LABEL
-        except (TypeError, ValueError):
-            good = False
-        if not good or isinstance(code, bool):
-            raise StageError(f"'{option}' has an entry that is not a class code", found=repr(code))
-        out.append(value)
-    return out
+    """Class codes as ints."""
+    return [code_of(f"a class in '{option}'", code) for code in codes]
 
 
 def class_names(codes: Iterable[int], given: Mapping[Any, str] | None) -> dict[int, str]:

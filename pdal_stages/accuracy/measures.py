@@ -159,40 +159,20 @@ class Accuracy:
         )
 
     @classmethod
-    def from_confusion(
-        cls,
-        matrix: npt.ArrayLike,
-        classes: Sequence[int],
-        extra: Sequence[int] = (),
-        names: Mapping[int, str] | None = None,
-        left_out: Mapping[int, int] | None = None,
-    ) -> Accuracy:
-        """Take a confusion matrix as it is.
-
-        Parameters
-        ----------
-        matrix : (K, K + E) array of whole numbers
-            Rows are the reference, columns the prediction: `classes` first, then `extra`.
-        classes, extra, names, left_out
-            As in the attributes.
-        """
-        rows, more = code_list(classes, "classes"), code_list(extra, "extra")
-        counts = np.asarray(matrix)
-        fits = counts.shape == (len(rows), len(rows) + len(more)) and len(rows) > 0
-        if not fits or len(set(rows + more)) != len(rows) + len(more):
+    def from_confusion(cls, matrix: npt.ArrayLike, classes: Sequence[int]) -> Accuracy:
+        """Take a confusion matrix as it is: whole numbers, rows are the reference, columns the prediction."""
+        rows, counts = code_list(classes, "classes"), np.asarray(matrix)
+        if counts.shape != (len(rows), len(rows)) or len(set(rows)) != len(rows) or not rows:
             raise StageError(
                 "the confusion matrix does not fit its classes",
-                found=f"shape {counts.shape} for classes {rows} and extra columns {more}",
-                cure="Give one row per class, and one column per class and extra class",
+                found=f"shape {counts.shape} for classes {rows}",
+                cure="Give one row and one column per class",
             )
-        whole = np.array(counts, dtype=np.int64)
+        whole = counts.astype(np.int64)
         if (whole != counts).any() or (whole < 0).any():
             raise StageError("a confusion matrix holds counts: whole numbers of 0 or more")
-        order, tail = np.argsort(rows), np.argsort(more).astype(int) + len(rows)
-        whole = whole[order][:, np.concatenate([order, tail]).astype(int)]
-        left = {int(c): int(n) for c, n in (left_out or {}).items()}
-        codes = tuple(sorted(rows)) + tuple(sorted(more))
-        return cls(codes[: len(rows)], codes[len(rows) :], whole, class_names((*codes, *left), names), left)
+        columns, whole = regroup(sorted(rows), (whole, rows, rows))
+        return cls(columns, (), whole, class_names(columns, None))
 
     def __add__(self, other: Accuracy) -> Accuracy:
         if not isinstance(other, Accuracy):

@@ -13,10 +13,9 @@ def percent(share: float | None, digits: int = 2) -> str:
 
 def summary(accuracy: Any) -> dict[str, Any]:
     """The figures of an ``Accuracy`` that one line holds."""
-    names = ("points", "overall_accuracy", "kappa", "mean_f1")
-    return {
-        name: getattr(accuracy, name) if accuracy.points else 0 if name == "points" else None
-        for name in names
+    shares = ("overall_accuracy", "kappa", "mean_f1")
+    return {"points": accuracy.points} | {
+        name: getattr(accuracy, name) if accuracy.points else None for name in shares
     }
 
 
@@ -25,21 +24,9 @@ def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
     rows = [(name, summary(one)) for name, one in zip(names, each, strict=True)]
     rows.sort(key=lambda row: (row[1]["overall_accuracy"] is None, row[1]["overall_accuracy"] or 0.0, row[0]))
     header = ["", "File", "Points", "Accuracy %", "Kappa %", "Mean F1 %"]
-    return (
-        _aligned(
-            header,
-            [
-                [
-                    "",
-                    name,
-                    f"{d['points']:,}",
-                    *(percent(d[key]) for key in ("overall_accuracy", "kappa", "mean_f1")),
-                ]
-                for name, d in rows
-            ],
-        )
-        + "\n"
-    )
+    shares = ("overall_accuracy", "kappa", "mean_f1")
+    lines = [["", name, f"{d['points']:,}", *(percent(d[key]) for key in shares)] for name, d in rows]
+    return _aligned(header, lines) + "\n"
 
 
 def table(figures: Mapping[str, Any], name: Callable[[int], str]) -> str:

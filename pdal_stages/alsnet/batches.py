@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import OptionError
 from ..classifier.sampling import Folds
 from .circles import REACH, Circles
 
@@ -60,16 +59,10 @@ def hold_out(
     out, use = np.zeros(len(xyz), bool), np.flatnonzero(labels >= 0)
     if share == 0.0:
         return out
-    folds = max(2, round(1.0 / share))
-    try:
-        made = Folds.of_blocks(xyz[use, :2], labels[use], np.ones(len(use)), folds, block_size)
-        out[use] = made.points(xyz[use, :2]) == 0
-    except OptionError as error:
-        raise OptionError(
-            error.what,
-            found=f"validation {share:g}, block_size {block_size:g}",
-            cure="Make block_size smaller, or set validation to 0 and choose the number of epochs yourself",
-        ) from None
+    folds = Folds.of_blocks(
+        xyz[use, :2], labels[use], np.ones(len(use)), max(2, round(1.0 / share)), block_size
+    )
+    out[use] = folds.points(xyz[use, :2]) == 0
     return out
 
 

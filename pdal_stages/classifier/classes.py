@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..accuracy.labels import MAX_LABEL
-from ..base import checks
+from ..accuracy.labels import MAX_LABEL, code_of
 from ..base.asprs import NAMES, UNINFORMATIVE, class_name
 from ..base.errors import OptionError, suggest
 
@@ -134,10 +133,8 @@ def _labels(text: Any) -> tuple[int, ...]:
 
 
 def _code(value: Any, what: str) -> int:
-    if isinstance(value, str) and value.strip().isdecimal():
-        value = int(value)
     try:
-        return checks.whole(f"a class {what}", value, 0, MAX_CODE if what == "code" else MAX_LABEL)
+        return code_of(f"a class {what}", value, MAX_CODE if what == "code" else MAX_LABEL)
     except OptionError as error:
         error.cure = _CURE
         raise

@@ -71,14 +71,14 @@ class Context:
         return found
 
     @property
-    def reach(self) -> float:
-        """Meters, along x or y, to the farthest point that can matter."""
-        return 2.0 * max((scale.side for scale in self.scales.values()), default=0.0)
+    def strip(self) -> float:
+        """Width in meters of strips such that a point's cells all lie in its own and the two beside it; 0 without cells."""
+        return max((scale.side for scale in self.scales.values()), default=0.0)
 
     @property
-    def strip(self) -> float:
-        """Width in meters of strips such that a point's cells all lie in its own and the two beside it."""
-        return max((scale.side for scale in self.scales.values()), default=SIDES[-1])
+    def reach(self) -> float:
+        """Meters, along x or y, to the farthest point that can matter."""
+        return 2.0 * self.strip
 
     def names(self, codes: Sequence[int]) -> tuple[str, ...]:
         """Columns, token by token, in each the classes of these codes: ``Probability_2_box0_5``."""

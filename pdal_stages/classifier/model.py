@@ -349,8 +349,8 @@ def load_model(path: str | os.PathLike) -> Model:
         near = "" if os.path.lexists(name) else suggest(name, modelfile.shipped())
         error.cure = f"{near}{error.cure or modelfile.CURE}"
         raise error.at(file) from error.__cause__
-    except OptionError as error:  # a feature or neighborhood of another release
-        raise ModelError("the model's features are not known here", where=file, found=error) from error
+    except OptionError as error:  # a feature of another release, say
+        raise ModelError("the model asks for what is not known here", where=file, found=error) from error
 
 
 def loaded_model(path: str) -> Model:
@@ -374,10 +374,7 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
     codes = [code for code, _ in classes]
     if sorted(set(codes)) != codes:
         raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
-    try:
-        check_side(manifest.get("voxel") or 0.0)
-    except OptionError as error:
-        raise ModelError(f"the model's {error.what}", found=error.found) from None
+    check_side(manifest.get("voxel") or 0.0)
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(classes):
         raise ModelError("the manifest's priors must have one factor per class", found=len(priors["factors"]))

@@ -200,10 +200,8 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 def to_bytes(array: npt.NDArray[Any]) -> bytes:
     """The array as ``.npy`` bytes (version 1.0, little-endian, C order)."""
-    array = np.asarray(array)
-    little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False)
     out = io.BytesIO()
-    np.lib.format.write_array(out, little, version=(1, 0), allow_pickle=False)
+    np.save(out, array.astype(array.dtype.newbyteorder("<"), order="C", copy=False), allow_pickle=False)
     return out.getvalue()
 
 

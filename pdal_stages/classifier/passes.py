@@ -139,7 +139,7 @@ class PassRun:
         for one in members[:0:-1]:
             wanted.insert(0, around(request.xyz, wanted[0], one.context))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
-        width = max((one.context.strip for one in members[1:]), default=8.0)
+        width = max((one.context.strip for one in members[1:]), default=0.0) or 8.0
         self._strips = Strips(request.xyz, wanted[0], width)
         self._shares = [np.zeros((len(self._strips), n), np.uint16) for n in classes[:-1]]
         self._features: list[CloudFeatures | None] = []

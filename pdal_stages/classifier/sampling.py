@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..accuracy.measures import Accuracy
+from ..accuracy.text import summary
 from ..base.arrays import hash_of
 from ..base.errors import OptionError
 from ..base.messages import Progress
@@ -233,7 +234,7 @@ class Folds:
             raise OptionError(
                 f"the samples cover {len(blocks)} block(s) of {side:g} m, fewer than the {folds} folds",
                 found=f"folds {folds}",
-                cure="Make folds smaller, or give more training data",
+                cure="Take smaller blocks, fewer folds, or more training data",
             )
         content = np.zeros((len(blocks), int(label.max()) + 1))
         np.add.at(content, (block, label), weight)
@@ -303,9 +304,6 @@ def split(
 def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, Any]:
     """The measures kept in a model file; rows of the matrix are the truth."""
     accuracy = Accuracy.from_confusion(matrix, codes)
-    return {
-        "overall_accuracy": accuracy.overall_accuracy,
-        "kappa": accuracy.kappa,
-        "mean_f1": accuracy.mean_f1,
-        "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class},
-    }
+    found = summary(accuracy)
+    del found["points"]
+    return {**found, "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class}}
