@@ -199,7 +199,7 @@ def spoiled(name, value, at=(0, 0)):
     "weights, text",
     [
         (spoiled("sa1_1", np.nan), "finite"),
-        ({"sa2_1": None}, "lacks an array"),
+        ({"sa2_1": None}, "not those of its configuration"),
         ({"sa2_1": np.zeros((32, 9), np.float32)}, r"must be \(32, "),
         ({"scores": np.zeros(3, np.float32)}, "2 axes"),
     ],
@@ -221,9 +221,12 @@ def greedy():
 @pytest.mark.parametrize(
     "parameters, text",
     [
-        ({"configuration": 7}, "parameters are not right"),
+        ({"configuration": 7}, "name or a mapping"),
         ({"configuration": shallow(points=10**9)}, "points"),
-        ({"configuration": shallow(levels=TINY.to_dict()["levels"][:1])}, "does not know|must be"),
+        (
+            {"configuration": shallow(levels=TINY.to_dict()["levels"][:1])},
+            "not those of its configuration|must be",
+        ),
         ({"configuration": greedy()}, "too much memory"),
         ({"inputs": [{"name": n, "mean": 0, "scale": 0} for n in INPUTS]}, "scale"),
         ({"more": 1}, "parameters are not right"),

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.errors import ModelError, OptionError, StageError
+from ..base.errors import ModelError, StageError
 from ..base.resources import map_blocks, resolve_threads
 from ..classifier.algorithms import ArrayRule, Column, InputPlan, PredictRequest, gather, with_returns
 from ..features.index import check_xyz
@@ -55,19 +55,16 @@ class AlsNet:
         """Made from what a model file says of a pass, everything checked."""
         names, parameters = entry["feature_names"], entry["parameters"]
         n_features, n_classes = len(names), len(codes)
-        wanted = {"configuration", "spacing", "inputs", "weights"}
-        if set(parameters) != wanted or not isinstance(parameters["inputs"], list):
+        wanted, entries = {"configuration", "spacing", "inputs", "weights"}, parameters.get("inputs")
+        listed = isinstance(entries, list) and all(isinstance(one, Mapping) for one in entries)
+        if set(parameters) != wanted or not listed:
             raise ModelError("the network's parameters are not right", found=sorted(map(str, parameters))[:6])
-        try:
-            configuration = parse_configuration(_mapping(parameters["configuration"]))
-        except OptionError as error:
-            raise ModelError("the network's configuration is not right", found=error) from None
-        spacing = _finite(parameters["spacing"], "spacing", 1e-3, 1e6)
-        entries = [_mapping(one) for one in parameters["inputs"]]
+        configuration = parse_configuration(parameters["configuration"])
+        spacing = checks.number("the network's spacing", parameters["spacing"], 1e-3, 1e6)
         if [one.get("name") for one in entries] != names or names != entry["dimensions"] or entry["context"]:
             raise ModelError("the network's inputs are not the model's dimensions", found=repr(names)[:80])
-        mean = tuple(_finite(one.get("mean"), "mean", -1e12, 1e12) for one in entries)
-        scale = tuple(_finite(one.get("scale"), "scale", 1e-12, 1e12) for one in entries)
+        mean = tuple(checks.number("an input's mean", one.get("mean"), -1e12, 1e12) for one in entries)
+        scale = tuple(checks.number("an input's scale", one.get("scale"), 1e-12, 1e12) for one in entries)
         needed = configuration.memory_mb(n_features)
         if needed > MOST_MB:
             raise ModelError("a batch of the network would need too much memory", found=f"{needed:,.0f} MB")
@@ -231,16 +228,3 @@ def make_pyramid(
         if name in ("X", "Y", "Z"):
             values[:, k] = local[:, "XYZ".index(name)] / METERS
     return order, build(local, values, configuration)
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ModelError("the network's parameters are not right", found=repr(value)[:60])
-    return value
-
-
-def _finite(value: Any, name: str, low: float, high: float) -> float:
-    try:
-        return checks.number(f"the network's '{name}'", value, low, high)
-    except OptionError as error:
-        raise ModelError(error.what, found=error.found) from None

@@ -40,21 +40,14 @@ def check(
 ) -> None:
     """Refuse, as a ModelError, arrays that are missing, unknown, of other shapes, not finite, or of negative variance."""
     shapes = configuration.shapes(inputs, classes)
-    odd = sorted(set(weights) - set(shapes))
-    if odd:
-        raise ModelError("the network has an array its configuration does not know", found=repr(odd[0])[:60])
+    if odd := sorted(set(weights) ^ set(shapes)):
+        raise ModelError("the network's arrays are not those of its configuration", found=repr(odd[0])[:60])
     for name, shape in shapes.items():
-        if name not in weights:
-            raise ModelError("the network lacks an array", found=name)
         array = weights[name]
         if array.shape != shape:
             raise ModelError(f"the network's array '{name}' must be {shape}", found=f"shape {array.shape}")
-        if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise ModelError(
-                f"the network's array '{name}' must be finite float32 numbers", found=str(array.dtype)
-            )
-        if name != "scores" and array[:, -1].min() < 0.0:
-            raise ModelError(f"the network's array '{name}' has a negative variance")
+        if not np.isfinite(array).all() or (name != "scores" and array[:, -1].min() < 0.0):
+            raise ModelError(f"the network's array '{name}' must be finite, with variances of 0 or more")
 
 
 def forward(

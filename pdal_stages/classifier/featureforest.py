@@ -67,27 +67,17 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """What is said before and what a forest on top says, as one.
+    """What is said before and what a forest on top says, as one."""
 
-    Attributes
-    ----------
-    before : tuple of int
-        Classes of the pass before.
-    labeled : tuple of int
-        Those the forest was trained on, in the order of its columns.
-    trusted : float
-        0: the forest counts for nothing where the base knows the class; 1: the base for nothing among the labeled.
-    target : int or None
-        With the binary strategy, the class that alone is changed; the other of `labeled` is everything else.
-    factors : tuple of float or None
-        What the forest's classes are multiplied by for being frequent.
-    """
-
-    before: tuple[int, ...]
-    labeled: tuple[int, ...]
+    before: tuple[int, ...]  #: classes of the pass before
+    labeled: tuple[int, ...]  #: those the forest was trained on, in the order of its columns
+    #: 0: the forest counts for nothing where the base knows the class; 1: the base for nothing among the labeled
     trusted: float = 1.0
+    #: with the binary strategy, the class that alone is changed; the other of `labeled` is everything else
     target: int | None = None
-    factors: tuple[float, ...] | None = None
+    factors: tuple[float, ...] | None = (
+        None  #: what the forest's classes are multiplied by for being frequent
+    )
 
     @classmethod
     def from_dict(cls, said: Mapping[str, Any], codes: Sequence[int]) -> Blend:

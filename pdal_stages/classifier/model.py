@@ -41,20 +41,12 @@ TOLERANCE = 2.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
-    """A trained classifier. Make one with :func:`train` or :func:`load_model`.
+    """A trained classifier. Make one with :func:`train` or :func:`load_model`."""
 
-    Attributes
-    ----------
-    passes : tuple
-        The classifiers, e.g. a :class:`FeatureForest`; each but the first reads what the one before said.
-    classes : list of (code, name)
-        In the order of the columns of probabilities.
-    info : dict
-        The rest of the manifest: how it was trained, scores; ``info["passes"]`` has the importances of each pass.
-    """
-
+    #: the classifiers, e.g. a :class:`FeatureForest`; each but the first reads what the one before said
     passes: tuple[Any, ...]
-    classes: list[tuple[int, str]]
+    classes: list[tuple[int, str]]  #: code and name, in the order of the columns of probabilities
+    #: the rest of the manifest: how it was trained, scores; ``info["passes"]`` has the importances of each pass
     info: dict[str, Any] = field(default_factory=dict)
 
     @property

@@ -242,15 +242,9 @@ Band = tuple[slice, slice]
 
 
 class Strips:
-    """Points in the order of strips of ground, each so many meters from south to north.
+    """Points in the order of strips of ground, each `width` meters from south to north; `rows` are looked at, None for all.
 
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-    rows : (m,) int64 or None
-        Points that are looked at; None for all.
-    width : float
-        Meters. Strips begin at multiples of it.
+    Strips begin at multiples of the width.
     """
 
     def __init__(

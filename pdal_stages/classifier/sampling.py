@@ -89,24 +89,12 @@ def draw_samples(
 ) -> Samples:
     """Draw `count` samples of each class from several clouds.
 
-    Parameters
-    ----------
-    clouds : sequence of ((n, 3) float64 coordinates in meters, (n,) class positions)
-        A position of -1 leaves the point out.
-    n_classes : int
-    count : int
-        Samples per class; no more than the largest class has points. A class with fewer points gives each of them
-        count/n times, rounded down or up.
-    seed : int
-    groups : sequence of str, optional
-        The group of each cloud: each gives as many samples of a class as the others, as far as it has them.
-    progress : Progress, optional
-        Updated with the points looked at: all of them once, and once more for each class.
+    `clouds` are pairs of (n, 3) coordinates in meters and (n,) class positions, -1 to leave the point out. No more samples
+    are drawn than the largest class has points; a class with fewer gives each of them count/n times, rounded down or up.
+    Clouds of one of the `groups` give as many of a class as those of the others, as far as they have them. `progress` is
+    updated with the points looked at: all of them once, and once more for each class.
     """
-    of_cloud = np.zeros(len(clouds), np.int64)
-    names: Any = [""]
-    if groups is not None:
-        names, of_cloud = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
+    names, of_cloud = np.unique(groups or [""] * len(clouds), return_inverse=True)
     there = np.zeros((len(names), n_classes), np.int64)
     for number, (_, position) in enumerate(clouds):
         there[of_cloud[number]] += np.bincount(position[position >= 0], minlength=n_classes)
@@ -199,22 +187,13 @@ def _spread_bits(value: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
 
 @dataclass(frozen=True, eq=False)
 class Folds:
-    """Which part of the training ground a point belongs to.
-
-    Attributes
-    ----------
-    count : int
-    surveys : dict of str to int
-        Fold of each survey, where whole surveys are folds; otherwise empty.
-    side : float
-        Of blocks, meters. They are anchored to absolute coordinates, so that clouds that overlap share them.
-    blocks, fold : (m,) int64, (m,) int16
-        Number of each block that has samples, ascending, and its fold. Others follow from their number.
-    """
+    """Which part of the training ground a point belongs to."""
 
     count: int
-    surveys: dict[str, int]
+    surveys: dict[str, int]  #: fold of each, where whole surveys are folds
+    #: of blocks, meters; they are anchored to absolute coordinates, so that clouds that overlap share them
     side: float = BLOCK
+    #: (m,) number of each block that has samples, ascending, and its fold; others follow from their number
     blocks: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     fold: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros(0, np.int16))
 

@@ -32,18 +32,11 @@ class Limit(NamedTuple):
 
 @dataclass
 class Sureness:
-    """Points by the class a model gave them and its reliability; weights are as the points lie.
+    """Points by the class a model gave them and its reliability; weights are as the points lie."""
 
-    Attributes
-    ----------
-    right, wrong : dict of int to (BINS,) float64
-    about : str
-        Where they were counted.
-    """
-
-    right: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
+    right: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)  #: (BINS,) of each class
     wrong: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
-    about: str = ""
+    about: str = ""  #: where they were counted
 
     def add(
         self,
