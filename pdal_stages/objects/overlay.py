@@ -34,13 +34,7 @@ class Overlay:
 
     @classmethod
     def parse(cls, text: str) -> Overlay:
-        """From ``FILE=CODE``, ``FILE=CODE:FROM,FROM`` or ``FILE=CODE:all``; a layer follows the file as ``|layername=NAME``.
-
-        Raises
-        ------
-        OptionError
-            If it is not written so, or a code is not 0 to 255.
-        """
+        """From ``FILE=CODE``, ``FILE=CODE:FROM,FROM`` or ``FILE=CODE:all``; FILE may be ``FILE|layername=NAME``."""
         source, _, codes = text.rpartition("=")
         file, _, layer = source.partition(_LAYER)
         code, told, over = codes.partition(":")
@@ -56,13 +50,7 @@ class Overlay:
         return cls(file.strip(), layer.strip(), int(code), tuple(map(int, given)))
 
     def check(self) -> str:
-        """The layer that will be read.
-
-        Raises
-        ------
-        StageError
-            If there is no such file, or no such layer of polygons in it.
-        """
+        """The layer that will be read."""
         if "://" not in self.file and not Path(self.file).exists():
             raise StageError("the file of polygons does not exist", where=self.file, cure="Check the path")
         pyogrio = vector("pyogrio")
@@ -97,11 +85,6 @@ def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[
     """Polygons near a box, in the reference system of `wkt`, as the box is; and what the user should know.
 
     `where`: a condition on the file's columns, in SQL.
-
-    Raises
-    ------
-    StageError
-        If the file cannot be read or holds no polygons, or its reference system cannot be made the points'.
     """
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     layer = overlay.check()

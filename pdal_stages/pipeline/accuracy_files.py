@@ -43,11 +43,6 @@ def compare_files(
 
     Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``. Without references the true classes
     are another dimension of the files; with a `model` its classes are judged, and the files' own are the truth.
-
-    Raises
-    ------
-    StageError
-        If a file has no partner, or two do not hold the same points.
     """
     files = input_files(sources)
     pairs = paired(files, input_files(references)) if references else [(file, "") for file in files]
@@ -101,11 +96,6 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
     """Files with their references: of the same name, or the longest name inside theirs (c_town: town).
 
     Names are looked for in the same folder (`in_folders`) where a name comes twice.
-
-    Raises
-    ------
-    StageError
-        If a file has no reference, or shares it with another.
     """
     if len(sources) == len(references) == 1:
         return [(sources[0], references[0])]

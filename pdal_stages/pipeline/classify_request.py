@@ -77,13 +77,7 @@ class ClassifyRequest:
 
     @cached_property
     def stages(self) -> list[dict[str, Any]]:
-        """What marks noise, what makes what the model reads, and the classifier.
-
-        Raises
-        ------
-        ModelError
-            If the model was trained on what no stage of its file makes.
-        """
+        """What marks noise, what makes what the model reads, and the classifier."""
         if by_hand := self.loaded.info.get("by_hand"):
             raise ModelError(
                 "what the model reads was made by stages that a model file does not carry",
@@ -148,13 +142,7 @@ class ClassifyRequest:
 
     @cached_property
     def beside(self) -> dict[str, str]:
-        """What is written beside the input's own dimensions: name -> PDAL type.
-
-        Raises
-        ------
-        OptionError
-            If a dimension is wanted that is not made.
-        """
+        """What is written beside the input's own dimensions: name -> PDAL type."""
         made: dict[str, str] = {}
         for stage in self.stages:
             if stage["type"] in preparation.OF_PDAL:

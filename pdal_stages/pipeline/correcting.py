@@ -43,11 +43,6 @@ def write_corrections(
         Files of polygons inside of which all was looked at, and what was not changed is right.
     around : float
         Meters around a changed point within which all was looked at.
-
-    Raises
-    ------
-    StageError
-        If a file cannot be read, or the two do not hold the same points.
     """
     import laspy
 

@@ -54,13 +54,7 @@ class Expanded:
 
 
 def expand(source: PipelineSource, whole: bool = True) -> Expanded:
-    """Expand a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves.
-
-    Raises
-    ------
-    PipelineError, OptionError
-        Where a stage type or option of ours is wrong; PDAL's own stages are left to PDAL.
-    """
+    """Expand a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves."""
     # File names stand for readers and writers; PDAL tells which, so they stay without a type.
     stages = [copy.deepcopy(one) if isinstance(one, dict) else {"filename": one} for one in source.stages]
     places = [source.where(number) for number in range(len(stages))]
@@ -204,12 +198,7 @@ _DEGREES = re.compile(
 
 
 def check_dimensions(expanded: Expanded) -> None:
-    """Refuse a stage that reads heights or labels that no stage makes and no input has, and one that would get degrees.
-
-    Raises
-    ------
-    DimensionError, PipelineError
-    """
+    """Refuse a stage that reads heights or labels that no stage makes and no input has, and one that would get degrees."""
     of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
     for ours in expanded.ours:
         before = list(enumerate(expanded.stages[: ours.index]))

@@ -26,13 +26,7 @@ _INDEXES = (".gpkg", ".sqlite", ".shp", ".geojson")
 
 
 def input_files(names: Sequence[str]) -> list[str]:
-    """The inputs that files, folders, patterns, tile indexes and EPT sources stand for: each once, sorted within each name.
-
-    Raises
-    ------
-    StageError
-        Where a name is empty, stands for nothing or cannot be looked at, or a folder or a tile index holds no input.
-    """
+    """The inputs that files, folders, patterns, tile indexes and EPT sources stand for: each once, sorted by name within."""
     found: list[str] = []
     for name in names:
         try:
@@ -79,13 +73,7 @@ def _inside(folder: Path) -> list[str]:
 
 
 def locations(path: str, column: str = "location") -> list[str]:
-    """The files a tile index names, made by ``pdal tindex create``; relative ones count from its folder, then from here.
-
-    Raises
-    ------
-    StageError
-        If it cannot be read, or has no such column.
-    """
+    """The files a tile index names, made by ``pdal tindex create``; relative ones count from its folder, then from here."""
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")
     try:
         with warnings.catch_warnings():  # GDAL's, of files that it reads nevertheless
@@ -149,11 +137,6 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
     """An output for each input, whose name stands for ``#``; for ``#`` alone with its suffix (see :func:`in_folders`).
 
     `copc`: octrees may be written as such, where this PDAL can.
-
-    Raises
-    ------
-    PipelineError
-        Where several inputs would be written to one file.
     """
     path = Path(target)
     if path.name == "#":
@@ -250,13 +233,6 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     """The reference of what a reader reads, as PDAL says; `horizontal`: the unit of x and y, where it is known better.
 
     The reader is restricted to as few points as it can be.
-
-    Raises
-    ------
-    PipelineError
-        If PDAL cannot read it.
-    StageError
-        If its coordinates are degrees.
     """
     said = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
     node: Any = next((node for kind, node in said.items() if kind.startswith("readers.")), {})

@@ -74,11 +74,6 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
     """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS record.
 
     `ours` are our stages in the expanded pipeline: the stage, its name in messages, its place.
-
-    Raises
-    ------
-    OptionError, DimensionError
-        Naming the stage.
     """
     last = [stage for stage, _, _ in ours if "Classification" in stage.creates()][-1:]
     for stage, place, index in ours:
@@ -152,11 +147,6 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
 
     A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: stages of ours are among them, or
     work on the points besides; without, text and rasters come out as PDAL makes them.
-
-    Raises
-    ------
-    PipelineError
-        Where one writer needs them together and another one apart.
     """
     if pdal_env.splits_class_flags():
         return []
@@ -210,13 +200,7 @@ def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]
 
 
 def compress(partials: Iterable[Path]) -> dict[str, str]:
-    """Compress what was left uncompressed; the names that files had -> those that they have now.
-
-    Raises
-    ------
-    StageError
-        If a file cannot be written.
-    """
+    """Compress what was left uncompressed; the names that files had -> those that they have now."""
     names: dict[str, str] = {}
     for made in [
         one for folder in {p.parent for p in partials} for one in sorted(folder.glob(f"*{UNCOMPRESSED}"))

@@ -66,13 +66,7 @@ def reads_in_parts(path: str) -> bool:
 
 
 def parts_of(path: str, wkt: str) -> Iterator[Part]:
-    """The points of a file, in its order, with those of the dimensions :data:`WANTED` that it has.
-
-    Raises
-    ------
-    StageError
-        If it cannot be read to its end.
-    """
+    """The points of a file, in its order, with those of the dimensions :data:`WANTED` that it has."""
     for arrays, flags in arrays_in_parts(path, WANTED):
         yield _part(Points(arrays, wkt=wkt, legacy_flags=flags))
 
@@ -105,11 +99,6 @@ def las_chunks(
 
     `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
     ``CLASSIFICATION``, ...): LAZ 1.4 holds them apart, so the others take no time. They hold nothing then.
-
-    Raises
-    ------
-    StageError
-        If it cannot be read, is damaged or cut short.
     """
     import laspy
 

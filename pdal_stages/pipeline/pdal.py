@@ -188,13 +188,7 @@ def writer_type(filename: str) -> str:
 
 
 def validate(stages: list[dict[str, Any]]) -> None:
-    """Let the program `pdal` check stages and their options, without reading points.
-
-    Raises
-    ------
-    PipelineError, DependencyError
-        As :func:`execute`.
-    """
+    """Let the program `pdal` check stages and their options, without reading points."""
     text = json.dumps({"pipeline": adapted(stages)})
     done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
     try:
@@ -302,11 +296,6 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
     Where nothing says otherwise, writers are told what old PDAL takes from memory that it never set: `writers.las` the
     file source identifier, 0, and `writers.ogr`, which crashes of it, the dimension of its measure, Z.
-
-    Raises
-    ------
-    PipelineError
-        If only a reader of COPC could do what its options ask for.
     """
     if version() >= (2, 4, 0):
         return stages

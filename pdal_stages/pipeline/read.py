@@ -39,13 +39,7 @@ def _with_plain_name(stage: Any) -> Any:
 
 
 def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
-    """A pipeline from a file name, JSON text, or Python lists and dicts.
-
-    Raises
-    ------
-    PipelineError
-        If the file cannot be read, is not JSON, or is not a pipeline.
-    """
+    """A pipeline from a file name, JSON text, or Python lists and dicts."""
     if isinstance(source, list | dict):
         stages = source.get("pipeline") if isinstance(source, dict) else source
         if not isinstance(stages, list):

@@ -119,11 +119,6 @@ def review_files(
         What gives reliabilities where the files have none.
     workers : int
         Files read at the same time.
-
-    Raises
-    ------
-    StageError
-        If a file cannot be read, there is nothing to judge, or a number is out of bounds.
     """
     if cell:
         checks.number("'--cell'", cell, 0.5, 100, unit="m")

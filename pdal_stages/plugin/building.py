@@ -47,13 +47,6 @@ def install(folder: Path | None = None) -> list[Path]:
     """Compile the plugin and put it into a folder, by default beside ``filters.python``; the files.
 
     A `folder` that is not there yet is made.
-
-    Raises
-    ------
-    DependencyError
-        If the compiler, PDAL's headers or ``filters.python`` is missing.
-    StageError
-        If it does not compile, or the folder cannot be written.
     """
     target = folder or usual_folder()
     found, cxx = pdal(), compiler()
