@@ -20,7 +20,8 @@ from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import decks, walkable
 from pdal_stages.terrain.cells import GAP, levels
 from pdal_stages.terrain.decks import PARTS, SURFACE, find_decks, level_points
-from pdal_stages.terrain.morphological import filtered_ground, reach
+from pdal_stages.terrain.groundcells import FilterOptions
+from pdal_stages.terrain.morphological import filtered_ground
 from pdal_stages.terrain.walkable import ACROSS, DOWN, NOTHING, ON, ROUGH, SMOOTH, SOLID, WALLED
 
 
@@ -364,7 +365,7 @@ def test_the_terrain_runs_below_the_deck():
 def test_the_stage_says_what_it_makes_and_how_far_it_looks():
     plain, made = HagMorphological({}), HagMorphological({"decks": True})
     assert "Deck" not in plain.creates() and made.creates()["Deck"] == "uint8_t"
-    assert plain.halo_m() <= made.halo_m() == reach(decks=True) < 820
+    assert plain.halo_m() <= made.halo_m() == FilterOptions(decks=True).reach_of_points < 820
     assert Bridges({}).halo_m() == 0 and Bridges({}).largest_class() == 17
 
 

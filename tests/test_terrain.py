@@ -59,7 +59,7 @@ def test_one_stray_point_costs_one_cell():
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 100, (2, 1000))
     z = rng.normal(0, 1, 1000)
-    terrain = MinimaTerrain.fit(np.append(x, 1e9), np.append(y, -1e9), np.append(z, 7.0))
+    terrain = MinimaTerrain(np.append(x, 1e9), np.append(y, -1e9), np.append(z, 7.0))
     assert terrain.figures["cells"] == 26
     both = hag_minima(np.append(x, 1e9), np.append(y, -1e9), np.append(z, 7.0))
     assert np.array_equal(both[:-1], hag_minima(x, y, z))
@@ -68,7 +68,7 @@ def test_one_stray_point_costs_one_cell():
 
 def test_gaps_are_filled_and_counted():
     x = np.array([1.0, 201.0, 100.0])
-    terrain = MinimaTerrain.fit(x, np.zeros(3), np.array([0.0, 10.0, 50.0]))
+    terrain = MinimaTerrain(x, np.zeros(3), np.array([0.0, 10.0, 50.0]))
     ground = terrain.at(np.array([55.0]), np.array([0.0]))
     assert 0.0 < ground[0] < 50.0
     assert terrain.figures["interpolated_cells"] > 0

@@ -13,7 +13,6 @@ from pdal_stages.terrain.cells import lowest_of_cells
 from pdal_stages.terrain.decks import level_points
 from pdal_stages.terrain.groundblocks import GroundCells, by_block, cells_of_block, reach_of_block
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions
-from pdal_stages.terrain.morphological import reach_of_cells
 from pdal_stages.tiling import run_tiled, tile
 from pdal_stages.tiling.ground import FirstRoundTask
 
@@ -187,7 +186,7 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
     for box in ((430, 410, 520, 560), (-10, 630, 60, 710), *([(4000, -3000, 4050, -2950)] if strays else [])):
         away = np.maximum(np.maximum(box[0] - u, u - box[2]), np.maximum(box[1] - v, v - box[3]))
         near = away <= 3.0
-        wide = 3.0 + reach_of_cells(cell)
+        wide = 3.0 + made.reach_of_cells * cell
         around = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
         around = [edge + origin[n % 2] for n, edge in enumerate(around)]
         cells = blocks_of(np.array([x, y, z]), made, around)

@@ -72,7 +72,7 @@ the unit of Z.
         forms = points.usable(self.ignore)
         if points.mask is not None and not points.mask.any():  # which the report says
             return {}
-        terrain = MinimaTerrain.fit(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)
+        terrain = MinimaTerrain(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
         height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical

@@ -15,7 +15,7 @@ from ..terrain.cells import lowest_of_cells
 from ..terrain.decks import level_points
 from ..terrain.groundblocks import GroundCells, by_block, cells_of_block, reach_of_block
 from ..terrain.groundcells import BLOCK_SIDE, FilterOptions
-from ..terrain.morphological import check_sizes, filtered_ground, reach, reach_of_cells
+from ..terrain.morphological import filtered_ground
 from ..terrain.openings import opening_names
 from .base import HEIGHTS_OUTSIDE, Stage
 from .options import ignore_option, option
@@ -135,7 +135,7 @@ of Z.
     example = {"type": "filters.hag_morphological", "ground": True}
 
     def check(self) -> None:
-        check_sizes(self.cell, self.slope, self.window, self.threshold, self.scalar, self.openings)
+        self._filter  # noqa: B018
 
     def creates(self) -> dict[str, str]:
         return {
@@ -147,7 +147,7 @@ of Z.
         }
 
     def halo_m(self) -> float:
-        return reach(cell=self.cell, window=self.window, openings=self.openings, decks=self.decks)
+        return self._filter.reach_of_points * self.cell
 
     #: In tiles: what :meth:`made_of_blocks` gave.
     from_blocks: GroundCells | None = None
@@ -156,7 +156,7 @@ of Z.
         """How far the rounds before the tiles reach; all that a point's height depends on is in cells."""
         cell = self.cell
         reach = (reach_of_block(self._filter) + 2) * cell
-        return Blocks(BLOCK_SIDE * cell, reach, reach_of_cells(cell), 2 * cell, cell)
+        return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
 
     @cached_property
     def _filter(self) -> FilterOptions:

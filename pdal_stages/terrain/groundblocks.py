@@ -18,13 +18,15 @@ from .groundcells import (
     CellMeans,
     CellWindow,
     FilterOptions,
+    GroundPoints,
     GroundRaster,
     add_ground,
     ground_raster,
     means_of,
+    surface_of,
 )
 from .openings import HOLE
-from .planes import around, heights_above, surface
+from .planes import around, heights_above
 from .planes import reach as planes_reach
 
 
@@ -144,34 +146,29 @@ def cells_of_block(
     # Openings reach into cells without points.
     spill = max([*openings, 0]) + 2
     margin = max(spill, _beside(options))
-    column, row = cell_numbers(x, cell), cell_numbers(y, cell)
-    if not own.grown(margin).holds(column, row).any():
+    levels = levels_near_decks(x, y, z) if options.decks else np.empty((0, 5))
+
+    def given(x, y, z) -> GroundPoints:
+        use = np.ones(len(x), bool)
+        return GroundPoints.of(x, y, z, use, decks_of_levels(x, y, z, use, levels), cell)
+
+    low = given(x, y, z)
+    if not own.grown(margin).holds(low.column, low.row).any():
         return GroundCells.of_blocks([], len(openings))
-    use, deck, levels = np.ones(len(x), bool), np.zeros(len(x), np.uint8), np.empty((0, 5))
-    if options.decks:
-        levels = levels_near_decks(x, y, z)
-        deck = decks_of_levels(x, y, z, use, levels)
-    raster, _ = ground_raster(
-        x, y, z, use, deck, column, row, options, margin=spill, wanted=own.grown(margin)
-    )
-    inside = own.holds(column, row)
-    needed = around(column[inside], row[inside], raster.left, raster.bottom, raster.shape)
-    planes = surface(
-        raster.ground, raster.place, raster.floor, raster.lowest, raster.left, raster.bottom,
-        options.levels(NEAR), needed,
-    )  # fmt: skip
+    raster, _ = ground_raster(low, options, margin=spill, wanted=own.grown(margin))
+    inside = low.some(own.holds(low.column, low.row))
+    needed = around(inside.column, inside.row, raster.left, raster.bottom, raster.shape)
+    planes = surface_of(raster, options, NEAR, needed)
     # With a ring around: points blend the four cells round them.
     part = own.grown(1).on(raster.left, raster.bottom, *raster.shape)
     raster, planes = raster.cut(part), planes[part].copy()
     sums = np.zeros((*raster.shape, 4), np.int64)
-    for some in points:
-        x, y, z = np.ascontiguousarray(some.T)
-        use = np.ones(len(x), bool)
-        height, gradient = np.empty((2, len(x)))
-        heights_above(x, y, z, cell, raster.left, raster.bottom, planes, height, gradient)
-        is_ground = options.is_ground(use, decks_of_levels(x, y, z, use, levels), height, gradient)
-        column, row = cell_numbers(x, cell), cell_numbers(y, cell)
-        add_ground(x, y, z, is_ground, column, row, cell, raster.left, raster.bottom, sums)
+    for xyz in points:
+        some = given(*np.ascontiguousarray(xyz.T))
+        height, gradient = np.empty((2, len(xyz)))
+        heights_above(*some[:3], cell, raster.left, raster.bottom, planes, height, gradient)
+        is_ground = options.is_ground(some.use, some.deck, height, gradient)
+        add_ground(*some[:3], is_ground, some.column, some.row, cell, raster.left, raster.bottom, sums)
     held, means = np.zeros(raster.shape, bool), np.zeros((*raster.shape, 3))
     means_of(sums, held, means)
     opened = np.empty((*raster.shape, len(openings)), np.float32)

@@ -14,19 +14,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base import checks
+from ..base.errors import OptionError
 from ..base.jit import njit
 from .belowground import pits, pits_reach
-from .cells import SIDE, heights_of, keys_of, lowest_points, places_of
+from .cells import SIDE, cell_numbers, heights_of, keys_of, lowest_points, places_of
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .openings import HOLE, objects_of, opening_radius
-from .planes import from_parents, planes_of_blocks
+from .planes import from_parents, planes_of_blocks, surface
 from .planes import reach as planes_reach
 from .plateaus import reach as plateau_reach
 from .plateaus import remove_plateaus
 
 #: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
 NEAR, FAR = 8.0, 32.0
+#: The most cells a window's radius may have.
+_MOST_CELLS = 300
 #: How often ground is regained.
 ROUNDS = 3
 #: Cells along the side of a block.
@@ -35,7 +39,7 @@ BLOCK_SIDE = SIDE
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """Of :func:`.morphological.filtered_ground`; lengths in meters."""
+    """Of :func:`.morphological.filtered_ground`; lengths in meters. Wrong ones raise an :class:`OptionError`."""
 
     cell: float = 1.0
     slope: float = 0.15
@@ -44,6 +48,22 @@ class FilterOptions:
     scalar: float = 1.25
     openings: Sequence[float] = ()
     decks: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("cell", self.cell),
+            ("window", self.window),
+            *(("openings", size) for size in self.openings),
+        ):
+            checks.number(f"'{name}'", value, 0, above=True)
+            if name != "cell" and value > _MOST_CELLS * self.cell:
+                raise OptionError(
+                    f"'{name}' must not be more than {_MOST_CELLS} cells",
+                    found=f"{value:g} m in cells of {self.cell:g} m",
+                    cure="Use larger cells or a smaller window",
+                )
+        for name in ("slope", "threshold", "scalar"):
+            checks.number(f"'{name}'", getattr(self, name), 0)
 
     @property
     def radius(self) -> int:
@@ -84,6 +104,19 @@ class FilterOptions:
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
         found = pits_reach(self.cell) + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
         return max(found, self.reach_of_decks) if self.decks else found
+
+    @property
+    def reach_of_points(self) -> int:
+        """How far away, in cells, points can change a point's results.
+
+        Beyond what decides which cells are ground come the surfaces through it: that for telling ground, and the last.
+        """
+        return self.reach + sum(planes_reach(self.levels(block)) for block in (NEAR, FAR))
+
+    @property
+    def reach_of_cells(self) -> int:
+        """How far away from points, in cells, cells of the ground matter that was found before."""
+        return planes_reach(self.levels(FAR)) + 4
 
     @property
     def reach_of_decks(self) -> int:
@@ -154,26 +187,43 @@ class GroundRaster(NamedTuple):
         )
 
 
+class GroundPoints(NamedTuple):
+    """Points with finite coordinates in meters (n,) each, and the cells they fall in."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    z: NDArray[np.float64]
+    use: NDArray[np.bool_]  #: whether they may be ground, where they are not of a deck
+    deck: NDArray[np.uint8]
+    column: NDArray[np.int64]
+    row: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, x, y, z, use, deck, cell: float) -> GroundPoints:
+        """Of a grid of such cells."""
+        return cls(x, y, z, use, deck, cell_numbers(x, cell), cell_numbers(y, cell))
+
+    def some(self, which: NDArray | slice) -> GroundPoints:
+        """Part of them."""
+        return GroundPoints(*(values[which] for values in self))
+
+    def window(self) -> CellWindow:
+        """The cells round them."""
+        left, bottom = int(self.column.min()), int(self.row.min())
+        return CellWindow(left, bottom, int(self.column.max()) + 1 - left, int(self.row.max()) + 1 - bottom)
+
+
 def ground_raster(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    use: NDArray[np.bool_],
-    deck: NDArray[np.uint8],
-    column: NDArray[np.int64],
-    row: NDArray[np.int64],
-    options: FilterOptions,
-    margin: int = 1,
-    wanted: CellWindow | None = None,
+    points: GroundPoints, options: FilterOptions, margin: int = 1, wanted: CellWindow | None = None
 ) -> tuple[GroundRaster, NDArray[np.int64]]:
     """What the raster round points tells of the ground, and the numbers of points (n,) that are pits.
 
-    Points have coordinates in meters, and columns and rows of their cells; those of `use` may be ground, but not those of a
-    `deck`. On every side are `margin` empty cells, one at least: points blend the four cells round them. Where only some
+    On every side are `margin` empty cells, one at least: points blend the four cells round them. Where only some
     cells are `wanted`, the raster holds these and as many around as steps still look at, when that is known.
     """
-    left, bottom = int(column.min()) - margin, int(row.min()) - margin
-    shape = int(row.max()) + margin + 1 - bottom, int(column.max()) + margin + 1 - left
+    x, y, z, use, deck, column, row = points
+    left, bottom, w, h = points.window().grown(margin)
+    shape = h, w
     mine = np.flatnonzero(use)
     low = mine[lowest_points(x[mine], y[mine], z[mine], keys_of(column[mine], row[mine]))]
     lowest = np.full(shape, -1)
@@ -244,6 +294,16 @@ def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, 
         x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
         gradient = np.sqrt(across * across + along * along) / cell
         out[k] = abs(z - height - x * across - y * along) <= threshold + scalar * gradient
+
+
+def surface_of(
+    raster: GroundRaster, options: FilterOptions, block: float, needed: NDArray[np.bool_], planes=None
+) -> NDArray[np.float64]:
+    """The :func:`.planes.surface` through a raster's ground, from such blocks, in meters."""
+    return surface(
+        raster.ground, raster.place, raster.floor, raster.lowest, raster.left, raster.bottom,
+        options.levels(block), needed, planes,
+    )  # fmt: skip
 
 
 @njit

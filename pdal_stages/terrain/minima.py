@@ -1,11 +1,8 @@
 """Height above a coarse terrain: the minima of a grid, interpolated [W18 section 3.2].
 
-The terrain is the lowest point of each cell of a coarse grid (20 m), interpolated
-bilinearly between cell centers and evaluated on a fine grid (0.5 m); a point's height is
-its z minus the value of the fine cell it falls in. Both grids are anchored to absolute
-coordinates (``floor(x / cell)``), so every tile of a survey sees the same cells. No raster
-is held: the fine value is computed where a point falls, and only cells with points and
-their neighbors are stored, so one stray coordinate costs one cell.
+The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centers and evaluated on
+a fine grid; a point's height is its z minus the value of the fine cell it falls in. Both grids are anchored to absolute
+coordinates, so every tile of a survey sees the same cells. No raster is held: one stray coordinate costs one cell.
 
 [W18] Weinmann, Blomley, Weinmann, Jutzi (2018), Investigations on the potential of binary and
 multi-class classification for object extraction from airborne laser scanning point clouds, DGPF.
@@ -14,7 +11,6 @@ multi-class classification for object extraction from airborne laser scanning po
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,49 +20,39 @@ from ..base.errors import NoTerrainError, OptionError
 from .cells import cell_numbers, columns, keys_of
 
 
-@dataclass
 class MinimaTerrain:
-    """The coarse terrain of a cloud: build with :meth:`fit`, read with :meth:`at`."""
+    """The coarse terrain of a cloud, read with :meth:`at`; parameters as of :func:`hag_minima`.
 
-    #: Sides of a coarse and of a fine cell, in the unit of the coordinates.
-    cell: float
-    resolution: float
-    keys: NDArray[np.int64]  #: of the coarse cells with points, ascending
-    minima: NDArray[np.float64]
-    #: Counts: ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed), ``farthest_fill`` (distance
-    #: to the nearest filled cell, the worst case), ``unused_points`` (not finite, or excluded by the mask).
-    figures: dict = field(default_factory=dict)
+    Its `figures` count ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed), ``farthest_fill``
+    (distance to the nearest filled cell, the worst case), ``unused_points`` (not finite, or excluded by the mask).
+    """
 
-    @classmethod
-    def fit(
-        cls,
+    def __init__(
+        self,
         x: ArrayLike,
-        y: ArrayLike,
-        z: ArrayLike,
+        y: ArrayLike | None = None,
+        z: ArrayLike | None = None,
         *,
         cell: float = 20.0,
         resolution: float = 0.5,
         mask: ArrayLike | None = None,
-    ) -> MinimaTerrain:
-        """Take the lowest point of each coarse cell; parameters as for :func:`hag_minima`."""
+    ) -> None:
         check_sizes(cell, resolution)
+        self.cell, self.resolution = float(cell), float(resolution)
         x, y, z = columns(x, y, z)
         usable = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
         if mask is not None:
             usable &= np.asarray(mask, bool)
-        keys, number = np.unique(
-            keys_of(cell_numbers(x[usable], cell), cell_numbers(y[usable], cell)), return_inverse=True
-        )
-        minima = np.full(len(keys), np.inf)
-        np.minimum.at(minima, number, z[usable])
-        unused = int(x.size - np.count_nonzero(usable))
-        figures = {
-            "cells": len(keys),
+        key = keys_of(cell_numbers(x[usable], cell), cell_numbers(y[usable], cell))
+        self.keys, number = np.unique(key, return_inverse=True)
+        self.minima = np.full(len(self.keys), np.inf)
+        np.minimum.at(self.minima, number, z[usable])
+        self.figures: dict[str, float] = {
+            "cells": len(self.keys),
             "interpolated_cells": 0,
             "farthest_fill": 0.0,
-            "unused_points": unused,
+            "unused_points": int(x.size - np.count_nonzero(usable)),
         }
-        return cls(float(cell), float(resolution), keys, minima, figures)
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Terrain height where points fall: bilinear, at the center of their fine cell; NaN for those not finite.
@@ -174,7 +160,7 @@ def hag_minima(
     [0.0, 3.5]
     """
     x, y, z = columns(x, y, z)
-    return z - MinimaTerrain.fit(x, y, z, cell=cell, resolution=resolution, mask=mask).at(x, y)
+    return z - MinimaTerrain(x, y, z, cell=cell, resolution=resolution, mask=mask).at(x, y)
 
 
 def terrain_reach(

@@ -25,28 +25,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.errors import OptionError, StageError
+from ..base.errors import StageError
 from ..base.resources import map_blocks
-from .cells import HIGHEST, cell_numbers, columns, patches
+from .cells import HIGHEST, columns, patches
 from .decks import decks_of_levels, find_decks
 from .groundblocks import GroundCells
 from .groundcells import (
     FAR,
     NEAR,
     CellMeans,
-    CellWindow,
     FilterOptions,
+    GroundPoints,
     GroundRaster,
     add_ground,
     ground_raster,
     means_of,
+    surface_of,
 )
 from .openings import above_opening, opening_names
-from .planes import around, heights_above, surface
-from .planes import reach as planes_reach
+from .planes import around, heights_above
 
-#: The most cells a window's radius may have.
-_MOST_CELLS = 300
 #: Points handed to a thread at a time.
 _SPAN = 1 << 17
 
@@ -114,7 +112,7 @@ def filtered_ground(
     StageError
         If shapes differ or coordinates are too large.
     """
-    check_sizes(cell, slope, window, threshold, scalar, openings)
+    options = FilterOptions(cell, slope, window, threshold, scalar, openings, decks)
     x, y, z = columns(x, y, z)
     use = np.ones(len(x), bool) if mask is None else np.array(mask, bool)
     if use.shape != x.shape:
@@ -131,24 +129,16 @@ def filtered_ground(
         **({"Slope": np.zeros(len(x))} if slope_too else {}),
         **{name: np.zeros(len(x), np.float32) for name in opening_names(openings)},
     }
-    options = FilterOptions(cell, slope, window, threshold, scalar, openings, decks)
     deck = np.zeros(len(x), np.uint8)
     if decks:
         deck = find_decks(x, y, z, use) if cells is None else decks_of_levels(x, y, z, use, cells.decks)
     if len(x):
-        column, row = cell_numbers(x, cell), cell_numbers(y, cell)
-        pieces = (
-            _found(x, y, z, use, deck, column, row, options, counts)
-            if cells is None
-            else _given(cells, column, row, options)
-        )
-        for points, own, raster, means in pieces:
-            found = _measured(
-                x[points], y[points], z[points], use[points], deck[points], column[points], row[points], own,
-                raster, means, options, slope_too=slope_too, threads=threads, counts=counts,
-            )  # fmt: skip
+        points = GroundPoints.of(x, y, z, use, deck, cell)
+        pieces = _found(points, options, counts) if cells is None else _given(points, options, cells)
+        for of, own, raster, means in pieces:
+            found = _measured(points.some(of), own, raster, means, options, slope_too, threads, counts)
             for name, values in found.items():
-                out[name][points if isinstance(points, slice) else points[own]] = values[own]
+                out[name][of if isinstance(of, slice) else of[own]] = values[own]
     if figures is not None:
         figures["ground_points"] = int(np.count_nonzero(out["Ground"]))
         figures.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
@@ -163,95 +153,39 @@ def filtered_ground(
 
 
 def _found(
-    x, y, z, use, deck, column, row, options: FilterOptions, counts: dict[str, int]
+    points: GroundPoints, options: FilterOptions, counts: dict[str, int]
 ) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
-    """Pieces of the points, which of each are its own, and the ground found there."""
-    around = options.reach + sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
-    for points, own in patches(column, row, around, options.link):
-        raster, pits = ground_raster(
-            x[points], y[points], z[points], use[points], deck[points], column[points], row[points], options
-        )
+    """Numbers of the points of pieces, which of each are its own, and the ground found there."""
+    for of, own in patches(points.column, points.row, options.reach_of_points, options.link):
+        raster, pits = ground_raster(points.some(of), options)
         counts["pits"] += len(pits) if isinstance(own, slice) else int(np.count_nonzero(own[pits]))
-        yield points, own, raster, None
+        yield of, own, raster, None
 
 
 def _given(
-    cells: GroundCells, column, row, options: FilterOptions
+    points: GroundPoints, options: FilterOptions, cells: GroundCells
 ) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
     """The same with the ground that was found before, as cells."""
-    away = planes_reach(options.levels(FAR)) + 4
-    for points, own in patches(column, row, 0, options.link):
-        left, bottom = int(column[points].min()), int(row[points].min())
-        width, height = int(column[points].max()) + 1 - left, int(row[points].max()) + 1 - bottom
-        yield (
-            points,
-            own,
-            *cells.on(CellWindow(left, bottom, width, height).grown(away), options.opening_radii),
-        )
-
-
-def reach(
-    *, cell: float = 1.0, window: float = 75.0, openings: Sequence[float] = (), decks: bool = False
-) -> float:
-    """How far away, in meters, points can change a point's results: the halo a tile needs.
-
-    Beyond what decides which cells are ground come the surfaces through it: that for telling ground, and the last.
-    """
-    options = FilterOptions(cell=cell, window=window, openings=openings, decks=decks)
-    surfaces = sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
-    return (options.reach + surfaces) * cell
-
-
-def reach_of_cells(cell: float) -> float:
-    """How far away from points, in meters, cells of the ground matter that was found before."""
-    return (planes_reach(FilterOptions(cell).levels(FAR)) + 4) * cell
-
-
-def check_sizes(
-    cell: float,
-    slope: float,
-    window: float,
-    threshold: float,
-    scalar: float,
-    openings: Sequence[float] = (),
-) -> None:
-    """Refuse sizes that make no filter; raises :class:`OptionError`."""
-    for name, value in (("cell", cell), ("window", window), *(("openings", size) for size in openings)):
-        if not (np.isfinite(value) and value > 0):
-            raise OptionError(f"'{name}' must be a positive length", found=value)
-        if name != "cell" and value > _MOST_CELLS * cell:
-            raise OptionError(
-                f"'{name}' must not be more than {_MOST_CELLS} cells",
-                found=f"{value:g} m in cells of {cell:g} m",
-                cure="Use larger cells or a smaller window",
-            )
-    for name, value in (("slope", slope), ("threshold", threshold), ("scalar", scalar)):
-        if not (np.isfinite(value) and value >= 0):
-            raise OptionError(f"'{name}' must not be negative", found=value)
+    for of, own in patches(points.column, points.row, 0, options.link):
+        window = points.some(of).window().grown(options.reach_of_cells)
+        yield of, own, *cells.on(window, options.opening_radii)
 
 
 def _measured(
-    x,
-    y,
-    z,
-    use,
-    deck,
-    column,
-    row,
+    points: GroundPoints,
     own,
     raster: GroundRaster,
     means: CellMeans | None,
     options: FilterOptions,
-    *,
-    slope_too,
-    threads,
-    counts,
-):
+    slope_too: bool,
+    threads: int | None,
+    counts: dict[str, int],
+) -> dict[str, NDArray]:
     """Heights of points above the ground of a raster, and what they say of that themselves, where no `means` say it."""
+    x, y, z, use, deck, column, row = points
     cell, left, bottom = options.cell, raster.left, raster.bottom
-    ground, place = raster.ground, raster.place
     needed = around(column, row, left, bottom, raster.shape)
-    planes = surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(NEAR), needed)
+    planes = surface_of(raster, options, NEAR, needed)
     height, gradient = np.empty((2, len(x)))
 
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
@@ -268,10 +202,10 @@ def _measured(
     if means is None:
         sums = np.zeros((*raster.shape, 4), np.int64)
         add_ground(x, y, z, is_ground, column, row, cell, left, bottom, sums)
-        means_of(sums, ground, place)
+        means_of(sums, raster.ground, raster.place)
     else:
-        ground, place = means
-    surface(ground, place, raster.floor, raster.lowest, left, bottom, options.levels(FAR), needed, planes)
+        raster = raster._replace(ground=means[0], place=means[1])
+    surface_of(raster, options, FAR, needed, planes)
     each(above)
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
