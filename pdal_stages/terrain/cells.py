@@ -93,12 +93,14 @@ def lowest_of_cells(
 
 
 def levels(z: NDArray[np.float64], cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Points (n,) in the order of their cells' numbers and of their heights, and which of them begin a level of a cell.
+    """Points (n,) in the order of their cells' numbers (small ones) and of their heights, and which begin a level of a cell.
 
     A cell's points are parted where a gap is wide: the ground and the deck over it, a roof and what it stands on. The lowest
     points of levels are levels again, each by itself, so they stand for all points of places far away.
     """
-    order = np.lexsort((z, cell))
+    rank = np.empty(len(z), np.int64)
+    rank[np.argsort(z)] = np.arange(len(z))
+    order = np.argsort(cell * len(z) + rank)
     return order, begins_run(cell[order]) | (np.diff(z[order], prepend=-np.inf) > GAP)
 
 

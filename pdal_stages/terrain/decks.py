@@ -53,7 +53,8 @@ def find_decks(
 
     Coordinates in meters, finite; only points to `use` make decks, and are of them. Works from about 2 points/m2 on.
     """
-    return decks_of_levels(x, y, z, use, levels_near_decks(x[use], y[use], z[use]))
+    column, row = (cell_numbers(axis[use], CELL) for axis in (x, y))
+    return decks_of_levels(x, y, z, use, levels_near_decks(column, row, z[use]))
 
 
 def level_points(
@@ -61,7 +62,7 @@ def level_points(
 ) -> NDArray[np.int64]:
     """Numbers of the points that are all :func:`find_decks` needs of places far away, ascending."""
     mine = np.flatnonzero(use)
-    order, begins = levels(z[mine], _keys(x[mine], y[mine]))
+    order, begins = levels(z[mine], np.unique(_keys(x[mine], y[mine]), return_inverse=True)[1])
     return np.sort(mine[order[begins]])
 
 
@@ -70,15 +71,14 @@ def _keys(x, y):
 
 
 def levels_near_decks(
-    x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
+    column: NDArray[np.int64], row: NDArray[np.int64], z: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least.
+    """All that :func:`decks_of_levels` needs, of the points :func:`level_points` at least and the cells they fall in.
 
     Levels in cells up to twice BESIDE from a deck (n, 5): column, row, height, whether it is a deck's, its kind.
     """
     rows = [np.empty((0, 5))]
-    if len(x):
-        column, row = cell_numbers(x, CELL), cell_numbers(y, CELL)
+    if len(z):
         for points, own in patches(column, row, int(REACH), FAR + AHEAD):
             c, r = column[points], row[points]
             left, bottom = int(c.min()), int(r.min())
@@ -93,7 +93,8 @@ def levels_near_decks(
             mine = np.zeros(len(c), bool)
             mine[own] = True
             near &= mine[lowest]
-            rows.append(np.column_stack([c[lowest], r[lowest], heights, deck, kind])[near])
+            lowest = lowest[near]
+            rows.append(np.column_stack([c[lowest], r[lowest], heights[near], deck[near], kind[near]]))
     return np.concatenate(rows)
 
 

@@ -146,7 +146,9 @@ def cells_of_block(
     # Openings reach into cells without points.
     spill = max([*openings, 0]) + 2
     margin = max(spill, _beside(options))
-    levels = levels_near_decks(x, y, z) if options.decks else np.empty((0, 5))
+    levels = np.empty((0, 5))
+    if options.decks:
+        levels = levels_near_decks(cell_numbers(x, CELL), cell_numbers(y, CELL), z)
 
     def given(x, y, z) -> GroundPoints:
         use = np.ones(len(x), bool)

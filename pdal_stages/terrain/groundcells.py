@@ -205,7 +205,7 @@ class GroundPoints(NamedTuple):
 
     def some(self, which: NDArray | slice) -> GroundPoints:
         """Part of them."""
-        return GroundPoints(*(values[which] for values in self))
+        return GroundPoints._make(values[which] for values in self)
 
     def window(self) -> CellWindow:
         """The cells round them."""

@@ -210,7 +210,7 @@ def _measured(
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
     height[nowhere] = gradient[nowhere] = 0.0
-    found = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
+    found: dict[str, NDArray] = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
     if slope_too:
         found["Slope"] = np.degrees(np.arctan(gradient))
     for name, radius in zip(opening_names(options.openings), options.opening_radii, strict=True):

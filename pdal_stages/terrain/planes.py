@@ -231,8 +231,10 @@ def surface(
         planes = np.zeros((*ground.shape, 3))
     _finer(blocks.values, blocks.left, blocks.bottom, 1.0, left, bottom, needed, planes)
     # Those of ground cells hold their cell's ground.
-    through = place[..., 2] - place[..., 0] * planes[..., 1] - place[..., 1] * planes[..., 2]
-    np.copyto(planes[..., 0], through, where=ground)
+    np.copyto(planes[..., 0], place[..., 2], where=ground)
+    for axis in (0, 1):
+        rise = place[..., axis] * planes[..., axis + 1]
+        np.subtract(planes[..., 0], rise, out=planes[..., 0], where=ground)
     return planes
 
 
