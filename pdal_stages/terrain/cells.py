@@ -64,6 +64,20 @@ def keys_of(column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int
     return (row << 32) + (column + 2**31)
 
 
+def runs(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Numbers of those (n,) that have the same key, for each there is."""
+    order = np.argsort(key, kind="stable")
+    return np.split(order, np.flatnonzero(begins_run(key[order]))[1:]) if len(key) else []
+
+
+def places_among(
+    keys: NDArray[np.int64], wanted: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Where wanted keys are among others, ascending and some; and whether they are."""
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return place, keys[place] == wanted
+
+
 def lowest_points(
     x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], key: NDArray[np.int64]
 ) -> NDArray[np.int64]:
@@ -129,7 +143,7 @@ def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link:
     is small enough.
     """
     cells = _cells(column, row)
-    if cells <= LARGEST and not _is_empty(cells, len(column)):
+    if cells <= min(LARGEST, _FEW + _EMPTY * len(column)):
         yield slice(None), slice(None)
         return
     for group in _groups(column, row, link):
@@ -137,27 +151,14 @@ def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link:
         if _cells(c, r) <= LARGEST:
             yield group, slice(None)
             continue
-        for near, mine in _squares(c, r, reach):
-            for part, own in connected(c[near], r[near], mine, link):
-                yield group[near[part]], own
-
-
-def connected(
-    column: NDArray[np.int64], row: NDArray[np.int64], mine: NDArray[np.bool_], link: int
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
-    """Yield (points, own) of a piece and its surroundings, whose own points are `mine`.
-
-    All in one, or where that would be a raster of empty land, in groups without a chain of points between them; groups
-    without a point of its own are left out.
-    """
-    if not mine.any():
-        return
-    if not _is_empty(_cells(column, row), len(column)):
-        yield np.arange(len(column)), mine
-        return
-    for part in _groups(column, row, link):
-        if mine[part].any():
-            yield part, mine[part]
+        for own in runs(keys_of(c // SIDE, r // SIDE)):
+            west, east, south, north = c[own].min(), c[own].max(), r[own].min(), r[own].max()
+            inside = (c >= west - reach) & (c <= east + reach) & (r >= south - reach) & (r <= north + reach)
+            near, mine = np.flatnonzero(inside), np.zeros(len(c), bool)
+            mine[own] = True
+            for part in _groups(c[near], r[near], link):
+                if mine[near[part]].any():
+                    yield group[near[part]], mine[near[part]]
 
 
 def _cells(column: NDArray[np.int64], row: NDArray[np.int64]) -> int:
@@ -165,69 +166,16 @@ def _cells(column: NDArray[np.int64], row: NDArray[np.int64]) -> int:
     return (int(column.max()) - int(column.min()) + 1) * (int(row.max()) - int(row.min()) + 1)
 
 
-def _is_empty(cells: int, points: int) -> bool:
-    return cells > _FEW + _EMPTY * points
-
-
-def _by_block(
-    column: NDArray[np.int64], row: NDArray[np.int64], side: int, rings: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int]:
-    """Points in the order of their blocks, numbers of the blocks, where each begins, and the step from row to row."""
-    across, along = column // side, row // side
-    across, along = across - across.min(), along - along.min()
-    stride = (
-        int(across.max()) + 1 + rings
-    )  # so that no row's end is within so many of the next one's beginning
-    key = along * stride + across
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    starts = np.flatnonzero(begins_run(key))
-    return order, key[starts], np.append(starts, len(key)), stride
-
-
 def _groups(column: NDArray[np.int64], row: NDArray[np.int64], link: int) -> list[NDArray[np.int64]]:
     """Points that belong together: all within `link` cells of each other, and few that are a little farther apart."""
     side = -(-link // _PARTS)
     rings = -(-link // side)
-    order, numbers, starts, stride = _by_block(column, row, side, rings)
-    if len(numbers) == 1:
-        return [order]
-    ones, others = [], []
+    blocks, of = np.unique(keys_of(column // side, row // side), return_inverse=True)
+    pairs = []
     for b in range(rings + 1):
         for a in range(-rings if b else 1, rings + 1):
-            step = b * stride + a
-            at = np.minimum(np.searchsorted(numbers, numbers + step), len(numbers) - 1)
-            linked = np.flatnonzero(numbers[at] == numbers + step)
-            ones.append(linked)
-            others.append(at[linked])
-    label = np.empty(len(numbers), np.int64)
-    if number_sets(np.concatenate(ones), np.concatenate(others), label) == 1:
-        return [order]
-    of_points = np.repeat(label, np.diff(starts))
-    together = np.argsort(of_points, kind="stable")
-    return np.split(order[together], np.flatnonzero(begins_run(of_points[together]))[1:])
-
-
-def _squares(
-    column: NDArray[np.int64], row: NDArray[np.int64], reach: int
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
-    """The points of each square and of `reach` cells round them, and which are the square's own."""
-    rings = -(-reach // SIDE)
-    order, numbers, starts, stride = _by_block(column, row, SIDE, rings)
-    for at, number in enumerate(numbers):
-        own = order[starts[at] : starts[at + 1]]
-        c, r = column[own], row[own]
-        west, east, south, north = c.min() - reach, c.max() + reach, r.min() - reach, r.max() + reach
-        near = [own]
-        for b in range(-rings, rings + 1):
-            low, high = np.searchsorted(
-                numbers, [number + b * stride - rings, number + b * stride + rings + 1]
-            )
-            for k in range(low, high):
-                if k != at:
-                    these = order[starts[k] : starts[k + 1]]
-                    c, r = column[these], row[these]
-                    near.append(these[(c >= west) & (c <= east) & (r >= south) & (r <= north)])
-        mine = np.zeros(sum(map(len, near)), bool)
-        mine[: len(own)] = True
-        yield np.concatenate(near), mine
+            at, there = places_among(blocks, blocks + (b << 32) + a)
+            pairs.append([np.flatnonzero(there), at[there]])
+    label = np.empty(len(blocks), np.int64)
+    number_sets(*np.concatenate(pairs, axis=1), label)
+    return runs(label[of])

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import cell_numbers, keys_of, levels, patches
+from .cells import cell_numbers, keys_of, levels, patches, places_among
 from .deckrims import REACH as RIMS_REACH
 from .deckrims import deck_levels
 from .linked import sums_around
@@ -114,10 +114,10 @@ def decks_of_levels(
     heights, deck, kind = table[order, 2], table[order, 3] > 0, table[order, 4].astype(np.int8)
     cells, start = np.unique(keys[order], return_index=True)
     # Every cell near a deck that holds a point has levels.
-    cell, there = _places(cells, _keys(x, y))
+    cell, there = places_among(cells, _keys(x, y))
     near = np.flatnonzero(use & there)
     steps = np.arange(-BESIDE, BESIDE + 1)
-    around, held = _places(cells, cells[:, None] + ((steps << 32)[:, None] + steps).ravel())
+    around, held = places_among(cells, cells[:, None] + ((steps << 32)[:, None] + steps).ravel())
     found = np.zeros(len(near), np.uint8)
     _mark(
         z[near],
@@ -131,12 +131,6 @@ def decks_of_levels(
     )
     out[near] = found
     return out
-
-
-def _places(cells, wanted):
-    """Where keys are among the cells' ascending ones, and whether they are."""
-    place = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
-    return place, cells[place] == wanted
 
 
 @njit

@@ -27,7 +27,7 @@ from ..base.errors import StageError
 from ..base.jit import device, njit
 from .belowground import AROUND, ENOUGH, below_ground
 from .belowground import reach as below_reach
-from .cells import HIGHEST, cell_numbers, columns, patches
+from .cells import HIGHEST, cell_numbers, columns, patches, places_among
 from .linked import longest_sides, number_sets, sums_around
 
 LOW, HIGH = NOISE
@@ -199,10 +199,8 @@ def _small(voxels: Voxels, usual: NDArray[np.float64], most: int) -> tuple[NDArr
     strong = voxels.counts > (WEAK * usual).astype(np.int64)
     pairs = []
     for dj, di, dl in list(product((-1, 0, 1), repeat=3))[14:]:  # those ahead
-        wanted = keys + ((dj * voxels.width + di) << BITS) + dl
-        at = np.minimum(np.searchsorted(keys, wanted), number - 1)
-        touching = np.flatnonzero(keys[at] == wanted)
-        pairs.append([touching, at[touching]])
+        at, touching = places_among(keys, keys + ((dj * voxels.width + di) << BITS) + dl)
+        pairs.append([np.flatnonzero(touching), at[touching]])
     one, other = np.concatenate(pairs, axis=1)
     both = strong[one] & strong[other]
     label = np.empty(number, np.int64)

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import begins_run
-from .cells import HIGHEST, cell_numbers, keys_of
+from .cells import HIGHEST, cell_numbers, keys_of, runs
 from .decks import CELL, decks_of_levels, levels_near_decks
 from .groundcells import (
     BLOCK_SIDE,
@@ -50,7 +49,7 @@ class GroundCells(NamedTuple):
     def in_parts(self, side: int) -> dict[str, NDArray]:
         """All by name, for files: those of squares of so many columns and rows by themselves."""
         column, row = (self.cells[name].astype(np.int64) // side for name in ("column", "row"))
-        parts = _runs(keys_of(column, row))
+        parts = runs(keys_of(column, row))
         return {"decks": self.decks} | {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
 
     @staticmethod
@@ -105,12 +104,6 @@ def _record(openings: int) -> np.dtype:
     )
 
 
-def _runs(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Numbers of those that have the same key, for each there is."""
-    order = np.argsort(key, kind="stable")
-    return np.split(order, np.flatnonzero(begins_run(key[order]))[1:]) if len(key) else []
-
-
 def by_block(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -121,7 +114,7 @@ def by_block(
     """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them; meters."""
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
-    parts = _runs(keys_of(column, row))
+    parts = runs(keys_of(column, row))
     return {
         (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[mine[p]] for axis in (x, y, z)])
         for p in parts

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
 from ..base.errors import NoTerrainError, OptionError
-from .cells import cell_numbers, columns, keys_of
+from .cells import cell_numbers, columns, keys_of, places_among
 
 
 class MinimaTerrain:
@@ -84,9 +84,8 @@ class MinimaTerrain:
         Weights are one over the fourth power of the distance between cell centers. [W18] does not say what becomes
         of empty cells.
         """
-        place = np.minimum(np.searchsorted(self.keys, keys), self.keys.size - 1)
-        values = self.minima[place].copy()
-        empty = np.flatnonzero(self.keys[place] != keys)
+        place, there = places_among(self.keys, keys)
+        values, empty = self.minima[place], np.flatnonzero(~there)
         if empty.size:
             from scipy.spatial import cKDTree  # most clouds have no gaps: not loaded at start
 

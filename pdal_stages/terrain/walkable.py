@@ -146,7 +146,7 @@ def ways(z, start, h, w, kind, most):
                 for n in range(start[j * w + i], start[j * w + i + 1]):
                     if kind[n] != SOLID:
                         continue
-                    found, lower, empty = -1, False, True
+                    found, lower = -1, False
                     for s in range(1, ahead + 1):
                         y, x = j + s * dj, i + s * di
                         if y < 0 or x < 0 or y >= h or x >= w:
@@ -156,8 +156,6 @@ def ways(z, start, h, w, kind, most):
                         for m in range(start[y * w + x], start[y * w + x + 1]):
                             if kind[m] == SOLID and abs(z[m] - z[n]) <= nearest:
                                 found, nearest = m, abs(z[m] - z[n])
-                            if s > edge and (z[m] < z[n] + ABOVE or kind[m] != ROUGH):
-                                empty = False
                             if z[m] < z[n] - max(DROP, WALL * far):
                                 lower = True
                         if found >= 0:
@@ -170,7 +168,7 @@ def ways(z, start, h, w, kind, most):
                     end[n, d] = WALLED
                     if lower:
                         end[n, d] = DOWN
-                    elif empty and _bare(z, start, h, w, kind, j, i, di, dj, edge, ahead, z[n] + ABOVE):
+                    elif _bare(z, start, h, w, kind, j, i, di, dj, edge, ahead, z[n] + ABOVE):
                         end[n, d] = _sight(z, start, h, w, kind, j, i, di, dj, z[n])
                     if end[n, d] != WALLED:
                         way[n, d], last[n, d] = 0, end[n, d]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import device, njit
+from ..base.jit import njit
 from .cells import cell_numbers, levels, patches
 from .linked import longest_sides, number_sets
 
@@ -207,13 +207,7 @@ def _seen_through(place, cells, w, good, line, x, y, z, begin, on):
         j, i = cells[n] // w, cells[n] % w
         below, sides, under = 0, np.zeros(2, np.int64), np.zeros(2, np.int64)
         for b in range(j - _MARGIN, j + _MARGIN + 1):
-            # Of the row, the columns near to the line.
-            low, high = i - _MARGIN, i + _MARGIN + 1
-            if abs(line[n, 1]) > 0.1:
-                middle = i + (b - j) * line[n, 0] / line[n, 1]
-                around = (STRIP_TO + 2.0) / abs(line[n, 1]) + 1.0
-                low, high = max(low, int(middle - around)), min(high, int(middle + around) + 2)
-            for a in range(low, high):
+            for a in range(i - _MARGIN, i + _MARGIN + 1):
                 for p in range(begin[b * w + a], begin[b * w + a + 1]):
                     dx, dy = (a - i) * CELL + x[p] - place[n, 0], (b - j) * CELL + y[p] - place[n, 1]
                     along, aside = dx * line[n, 0] + dy * line[n, 1], dy * line[n, 0] - dx * line[n, 1]
@@ -230,16 +224,6 @@ def _seen_through(place, cells, w, good, line, x, y, z, begin, on):
     return out
 
 
-@device
-def _distance(place, line, n, m, dj, di):
-    """How far along the line through a level another lies, which is on it; infinite where it is not."""
-    dx, dy = di * CELL + place[m, 0] - place[n, 0], dj * CELL + place[m, 1] - place[n, 1]
-    along = abs(dx * line[n, 0] + dy * line[n, 1])
-    aside = dy * line[n, 0] - dx * line[n, 1]
-    above = place[m, 2] - place[n, 2] - line[n, 2] * (dx * line[n, 0] + dy * line[n, 1])
-    return along if abs(aside) <= BESIDE and abs(above) <= NEAR + 0.02 * along else np.inf
-
-
 @njit
 def _on_lines(place, cells, start, h, w, good, line):
     """Levels with lines, others on these up to `HALF` meters away, themselves included, and how far away (k,)."""
@@ -252,8 +236,14 @@ def _on_lines(place, cells, start, h, w, good, line):
         for b in range(max(j - reach, 0), min(j + reach + 1, h)):
             for a in range(max(i - reach, 0), min(i + reach + 1, w)):
                 for m in range(start[b * w + a], start[b * w + a + 1]):
-                    away = _distance(place, line, n, m, b - j, a - i)
-                    if away > HALF:
+                    dx, dy = (
+                        (a - i) * CELL + place[m, 0] - place[n, 0],
+                        (b - j) * CELL + place[m, 1] - place[n, 1],
+                    )
+                    along, aside = dx * line[n, 0] + dy * line[n, 1], dy * line[n, 0] - dx * line[n, 1]
+                    above = place[m, 2] - place[n, 2] - line[n, 2] * along
+                    away = abs(along)
+                    if away > HALF or abs(aside) > BESIDE or abs(above) > NEAR + 0.02 * away:
                         continue
                     if count == len(one):
                         one, other = np.concatenate((one, one)), np.concatenate((other, other))
