@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -135,7 +134,7 @@ of Z.
     example = {"type": "filters.hag_morphological", "ground": True}
 
     def check(self) -> None:
-        self._filter  # noqa: B018
+        self._filter = FilterOptions(**{one.name: self.options[one.name] for one in fields(FilterOptions)})
 
     def creates(self) -> dict[str, str]:
         return {
@@ -157,10 +156,6 @@ of Z.
         cell = self.cell
         reach = (reach_of_block(self._filter) + 2) * cell
         return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
-
-    @cached_property
-    def _filter(self) -> FilterOptions:
-        return FilterOptions(**{one.name: self.options[one.name] for one in fields(FilterOptions)})
 
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """First, the points (n, 3) that blocks need: ``around`` them, and inside each (:func:`inside_block`)."""
