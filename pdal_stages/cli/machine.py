@@ -235,10 +235,10 @@ def _warmup(options: argparse.Namespace) -> None:
     import numpy as np
 
     from ..classifier import TrainingCloud, TrainingOptions, train
-    from ..synthetic.demo import compile_kernels
+    from ..synthetic import make_town
     from ..terrain import detached_noise, filtered_ground, hag_minima
 
-    compile_kernels()
+    make_town(20.0, 1.0, threads=1, progress=False)
     # A deck over a valley, with land at both of its ends: what is asked of decks is asked only where one may be.
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
     z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))

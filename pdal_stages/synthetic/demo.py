@@ -104,13 +104,6 @@ def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str
     return {"train": train, "classify": classify, "standard": standard}
 
 
-def compile_kernels() -> None:
-    """Compile the kernels that making a town needs."""
-    from . import make_town
-
-    make_town(20.0, 1.0, threads=1, progress=False)
-
-
 def _draw(path: Path, points) -> None:
     import numpy as np
 

@@ -135,12 +135,6 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     stages = [step.ours for step in head if step.ours is not None]
     makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
-    messages = list(pipeline.expanded.warnings)
-    if any(step.ours is None and step.sees_neighbors for step in head):
-        messages.append(
-            "PDAL filters that look at neighbors were given --buffer; the result is seamless only if it is wide enough "
-            "for them"
-        )
     return TilePlan(
         readers=[step.given for step in readers],
         head=[_narrowed(step, reach) for step, reach in zip(head, later, strict=True)],
@@ -152,7 +146,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         creates=None if foreign else list(makes),
         makes=makes,
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
-        messages=messages,
+        messages=list(pipeline.expanded.warnings),
         name=source.name,
     )
 

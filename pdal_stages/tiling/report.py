@@ -43,7 +43,7 @@ class Job:
 
     name: str  #: under which it is kept in the work folder
     points: int = 0  #: its own; 0 where not known before it is read
-    tile: tuple[int, int] | None = None
+    tile: tuple[int, int] = (0, 0)  #: of a tile or block: column and row
     source: InputSource | None = None  #: the input that an output is of
     outputs: list[str] | None = (
         None  #: what the writers write; None for a tile whose points go into outputs of files
@@ -122,7 +122,7 @@ class TiledRun:
             "messages": self.messages,
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
-                {"name": j.name, "tile": list(j.tile or ()), "state": j.state, "points": j.points}
+                {"name": j.name, "tile": list(j.tile), "state": j.state, "points": j.points}
                 | {k: v for k, v in j.record.items() if k != "fingerprint" and (k != "outputs" or j.outputs)}
                 | ({"reason": j.reason} if j.reason else {})
                 for j in self.tiles

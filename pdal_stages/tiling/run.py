@@ -254,7 +254,7 @@ class _Run:
         if first := self.plan.first:
             far += (self.plan.sees_m + first.blocks.side + first.blocks.reach) / self.survey.unit
             far += self.survey.grid.size
-        waiting = [job.tile for job in self.tiles if job.state == "waiting" and job.tile]
+        waiting = [job.tile for job in self.tiles if job.state == "waiting"]
         return {source.path for tile in waiting for source in self.survey.near(tile, far)}
 
     # ---- tiles and outputs -----------------------------------------------------------------------------------
@@ -338,7 +338,6 @@ class _Run:
                 assert job.outputs is not None
                 plan, scratch = context.plan, context.scratch
                 return FileTask(plan, job.source, job.points, results, job.outputs, scratch).run
-            assert job.tile is not None
             sources = survey.near(job.tile, self.farthest)
             complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
             given = survey.readable(sources)
@@ -366,7 +365,7 @@ class _Run:
         if first is None or len(self.tiles) == 1:
             return
         unit, context = survey.unit, self._context()
-        by_tile = {job.tile: job for job in self.tiles if job.tile}
+        by_tile = {job.tile: job for job in self.tiles}
         places = {b for tile in by_tile for b in blocks_around(context, tile, first.blocks.spill)}
         # Those of an earlier run with other inputs would be taken for blocks and tiles with points.
         store.remove(".block.npz", [f"{block_name(block)}.npz" for block in places])
@@ -390,7 +389,6 @@ class _Run:
             return survey.readable(survey.near(tile, first.halo_m / unit))
 
         def first_task(job: Job) -> Callable[[], Any]:
-            assert job.tile is not None
             return FirstRoundTask(context, first, job.tile, sources(job.tile), store.path(job.name)).run
 
         firsts: dict[tuple[int, int], Job] = {}
@@ -402,7 +400,6 @@ class _Run:
             self.messages_before.append(job.record.get("messages", []))
 
         def block_task(job: Job) -> Callable[[], Any]:
-            assert job.tile is not None
             left = [store.path(firsts[tile].name) for tile in near[job.tile]]
             return BlockTask(context.plan, job.tile, left, store.path(job.name)).run
 

@@ -271,7 +271,7 @@ class TrainTask:
             choice.say(report)
         for job in run.tiles:
             if "dimensions" in job.record:
-                assert job.outputs is not None and job.tile is not None
+                assert job.outputs is not None
                 _check_same(job.record["dimensions"], dimensions or job.record["dimensions"])
                 dimensions = job.record["dimensions"]
                 for value, cloud in self.stage.surveys(_read_back(job.outputs[0], self.stage.named, choice)):
