@@ -143,7 +143,7 @@ def test_what_is_wrong_is_said_before_any_work(tmp_path, monkeypatch):
     with pytest.raises(StageError, match="the file of polygons does not exist"):
         Polygons({"polygons": [f"{tmp_path}/none.gpkg=9"]})
     (tmp_path / "bad.gpkg").write_text("no map")
-    with pytest.raises(StageError, match="the polygons cannot be read"):
+    with pytest.raises(StageError, match="the vector file cannot be read"):
         Polygons({"polygons": [f"{tmp_path}/bad.gpkg=9"]})
     lines = tmp_path / "lines.gpkg"
     wkb = np.array([shapely.to_wkb(LAKE.exterior)], object)

@@ -53,13 +53,9 @@ class Overlay:
         """The layer that will be read."""
         if "://" not in self.file and not Path(self.file).exists():
             raise StageError("the file of polygons does not exist", where=self.file, cure="Check the path")
-        pyogrio = vector("pyogrio")
-        try:
-            layers = [
-                str(name) for name, kind in pyogrio.list_layers(self.file) if _POLYGONS.search(str(kind))
-            ]
-        except Exception as error:  # pyogrio's own
-            raise StageError("the polygons cannot be read", where=self.file, found=str(error)) from None
+        with reading(self.file):
+            listed = vector("pyogrio").list_layers(self.file)
+        layers = [str(name) for name, kind in listed if _POLYGONS.search(str(kind))]
         layer = self.layer or (layers[0] if len(layers) == 1 else "")
         if layer not in layers:
             raise StageError(

@@ -226,8 +226,5 @@ def near_any(xyz: NDArray[np.float64], chosen: NDArray[np.bool_], within: float)
 
     if within <= 0 or not chosen.any():
         return chosen.copy()
-    low, high = xyz[chosen].min(axis=0) - within, xyz[chosen].max(axis=0) + within
-    out, maybe = chosen.copy(), np.flatnonzero(((xyz >= low) & (xyz <= high)).all(axis=1))
-    far, _ = cKDTree(xyz[chosen]).query(xyz[maybe], distance_upper_bound=np.nextafter(within, np.inf))
-    out[maybe[np.isfinite(far)]] = True
-    return out
+    far, _ = cKDTree(xyz[chosen]).query(xyz, distance_upper_bound=np.nextafter(within, np.inf))
+    return np.isfinite(far)

@@ -107,18 +107,8 @@ def review_files(
 ) -> Review:
     """Read classified files and find the patches.
 
-    Parameters
-    ----------
-    inputs : sequence of str
-        Files, folders, patterns.
-    share : float
-        Patches are listed until they hold this share of the expected errors.
-    cell : float
-        Side of a cell, meters; 0: chosen by the density.
-    model : str
-        What gives reliabilities where the files have none.
-    workers : int
-        Files read at the same time.
+    They are listed until they hold a `share` of the expected errors. Cells are `cell` meters wide, or as the density says
+    (0). The `model` gives reliabilities where files have none; `workers` read files at the same time.
     """
     if cell:
         checks.number("'--cell'", cell, 0.5, 100, unit="m")

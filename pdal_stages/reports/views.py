@@ -34,18 +34,9 @@ BACKGROUND = (246, 246, 243)
 
 
 def png(rgb: npt.NDArray[np.uint8]) -> bytes:
-    """A (height, width, 3) uint8 image as a PNG file of at most 256 colors; the same image gives the same bytes.
-
-    Class maps are few colors in many shades, so channels in steps of 4 to 16 levels do, and a rare class keeps its color.
-    """
-    image = Image.fromarray(np.ascontiguousarray(rgb))
-    for step in (1, 4, 8, 12, 16, 24, 32, 48, 64):  # 64: at most 5 x 5 x 5 colors
-        rounded = np.minimum((rgb.astype(np.uint16) + step // 2) // step * step, 255)
-        image = Image.fromarray(rounded.astype(np.uint8))
-        if image.getcolors(256):
-            break
-    file = io.BytesIO()
-    image.quantize(256, dither=Image.Dither.NONE).save(file, "PNG")
+    """A (height, width, 3) uint8 image as a PNG file of at most 256 colors, rare ones among them."""
+    file, image = io.BytesIO(), Image.fromarray(np.ascontiguousarray(rgb))
+    image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(file, "PNG")
     return file.getvalue()
 
 
