@@ -28,7 +28,7 @@ from pdal_stages.alsnet.batches import (
 )
 from pdal_stages.alsnet.geometry import build
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.base.outputs import CHECKPOINT, kind_of
+from pdal_stages.base.files import CHECKPOINT, kind_of
 from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 
 needs_torch = pytest.mark.skipif(

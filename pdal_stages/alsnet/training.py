@@ -17,9 +17,8 @@ import numpy.typing as npt
 
 from ..base.arrays import hash_of
 from ..base.errors import DependencyError, ModelError, OptionError
-from ..base.files import write_whole
+from ..base.files import CHECKPOINT, Output, write_whole
 from ..base.messages import Progress
-from ..base.outputs import CHECKPOINT, Output
 from ..base.resources import map_blocks, resolve_threads
 from ..classifier.algorithms import gather, versions, with_returns
 from ..classifier.classes import ClassMap

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, OptionError
+from ..base.files import Output
 from ..base.messages import Progress
-from ..base.outputs import Output
 from ..base.resources import free_memory
 from ..features.engine import fit_clouds
 from ..features.returns import SOURCES

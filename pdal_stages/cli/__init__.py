@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from ..base.errors import StageError, suggest
+from ..base.files import Output, check_outputs
 from ..base.messages import LoggedStream, PlainStream, RunLog, print_messages
-from ..base.outputs import Output, check_outputs
 from ..base.version import __version__
 
 #: Modules and their commands, which are imported for these alone; for ``commands`` all are.

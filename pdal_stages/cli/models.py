@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from ..base.errors import StageError
+from ..base.files import JSON, Output, check_outputs
 from ..base.messages import print_messages
-from ..base.outputs import JSON, Output, check_outputs
 from . import INPUTS, OVERRIDES, Parser, takes_options, tiles
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.

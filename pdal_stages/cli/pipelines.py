@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..base.errors import StageError
-from ..base.files import write_whole
+from ..base.files import JSON, Output, check_outputs, write_whole
 from ..base.messages import print_messages
-from ..base.outputs import JSON, Output, check_outputs
 from . import Parser, tiles
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, StageError, suggest
+from ..base.files import check_outputs
 from ..base.messages import Progress, Report
-from ..base.outputs import check_outputs
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from .classify_request import ClassifyRequest

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from ..base.outputs import LAS, Output
+from ..base.files import LAS, Output
 from ..classifier.modelfile import find
 from ..stages.base import Stage
 

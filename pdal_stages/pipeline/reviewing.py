@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from ..accuracy.expected import Patches, ReviewCells, find_patches, side_for
 from ..base import checks
 from ..base.errors import StageError
-from ..base.files import write_whole
+from ..base.files import HTML, JSON, Output, check_outputs, write_whole
 from ..base.las import read_header
 from ..base.messages import Progress, duration, one_line, print_messages
-from ..base.outputs import HTML, JSON, Output, check_outputs
 from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD

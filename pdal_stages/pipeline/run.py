@@ -12,11 +12,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
-from ..base.files import whole_files
+from ..base.files import Output, check_outputs, whole_files
 from ..base.las import odd_text, supersede_copc
 from ..base.lascheck import check_complete, check_readable
 from ..base.messages import Report
-from ..base.outputs import Output, check_outputs
 from ..stages import registry
 from . import las_output, runtime
 from . import pdal as pdal_env

@@ -16,9 +16,8 @@ from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
-from ..base.files import check_writable, write_whole
+from ..base.files import HTML, JSON, Output, check_writable, write_whole
 from ..base.messages import Report, plain
-from ..base.outputs import HTML, JSON, Output
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
 from .base import Stage, files_read

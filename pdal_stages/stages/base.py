@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.outputs import Output
+from ..base.files import Output
 from ..base.units import named_unit
 from .options import Option, option, parse_options
 from .points import Points

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import ModelError, OptionError
-from ..base.files import check_writable
+from ..base.files import MODEL, Output, check_writable
 from ..base.messages import Report
-from ..base.outputs import MODEL, Output
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, required, trainer, welcome
 from ..classifier.classes import ClassMap

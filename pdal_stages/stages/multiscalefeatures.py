@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from ..base import strictjson
 from ..base.errors import OptionError
-from ..base.files import write_whole
+from ..base.files import JSON, Output, write_whole
 from ..base.messages import Progress
-from ..base.outputs import JSON, Output
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.voxels import LARGEST, check_side, represent

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numpy.typing import NDArray
 
-from ..base.outputs import Output
+from ..base.files import Output
 from ..objects import find_objects
 from ..objects.outlines import with_vector
 from .base import Stage

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..base import checks, las
 from ..base.errors import StageError
-from ..base.outputs import MODEL, Output, check_outputs
+from ..base.files import MODEL, Output, check_outputs
 from ..classifier.model import load_model
 from ..classifier.modelfile import digest_of
 from ..pipeline.classify_request import ClassifyRequest

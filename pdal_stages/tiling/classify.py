@@ -12,8 +12,7 @@ from typing import Any
 
 from ..base import las
 from ..base.errors import OptionError, StageError
-from ..base.files import write_whole
-from ..base.outputs import JSON, Output, check_outputs
+from ..base.files import JSON, Output, check_outputs, write_whole
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
 from .inputs import ept_form, read_ept

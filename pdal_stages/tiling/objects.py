@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
-from ..base.files import write_whole
+from ..base.files import JSON, Output, check_outputs, write_whole
 from ..base.messages import Progress, print_messages
-from ..base.outputs import JSON, Output, check_outputs
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects import Cells, Objects, ObjectSettings, find_objects

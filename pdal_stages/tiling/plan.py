@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import PipelineError
-from ..base.outputs import LAS, Output, check_outputs
+from ..base.files import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import writes_las

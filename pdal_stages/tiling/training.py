@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
+from ..base.files import check_outputs
 from ..base.messages import Report
-from ..base.outputs import check_outputs
 from ..classifier import Model, TrainingCloud, TrainingOptions, train
 from ..classifier.clouds import TiledCloud
 from ..classifier.summary import FILE_NUMBER
