@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 def add_commands(parser: Parser) -> None:
     """``classify``, ``objects``, ``review`` and ``corrections``."""
-    takes = parser.command(
-        "classify", _classify, "Classify a cloud with a model file", overrides=True, logged=True
-    )
+    takes = parser.command("classify", _classify, "Classify clouds with a model", overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("output", help="A file; of several inputs a folder, or a name with # where the input's goes")
     takes("--model", default="standard", help="A model file, or one of pdal-stages models; default standard")
@@ -54,22 +52,16 @@ def add_commands(parser: Parser) -> None:
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     tiles.add_arguments(parser.commands["classify"], survey=True)
 
-    takes = parser.command(
-        "objects",
-        _objects,
-        "Write buildings, trees, spans of wires and bridge decks of classified files to a vector file",
-        overrides=True,
-        logged=True,
-    )
+    what = "Write buildings, trees, spans and decks of classified files to a vector file"
+    takes = parser.command("objects", _objects, what, overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes_options(takes, "writers.objects", "outlines", "cell")
     takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
-    takes = parser.command(
-        "review", _review, "List where a person should look in classified files, worst first", logged=True
-    )
+    what = "List where a person should look in classified files, worst first"
+    takes = parser.command("review", _review, what, logged=True)
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes("--html", metavar="FILE", help="A page; default: beside the vector file, under its name")
@@ -79,22 +71,13 @@ def add_commands(parser: Parser) -> None:
     takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
     takes("--model", default="standard", help="What says how reliable classes are, where files do not")
 
-    takes = parser.command(
-        "corrections",
-        _corrections,
-        "Mark what a person has corrected, or looked at and found right, for train",
-    )
+    what = "Mark what a person has corrected, or looked at and found right, for train"
+    takes = parser.command("corrections", _corrections, what)
     takes("before", help="The file as it was classified (LAS or LAZ)")
     takes("after", nargs="?", help="The same points, in any order, as the person left them")
     takes("--out", required=True, metavar="FILE", help="The points with the new classes, and Checked")
-    takes(
-        "--area",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="Polygons inside of which all was looked at: what was not changed there is right. Of the patches of review, "
-        "those whose 'done' is 1; may be repeated",
-    )
+    area = "Polygons in which all was looked at (of review: where 'done' is 1); may be repeated"
+    takes("--area", action="append", default=[], metavar="FILE", help=area)
     takes("--around", type=float, default=1.0, metavar="METERS", help="Around changes all was looked at (1)")
 
 

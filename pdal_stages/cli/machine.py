@@ -44,13 +44,8 @@ def add_commands(parser: Parser) -> None:
     what.add_argument("--install", action="store_true", help="Compile it and put it beside filters.python")
     what.add_argument("--check", action="store_true", help="Tell what is there and what is missing")
     what.add_argument("--uninstall", action="store_true", help="Take it away")
-    command.add_argument(
-        "--folder",
-        type=Path,
-        metavar="DIR",
-        help="Another folder, made where it is not there, which must then be in PDAL_DRIVER_PATH, together with that of "
-        "filters.python",
-    )
+    folder = "Another folder, which must then be in PDAL_DRIVER_PATH, together with that of filters.python"
+    command.add_argument("--folder", type=Path, metavar="DIR", help=folder)
 
     takes = parser.command(
         "demo", _demo, "Generate a town, train on one half, classify the other", logged=True

@@ -23,13 +23,8 @@ def add_commands(parser: Parser) -> None:
     takes("inputs", nargs="+", metavar="input", help=f"Labeled: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write")
     takes_options(takes, "writers.classifiermodel", *_OF_TRAINING)
-    takes(
-        "--surveys",
-        nargs="*",
-        metavar="NAME=PATTERN",
-        help="Files of one survey, e.g. north=north/*.laz; each other file is a survey of its own. Surveys do not see each "
-        "other, weigh alike, and may have different reference systems",
-    )
+    surveys = "Files of one survey, e.g. north=north/*.laz; each other file is one of its own. They do not see each other"
+    takes("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
 
     tiles.add_sizes(parser.commands["train"])
     parser.commands["train"].epilog = (
@@ -38,21 +33,16 @@ def add_commands(parser: Parser) -> None:
         "points of another number there are of another survey. " + OVERRIDES
     )
 
-    takes = parser.command(
-        "adapt",
-        _adapt,
-        "Make a model for a survey without labels, of what another is sure of there",
-        logged=True,
-    )
+    what = "Make a model for a survey without labels, of what another is sure of there"
+    takes = parser.command("adapt", _adapt, what, logged=True)
     takes("inputs", nargs="+", metavar="input", help=f"One survey's: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes("--model", required=True, help="The model file to write, for classify --model")
     takes("--teacher", default="standard", metavar="MODEL", help="The model that is asked; default standard")
     takes("--sure", type=float, default=0.7, metavar="SHARE", help="Least Reliability to be believed (0.7)")
     tiles.add_sizes(parser.commands["adapt"])
 
-    takes = parser.command(
-        "accuracy", _accuracy, "Compare two class dimensions, or two files", overrides=True, logged=True
-    )
+    what = "Compare two class dimensions, or two files"
+    takes = parser.command("accuracy", _accuracy, what, overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help=f"Classified: {INPUTS[0].lower()}{INPUTS[1:]}")
     takes("--reference", action="append", metavar="FILE", help="True classes of the same points, in order")
     takes("--model", help="Score this model on labeled files: a model file, or a shipped model's name")

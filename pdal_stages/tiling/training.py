@@ -65,18 +65,9 @@ def _lowered(given: Mapping[str, Any]) -> ClassifierModel:
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
-    """Name -> files of each survey.
+    """Name -> files of each survey; `grouped` are ``NAME=PATTERN``, and each file that is like none is its own.
 
-    Parameters
-    ----------
-    files : sequence of str
-    grouped : sequence of str
-        ``NAME=PATTERN``: files whose path or name is like the pattern are of that survey; each other one is its own.
-
-    Raises
-    ------
-    OptionError
-        If a group is not written so, or has no file, or a file is in two.
+    OptionError where a group is not written so, or has no file, or a file is in two.
     """
     out: dict[str, list[str]] = {}
     of: dict[str, str] = {}
