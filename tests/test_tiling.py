@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
 from pdal_stages.pipeline.inputs_outputs import locations
-from pdal_stages.synthetic.townfile import WKT
+from pdal_stages.synthetic.town import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling import TilingOptions, run_tiled
 from pdal_stages.tiling.classify import ClassifyTask, one_format

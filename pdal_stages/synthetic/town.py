@@ -1,18 +1,23 @@
-"""A generated town under a simulated flight: options and points."""
+"""A generated town under a simulated flight: options, points, a LAS or LAZ file."""
 
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import math
+import os
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
 from ..base import checks
-from ..base.errors import OptionError, suggest
+from ..base.errors import OptionError, StageError, suggest
+from ..base.files import whole_files
 from ..base.messages import Progress
 from ..base.resources import map_blocks
+from ..base.version import __version__
 from .districts import fill
 from .solids import VEGETATION, build_scene, cast
 from .townplan import block_at, heights, plan_town
@@ -28,7 +33,16 @@ SAMPLE = 20_000  # pulses that tell how many returns a pulse gives
 SIDEWAYS = 45.0  # meters a beam may travel between the highest thing and the lowest ground
 SPAN = 65.0  # meters a thing may stand out of its block: the wires to the next
 
-
+#: The reference system of a town's file.
+WKT = (
+    'PROJCS["ETRS89 / UTM zone 32N",GEOGCS["ETRS89",DATUM["European_Terrestrial_Reference_System_1989",'
+    'SPHEROID["GRS 1980",6378137,298.257222101,AUTHORITY["EPSG","7019"]],AUTHORITY["EPSG","6258"]],'
+    'PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],'
+    'AUTHORITY["EPSG","4258"]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0],'
+    'PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
+    'PARAMETER["false_northing",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],'
+    'AXIS["Northing",NORTH],AUTHORITY["EPSG","25832"]]'
+)
 #: Bounds of the options that have any.
 LIMITS = {"size": (20, 20_000), "density": (0.05, 500), "seed": (0, 2**31 - 1), "noise": (0, 0.5)}
 
@@ -208,3 +222,37 @@ def make_town(size=200.0, density=7.0, seed=1, *, threads=None, progress=True, *
     names = [f.name for f in dataclasses.fields(Town)][:-1]
     columns: dict = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names}
     return Town(**columns, options=options)
+
+
+def write_town(town: Town, path: str | os.PathLike) -> None:
+    """Write a town to a LAS or LAZ file (by its suffix), whole or not at all."""
+    import laspy
+
+    target = Path(path)
+    if target.suffix.lower() not in (".las", ".laz"):
+        raise OptionError("the output's name must end in .las or .laz", where="write_town", found=str(path))
+    if not len(town):
+        raise StageError(
+            "no pulse hit this town", where="synthetic", cure="Give a larger 'size' or 'density'"
+        )
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(np.array(town.options.origin))
+    header.creation_date = datetime.date(2020, 7, 1)  # fixed, so that the same town gives the same bytes
+    header.system_identifier, header.generating_software = "generated town", f"pdal-stages {__version__}"
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    header.global_encoding.wkt = True
+    header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", WKT.encode() + b"\0"))
+    las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(town), header=header))
+    las.X, las.Y, las.Z = np.round((town.xyz - header.offsets) * 1000.0).astype(np.int32).T
+    for name in (
+        "classification",
+        "intensity",
+        "return_number",
+        "number_of_returns",
+        "gps_time",
+        "point_source_id",
+    ):
+        las[name] = getattr(town, name)
+    las["scan_angle"] = np.round(town.scan_angle / 0.006).astype(np.int16)
+    with whole_files(target) as (part,), open(part, "wb") as file:
+        las.write(file, do_compress=target.suffix.lower() == ".laz")

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.arrays import begins_run
 from ..base.errors import StageError
 from .linked import number_sets
-from .openings import HOLE
 
 #: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
 _INDEX_LIMIT = 2**31 - 2
@@ -116,23 +115,6 @@ def levels(z: NDArray[np.float64], cell: NDArray[np.int64]) -> tuple[NDArray[np.
     rank[np.argsort(z)] = np.arange(len(z))
     order = np.argsort(cell * len(z) + rank)
     return order, begins_run(cell[order]) | (np.diff(z[order], prepend=-np.inf) > GAP)
-
-
-def heights_of(z: NDArray[np.float64], grid: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Height of each cell's lowest point, whose numbers the grid has."""
-    return np.where(grid >= 0, z[grid], HOLE).astype(np.float32)
-
-
-def places_of(x, y, z, cell: float, grid: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Place in the cell (from its center, in cells) and height of each cell's lowest point (h, w, 3)."""
-    place = np.zeros((*grid.shape, 3))
-    held = grid >= 0
-    point = grid[held]
-    for k, axis in enumerate((x, y)):
-        at = axis[point] / cell
-        place[held, k] = at - np.floor(at) - 0.5
-    place[held, 2] = z[point]
-    return place
 
 
 def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int) -> Iterator[_Piece]:

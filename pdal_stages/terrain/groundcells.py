@@ -18,7 +18,7 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.jit import njit
 from .belowground import pits, pits_reach
-from .cells import SIDE, cell_numbers, heights_of, keys_of, lowest_points, places_of
+from .cells import SIDE, cell_numbers, keys_of, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .openings import HOLE, objects_of, opening_radius
@@ -229,7 +229,7 @@ def ground_raster(
     lowest = np.full(shape, -1)
     lowest[row[low] - bottom, column[low] - left] = low
     cell = options.cell
-    raster = heights_of(z, lowest)
+    raster = np.where(lowest >= 0, z[lowest], HOLE).astype(np.float32)
     bad = pits(raster, cell)
     pit_points = lowest[bad]
     raster[bad] = HOLE
@@ -249,8 +249,12 @@ def ground_raster(
     del cut_out
     opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
     left, bottom, shape = left + (part[1].start or 0), bottom + (part[0].start or 0), raster.shape
-    place = places_of(x, y, z, cell, lowest)
-    on_deck = (deck != 0)[lowest] & (lowest >= 0)
+    held = lowest >= 0
+    low, place = lowest[held], np.zeros((*shape, 3))
+    for axis, (at, number) in enumerate(((x, column), (y, row))):
+        place[held, axis] = at[low] / cell - number[low] - 0.5
+    place[held, 2] = z[low]
+    on_deck = (deck != 0)[lowest] & held
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
 

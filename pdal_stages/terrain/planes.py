@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
+from .linked import sums_around
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
 #: ground of a fit lies to one side or on a line.
@@ -255,10 +256,4 @@ def around(
     """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose planes points blend."""
     held = np.zeros(shape, bool)
     held[row - bottom, column - left] = True
-    needed = held.copy()
-    needed[1:] |= held[:-1]
-    needed[:-1] |= held[1:]
-    held = needed.copy()
-    needed[:, 1:] |= held[:, :-1]
-    needed[:, :-1] |= held[:, 1:]
-    return needed
+    return sums_around(held, 1) > 0
