@@ -21,10 +21,10 @@ def reference(xyz, shares, rows, context):
         if token == OWN:
             columns.append(shares[rows] / WHOLE)
             continue
-        scale = context.scales[token]
-        cell = np.floor(xyz[:, : scale.axes] / scale.side)
+        side, axes, votes = context.scales[token]
+        cell = np.floor(xyz[:, :axes] / side)
         what = shares.astype(float)
-        if scale.votes:
+        if votes:
             what = np.eye(shares.shape[1])[shares.argmax(axis=1)] * WHOLE
         near = (np.abs(cell[rows][:, None] - cell[None]) <= 1).all(axis=2)
         means = [what[one].sum(axis=0) / (one.sum() * WHOLE) for one in near]

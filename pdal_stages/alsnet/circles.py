@@ -86,20 +86,15 @@ class Circles:
     def __len__(self) -> int:
         return len(self.centers)
 
-    def _near(self, x: float, y: float, radius: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
-        """Places in the canonical order of the points around (x, y), a few beyond `radius` too; squared distances."""
-        at = np.array(
-            self._tree.query_ball_point((x, y), radius * (1.0 + 1e-9), return_sorted=True), np.int64
-        )
-        return at, ((self._xy[at] - (x, y)) ** 2).sum(axis=1)
-
     def around(self, x: float, y: float, size: int | None = None) -> npt.NDArray[np.int64]:
         """Rows of the points nearest to a place in plan, at most `size` and none beyond ``reach``.
 
         In the canonical order. Of points equally far the first in that order are taken.
         """
         size = self.points if size is None else size
-        at, d2 = self._near(x, y, self.reach)
+        radius = self.reach * (1.0 + 1e-9)  # a few beyond too
+        at = np.array(self._tree.query_ball_point((x, y), radius, return_sorted=True), np.int64)
+        d2 = ((self._xy[at] - (x, y)) ** 2).sum(axis=1)
         at, d2 = at[d2 <= self.reach**2], d2[d2 <= self.reach**2]
         if len(at) > size:
             limit = np.partition(d2, size - 1)[size - 1]

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,14 +28,6 @@ CELLS = {"box": (3, False), "column": (2, False), "boxvotes": (3, True), "column
 
 #: The token of the point's own probabilities.
 OWN = "own"
-
-
-class Scale(NamedTuple):
-    """One token's cells."""
-
-    side: float
-    axes: int
-    votes: bool
 
 
 @dataclass(frozen=True)
@@ -54,8 +46,8 @@ class Context:
         return cls(tuple(dict.fromkeys(str(part).strip() for part in parts if str(part).strip())))
 
     @cached_property
-    def scales(self) -> dict[str, Scale]:
-        """Of the tokens that have cells."""
+    def scales(self) -> dict[str, tuple[float, int, bool]]:
+        """Of the tokens that have cells: side, and what :data:`CELLS` says."""
         found = {}
         for token in self.tokens:
             match = re.fullmatch(rf"({'|'.join(CELLS)})(\d+(?:\.\d+)?)", token)
@@ -67,13 +59,13 @@ class Context:
                     f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8",
                 )
             if match:
-                found[token] = Scale(float(match[2]), *CELLS[match[1]])
+                found[token] = (float(match[2]), *CELLS[match[1]])
         return found
 
     @property
     def strip(self) -> float:
         """Width in meters of strips such that a point's cells all lie in its own and the two beside it; 0 without cells."""
-        return max((scale.side for scale in self.scales.values()), default=0.0)
+        return max((side for side, _, _ in self.scales.values()), default=0.0)
 
     @property
     def reach(self) -> float:
@@ -99,8 +91,9 @@ class Context:
             Of each point; see :func:`count_shares`.
         """
 
-        def means(scale: Scale):
-            return cell_means(xyz[:, : scale.axes], shares, scale.side, scale.votes)
+        def means(scale: tuple[float, int, bool]):
+            side, axes, votes = scale
+            return cell_means(xyz[:, :axes], shares, side, votes)
 
         found = map_blocks(means, list(self.scales.values()), threads)
         cells, classes = dict(zip(self.scales, found, strict=True)), shares.shape[1]

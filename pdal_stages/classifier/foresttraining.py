@@ -25,7 +25,7 @@ from .forest import Forest, grow_forest
 from .model import Model
 from .passes import FoldForests, sample_context
 from .sampling import BLOCK, Folds, draw_samples, figures, split
-from .sureness import Sureness
+from .summary import Sureness
 from .trainoptions import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 
 #: Trees of a forest that judges a fold, as a share of the final one's.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -68,14 +69,6 @@ class FoldForests:
         return out
 
 
-@dataclass(frozen=True, eq=False)
-class _ContextOnly:
-    """A pass of which nothing but its context is wanted."""
-
-    context: Context
-    features: None = None
-
-
 def predict(
     passes: Sequence[Any],
     classes: Sequence[int],
@@ -105,7 +98,8 @@ def sample_context(
     """(m, columns): the context that some passes give the m points asked for, ascending."""
     asked: Any = request.rows
     out = np.empty((len(asked), len(context.tokens) * classes[-1]), np.float32)
-    run = PassRun([*passes, _ContextOnly(context)], [*classes, 0], request, [*factors, None])
+    last = SimpleNamespace(context=context, features=None)
+    run = PassRun([*passes, last], [*classes, 0], request, [*factors, None])
     for rows, columns in run.blocks(lambda columns, rows: columns):
         out[np.searchsorted(asked, rows)] = columns
     return out

@@ -20,7 +20,7 @@ from ..classifier.classes import ClassMap
 from ..classifier.foresttraining import SHORT
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import digest_of, find
-from ..classifier.sureness import of_the_base
+from ..classifier.summary import of_the_base
 from .base import Stage, files_read
 from .checked import SURE, CheckedChoice, Looked
 from .options import option

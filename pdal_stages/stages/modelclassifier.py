@@ -15,7 +15,7 @@ from ..base.messages import Progress
 from ..classifier import Model
 from ..classifier.model import UNCLASSIFIED, loaded_model
 from ..classifier.modelfile import find
-from ..classifier.sureness import Limit, Sureness, said, sureness_of
+from ..classifier.summary import Limit, Sureness, said, sureness_of
 from .base import Stage
 from .options import ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts
