@@ -37,8 +37,6 @@ from .weights import Weights, check, fresh
 #: Of a checkpoint: a file of PyTorch's own, read with ``weights_only`` (nothing in it is executed), and its SHA-256.
 FORMAT = "pdal-stages alsnet checkpoint 4"
 
-COORDINATES = ("X", "Y", "Z")
-
 optional_inputs: dict[str, tuple[str, ...]] = {}
 
 
@@ -50,11 +48,7 @@ def outputs(options: TrainingOptions) -> list[Output]:
 
 def own_options(given: Any) -> NetworkOptions:
     """The options of the network."""
-    return (
-        given
-        if isinstance(given, NetworkOptions)
-        else NetworkOptions.from_dict({} if given is None else given)
-    )
+    return given if isinstance(given, NetworkOptions) else NetworkOptions.from_dict(given or {})
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
@@ -71,23 +65,10 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     """See :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
     from .network import torch  # before any work: says what to install where it is missing
 
-    names = inputs(options)
-    xyz = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
-    known = label_classes(clouds, options)
-    dimensions = [name for name in names if name not in COORDINATES]
-    values: list[dict[str, npt.NDArray[Any]]] = []
-    for cloud, places in zip(clouds, xyz, strict=True):
-        there = with_returns(names, places, cloud.dimensions, options.threads)
-        values.append(gather(names, there, len(places), where=cloud.name))
-    position = np.concatenate([np.asarray(one) for _, one in known])
-    joined = {
-        name: np.concatenate([np.asarray(own[name], np.float64) for own in values]) for name in dimensions
-    }
-    threads = resolve_threads(options.threads)
-    before = torch.get_num_threads()
-    session = _Session(xyz, position, joined, names, known.classes, options.alsnet, options.seed, threads)
+    session = _Session(clouds, options)
+    known, position, before = session.labeled, session.position, torch.get_num_threads()
     try:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(session.threads)
         with torch.random.fork_rng(devices=[torch.cuda.current_device()] if session.device == "cuda" else []):
             net = session.run(progress)
     finally:
@@ -115,35 +96,32 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
 
 
 class _Session:
-    """One training: its data, the network, the optimizer, what has been reached.
+    """One training: its data, the network, the optimizer, what has been reached."""
 
-    Of all clouds, one after the other: `position` (n,) is the place of each point's class, -1 for those that are only
-    neighbors; `values` (n,) are those of the inputs that are dimensions.
-    """
-
-    def __init__(
-        self,
-        clouds: Sequence[npt.NDArray[np.float64]],
-        position: npt.NDArray[Any],
-        values: dict[str, npt.NDArray[np.float64]],
-        names: tuple[str, ...],
-        classes: ClassMap,
-        options: NetworkOptions,
-        seed: int,
-        threads: int,
-    ) -> None:
+    def __init__(self, clouds: Sequence[TrainingCloud], training: TrainingOptions) -> None:
         from .network import Network, torch
 
-        self.torch, self.clouds, self.position = torch, clouds, position
-        self.inputs, self.options = names, options
-        self.classes, self.seed, self.threads, self.n_classes = classes, seed, threads, len(classes.codes)
-        there = torch.cuda.is_available()
-        if options.device == "cuda" and not there:
+        self.torch, self.options, self.seed = torch, training.alsnet, training.seed
+        self.threads, self.inputs = resolve_threads(training.threads), inputs(training)
+        options, names = self.options, self.inputs
+        # Of all clouds, one after the other; the place of each point's class is -1 where it is only a neighbor.
+        self.clouds = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
+        self.labeled = label_classes(clouds, training)
+        self.position = position = np.concatenate([np.asarray(one) for _, one in self.labeled])
+        self.classes = classes = self.labeled.classes
+        self.n_classes = len(classes.codes)
+        each: list[dict[str, npt.NDArray[Any]]] = []
+        for cloud, xyz in zip(clouds, self.clouds, strict=True):
+            there = with_returns(names, xyz, cloud.dimensions, self.threads)
+            each.append(gather(names, there, len(xyz), where=cloud.name))
+        values = {name: np.concatenate([own[name] for own in each]).astype(np.float64) for name in each[0]}
+        cuda = torch.cuda.is_available()
+        if options.device == "cuda" and not cuda:
             raise DependencyError(
                 "'device' is cuda, but PyTorch sees no CUDA device",
                 cure="Install a CUDA build of PyTorch and the driver, or use device auto",
             )
-        self.device = "cuda" if there and options.device != "cpu" else "cpu"
+        self.device = "cuda" if cuda and options.device != "cpu" else "cpu"
         source = None if options.start_from is None else _source(options, names)
         self.mean: tuple[float, ...]
         self.scale: tuple[float, ...]
@@ -156,12 +134,12 @@ class _Session:
             self.mean, self.scale = source.algorithm.mean, source.algorithm.scale
         points = options.configuration.points
         self.spacing = options.spacing or spacing_for(
-            points, float(np.median([density(xyz) for xyz in clouds]))
+            points, float(np.median([density(xyz) for xyz in self.clouds]))
         )
-        self.xyz = batches.side_by_side(clouds, self.spacing)
+        self.xyz = batches.side_by_side(self.clouds, self.spacing)
         self.columns = scaled(self.xyz, values, names, self.mean, self.scale)
         self.circles = Circles(self.xyz, points, self.spacing, self.columns)
-        held = batches.hold_out(np.concatenate(clouds), position, options.validation, options.block_size)
+        held = batches.hold_out(np.concatenate(self.clouds), position, options.validation, options.block_size)
         self.train_labels = np.where(held, -1, position).astype(np.int64)
         self.held_labels = np.where(held, position, -1).astype(np.int64)
         count = np.bincount(self.train_labels[self.train_labels >= 0], minlength=self.n_classes)
@@ -174,7 +152,7 @@ class _Session:
         threshold = options.histogram_threshold
         self.chosen = batches.choose(self.circles, self.train_labels, self.n_classes, threshold)
         self.held_batches = batches.covering(self.circles, self.held_labels >= 0)
-        start = fresh(options.configuration, len(names), self.n_classes, seed)
+        start = fresh(options.configuration, len(names), self.n_classes, self.seed)
         if source is not None:
             start = _transfer(source, start, classes)
         self.network = Network(options.configuration, len(names), self.n_classes).load(start).to(self.device)
