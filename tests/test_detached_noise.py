@@ -52,42 +52,73 @@ def scene(seed=0, side=90, density=6.0, origin=(0.0, 0.0, 0.0)):
 # ---- a slow reference -----------------------------------------------------------------------------------
 
 
-def slow_small(count, usual, most):
-    """Voxels, as a mapping to their points, in small clusters; and points of each one's cluster."""
-    strong = {k for k, n in count.items() if n > int(detached.WEAK * usual(k))}
-    around = [d for d in product((-1, 0, 1), repeat=3) if any(d)]
-    near = lambda k: [(k[0] + a, k[1] + b, k[2] + c) for a, b, c in around]  # noqa: E731
-    small, size, seen = {}, {}, set()
-    for start in sorted(strong):  # by row, column, level: the first voxel stands for the component
+def slow_components(voxels):
+    """Lists of those that touch, the first by row, column and level at the head of each."""
+    seen = set()
+    for start in sorted(voxels):
         if start in seen:
             continue
         seen.add(start)
         members, queue = [start], deque([start])
         while queue:
-            for other in near(queue.popleft()):
-                if other in strong and other not in seen:
+            for other in slow_near(queue.popleft()):
+                if other in voxels and other not in seen:
                     seen.add(other)
                     members.append(other)
                     queue.append(other)
-        total = sum(count[m] for m in members)
+        yield members
+
+
+def slow_near(k):
+    return [
+        (k[0] + a, k[1] + b, k[2] + c) for a, b, c in product((-1, 0, 1), repeat=3) if (a, b, c) != (0, 0, 0)
+    ]
+
+
+def slow_small(count, usual, most, widest):
+    """Voxels, as a mapping to their points, in small clusters; points of each one's cluster; and the first of each one's
+    cluster with weak ones, None where it is wide."""
+    strong = {k for k, n in count.items() if n > int(detached.WEAK * usual(k))}
+    small, size, whole = {}, {}, {}
+    for members in slow_components(count.keys()):
+        extent = np.ptp(np.array(members)[:, :2], axis=0).max()
+        whole |= dict.fromkeys(members, members[0] if extent < widest else None)
+    for members in slow_components(strong):
+        start, total = members[0], sum(count[m] for m in members)
         extent = np.ptp(np.array(members), axis=0).max()
         widest = min(detached.EXTENT + detached.EXTENT_GROWTH * usual(start), detached.LARGEST_EXTENT)
         for m in members:
             small[m], size[m] = total <= most and extent < widest, total
     for k in count:
         if k not in strong:
-            small[k] = not any(o in strong and not small[o] for o in near(k))
+            small[k] = not any(o in strong and not small[o] for o in slow_near(k))
             size[k] = count[k]
-    return small, size
+    return small, size, whole
 
 
-def slow_plane(base, j, i, radius):
+def slow_covered(count, whole, spacing, most):
+    """Voxels of clusters that others lie above, in most of their columns; and those of more than `most` points."""
+    top, above = {}, defaultdict(list)
+    for k in sorted(count):
+        top[k[:2]] = k
+    for k in count:
+        if whole[k] is not None:
+            near = [n for n in range(3) if n < spacing(k) * detached.SPACINGS / SIDE + 0.5]
+            columns = product(range(-near[-1], near[-1] + 1), repeat=2)
+            tops = [top.get((k[0] + b, k[1] + a)) for b, a in columns]
+            above[whole[k]].append(any(t is not None and whole[t] != whole[k] for t in tops))
+    under = {c for c, seen in above.items() if np.mean(seen) >= detached.COVERED}
+    large = {c for c in under if sum(n for k, n in count.items() if whole[k] == c) > most}
+    return [{k for k in count if whole[k] in clusters} for clusters in (under, large)]
+
+
+def slow_plane(base, j, i, radius, inner=0):
     h, w = base.shape
     cells = [
         (a - i, b - j, base[b, a])
         for b in range(max(j - radius, 0), min(j + radius + 1, h))
         for a in range(max(i - radius, 0), min(i + radius + 1, w))
-        if 0 < (b - j) ** 2 + (a - i) ** 2 <= radius**2 and np.isfinite(base[b, a])
+        if inner**2 < (b - j) ** 2 + (a - i) ** 2 <= radius**2 and np.isfinite(base[b, a])
     ]
     n = len(cells)
     if n < belowground.ENOUGH:
@@ -138,7 +169,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
             known[key] = n / held, np.sqrt(blocks * (block * SIDE) ** 2 / n)
         return known[key]
 
-    small, size = slow_small(count, lambda k: density(k)[0], most)
+    small, size, cluster = slow_small(count, lambda k: density(k)[0], most, detached.LARGEST_EXTENT)
     for scale in range(1, detached.SCALES + 1):
         thin = [k for k in count if small[k] and density(k)[1] * detached.SPACINGS > SIDE * 2 ** (scale - 1)]
         if not thin:
@@ -147,15 +178,18 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         coarse = defaultdict(int)
         for k, n in count.items():
             coarse[wider(k)] += n
-        still, total = slow_small(coarse, lambda k: 1.0, most)
+        still, total, all_of = slow_small(coarse, lambda k: 1.0, most, detached.LARGEST_EXTENT >> scale)
         for k in thin:
             small[k], size[k] = still[wider(k)], total[wider(k)]
+            cluster[k] = all_of[wider(k)] and (scale, all_of[wider(k)])
+    covered, large = slow_covered(count, cluster, lambda k: density(k)[1], most)
     top, base = np.full((h, w), -np.inf), np.full((h, w), np.inf)
     lowest = {k: xyz[m, 2].min() for k, m in members.items()}
     highest = {k: xyz[m, 2].max() for k, m in members.items()}
     for k in count:
         if not small[k]:
             top[k[:2]] = max(top[k[:2]], highest[k])
+        if not small[k] and k not in covered:
             base[k[:2]] = min(base[k[:2]], lowest[k])
     hung = {}
     for c in full:
@@ -190,21 +224,22 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         if len(others) < detached.STRUNG or not thin:
             codes[k] = 18
     low = np.full((h, w), np.inf)
-    for k in count:
-        if small[k] and k not in codes:
-            low[k[:2]] = min(low[k[:2]], lowest[k])
+    lone = {k for k in count if small[k] or k in covered} - codes.keys()
+    for k in lone:
+        low[k[:2]] = min(low[k[:2]], lowest[k])
     limit = slow_below(low, base, SIDE, depth)
-    codes |= {k: 7 for k in count if small[k] and k not in codes and highest[k] < limit[k[:2]]}
+    codes |= {k: 7 for k in lone if highest[k] < limit[k[:2]]}
     out = np.array([codes.get(k, 0) for k in voxel], np.uint8)
     points, lows = np.zeros((2, h, w), np.int64)
     np.add.at(points, (at[:, 0], at[:, 1]), 1)
-    np.add.at(lows, (at[:, 0], at[:, 1]), out == 7)
+    bare = np.array([k not in large for k in voxel])
+    np.add.at(lows, (at[:, 0], at[:, 1]), (out == 7) & bare)
     for c in zip(*np.nonzero(lows), strict=True):
         near = np.maximum(abs(j - c[0]), abs(i - c[1])) <= 20
         held, filled = (lows[near] > 0).sum(), (points[near] > 0).sum()
         share = min(held / filled, lows[near].sum() / points[near].sum())
         if held >= detached.COLUMNS and share > detached.TOO_MANY:
-            out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7)] = 0
+            out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7) & bare] = 0
     return out
 
 
@@ -223,7 +258,7 @@ def slow_below(low, base, side, depth=1.0):
     for at in np.argwhere(deep):
         near = np.maximum(abs(j - at[0]), abs(i - at[1])) <= belowground.AROUND
         if supported[near].sum() <= belowground.CLOSED * filled[near].sum():
-            plane = slow_plane(deepest, *at, int(belowground.OTHERS / side))
+            plane = slow_plane(deepest, *at, int(belowground.OTHERS / side), int(belowground.APART / side))
             if plane and not low[tuple(at)] < plane[0] - depth - belowground.SCATTERS * plane[3]:
                 limit[tuple(at)] = -np.inf
     return limit
@@ -367,6 +402,47 @@ def test_a_ditch_and_a_pit_stay():
     z[np.abs(x - 40) < 1.0] -= 2.5
     z[np.hypot(x - 15, y - 15) < 4] -= 6
     assert not detached_noise(np.column_stack([x, y, z])).any()
+
+
+@pytest.mark.parametrize(("size", "across", "below"), [(128, 7, 22), (1000, 10, 10), (300, 2, 5)])
+@pytest.mark.parametrize("density", [0.5, 8.0])
+def test_clusters_of_any_size_under_the_ground_are_found(size, across, below, density):
+    xyz, _ = scene(2, 90, density)
+    rng = np.random.default_rng(size)
+    at = np.array(
+        [[10, 60, 0], [35, 70, 0], [32, 25, 0], [75, 75, 0]]
+    )  # land, land, under a house, under a wood
+    level = 0.15 * at[:, 0] + 2 * np.sin(at[:, 1] / 15)
+    clusters = [rng.uniform(-across / 2, across / 2, (size, 3)) + each for each in at]
+    for part, ground in zip(clusters, level, strict=True):
+        part[:, 2] += ground - below - part[:, 2].max() - 1
+    found = detached_noise(np.vstack([xyz, *clusters]))
+    assert (found[len(xyz) :] == 7).all()
+    changed = (found[: len(xyz)] == 7) & (detached_noise(xyz) == 0)
+    assert changed.sum() <= 2
+
+
+@pytest.mark.parametrize("what", ["basement", "well of light", "underpass", "terraces", "gorge", "quarry"])
+def test_true_low_places_are_no_noise(what):
+    """Each is bare above, wide, or has returns on the way down."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-60, 60, (2, 120_000))
+    z = rng.normal(0, 0.02, len(x))
+    if what == "basement":
+        z[np.maximum(abs(x), abs(y)) < 5] -= 6
+    elif what == "well of light":  # in a block of 100 m
+        z[np.maximum(abs(x), abs(y)) < 50] += 18
+        z[np.maximum(abs(x), abs(y)) < 2.5] -= 18
+    elif what == "underpass":  # lanes that go down in the open, under a street
+        z[abs(x) < 5] = -6 * np.clip((30 - abs(y)) / 15, 0, 1)[abs(x) < 5]
+        z[(abs(x) < 5) & (abs(y) < 8)] = 0
+    elif what == "terraces":
+        z -= 5 * np.floor(np.clip(x, 0, 40) / 10)
+    elif what == "gorge":
+        z -= 25 * (abs(x - 8 * np.sin(y / 20)) < 4)
+    else:
+        z[np.hypot(x, y) < 15] -= 20
+    assert not detached_noise(x, y, z).any()
 
 
 # ---- the stage ------------------------------------------------------------------------------------------

@@ -18,7 +18,11 @@ class DetachedNoise(ClassStage):
     summary = "Mark points and small clusters detached from everything as low and high noise"
     where_help = "Points outside are not marked but still serve as neighbors."
     cluster: int = option(
-        "integer", 60, "The most points of a cluster of noise", minimum=1, maximum=1_000_000
+        "integer",
+        60,
+        "The most points of a cluster of noise; one that others lie above may have more",
+        minimum=1,
+        maximum=1_000_000,
     )
     gap: float = option(
         "number",
@@ -45,7 +49,8 @@ class DetachedNoise(ClassStage):
 Marks echoes from below the ground (multiple reflections), birds, clouds and the sun, alone or in small clusters, in clouds
 of any density. Put it first: one echo 10 m below ground spoils a ground filter, and features, for many meters around.
 
-A point is suspect if it is of a cluster of at most `cluster` points that nothing joins to the rest of the cloud. A suspect
+A point is suspect if it is of a cluster of at most `cluster` points that nothing joins to the rest of the cloud, or of one
+of any size, at most 15 m wide, that lies under others in nearly all of its columns. A suspect
 that lies above all that is near by more than `gap` is high noise (18); one that lies below a plane under its
 surroundings by more than `depth` is low noise (7). Not marked are what hangs in line with others, as wires do; what is as
 deep as ground near by, as courtyards and wells of light are; what is more than a fortieth of all around, or under a closed

@@ -26,8 +26,8 @@ FAR, COMPANY, ROOM = 30.0, 4, 0.05
 #: A column of ground has so many others of its level, in meters, in the 5 x 5 round it, and such a share of those.
 SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
 #: A canopy is closed where at most such a share of the columns within so many around is level with others; low places there
-#: are compared within so many meters.
-CLOSED, AROUND, OTHERS = 1 / 3, 20, 45.0
+#: are compared within so many meters, but for the nearest, which may be of the same cluster.
+CLOSED, AROUND, OTHERS, APART = 1 / 3, 20, 45.0, 12.0
 #: Cells of a minimum grid are linked within so many cells, across a step of so many meters, and so many per meter of
 #: distance; an island has at most so many, and is no longer, in cells, along either axis.
 LINK, STEP, GRADE, MOST, EXTENT = 3, 0.35, 0.15, 30, 20
@@ -39,16 +39,16 @@ def reach(side: float) -> int:
 
 
 @device
-def _plane_under(base, j, i, radius):
-    """Plane (height at the column, per column across, along; scatter below it) under the columns round one, and how
-    many these are."""
+def _plane_under(base, j, i, radius, inner=0):
+    """Plane (height at the column, per column across, along; scatter below it) under the columns round one, between two
+    radii, and how many these are."""
     h, w = base.shape
     size = min(2 * radius + 1, h) * min(2 * radius + 1, w)
     u, v, zs = np.empty(size), np.empty(size), np.empty(size)
     n = 0
     for b in range(max(j - radius, 0), min(j + radius + 1, h)):
         for a in range(max(i - radius, 0), min(i + radius + 1, w)):
-            if (b - j) ** 2 + (a - i) ** 2 <= radius * radius and (b != j or a != i) and base[b, a] < np.inf:
+            if inner * inner < (b - j) ** 2 + (a - i) ** 2 <= radius * radius and base[b, a] < np.inf:
                 u[n], v[n], zs[n] = a - i, b - j, base[b, a]
                 n += 1
     if n < ENOUGH:
@@ -148,7 +148,7 @@ def _below_others(low, asked, side, depth, out):
     for j in range(low.shape[0]):
         for i in range(low.shape[1]):
             if asked[j, i]:
-                n, height, _, _, scatter = _plane_under(low, j, i, radius)
+                n, height, _, _, scatter = _plane_under(low, j, i, radius, int(APART / side))
                 out[j, i] = n < ENOUGH or low[j, i] < height - depth - SCATTERS * scatter
 
 

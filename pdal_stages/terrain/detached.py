@@ -5,8 +5,9 @@ extremes, so that no order of points and no tile matters:
 
 1. A point is suspect if it is of a small cluster that nothing joins to the rest: a component of voxels that touch, by a
    corner at least, with few points and little extent. In dense clouds, voxels with next to no points do not join others;
-   in thin ones, voxels are widened until they hold several spacings of points. What is not suspect gives every column of
-   the grid its lowest and its highest point.
+   in thin ones, voxels are widened until they hold several spacings of points. A cluster that lies under others in nearly
+   all of its columns may have any number of points. What is not suspect gives every column of the grid its lowest and its
+   highest point.
 2. A suspect is high noise if it lies above all that is near, by a gap. The thinner the cloud, the wider the gap and the
    way looked: a tree, or a mast, may be a single point there. What hangs in line with others, as wires do, stays.
 3. A suspect is low noise if it lies below the ground (:mod:`.belowground`).
@@ -57,6 +58,8 @@ FAR = 20
 STRUNG, ACROSS = 8, 0.13
 #: More than such a share of the points and of the columns within so many around, so many columns at least, is no noise.
 TOO_MANY, COLUMNS = 0.025, 6
+#: Low noise of any size has others above it in such a share of its voxels.
+COVERED = 0.8
 #: How far away, in meters, points can change what a point is: the halo a tile needs.
 REACH = (below_reach(SIDE) + FAR + 2) * SIDE + CLUSTER_REACH
 
@@ -81,7 +84,7 @@ def detached_noise(
     mask : array_like of bool, shape (n,), optional
         Points to look at; the others are as good as not there, and get 0.
     cluster : int, default 60
-        The most points of a cluster of noise.
+        The most points of a cluster of noise; one that others lie above may have more.
     gap : float, default 2.5
         How far above everything near high noise lies at least, meters; more in clouds below 3 points/m2.
     depth : float, default 1.0
@@ -130,13 +133,15 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     w, h = (-(-(int(v.max()) + 2 - start) // whole) * whole for v, start in ((column, left), (row, bottom)))
     voxels, voxel = Voxels.of(row - bottom, column - left, cell_numbers(z, SIDE), w)
     usual, spacing = surroundings(voxels)
-    suspect, size = small_clusters(voxels, usual, spacing, cluster)
+    suspect, size, number = small_clusters(voxels, usual, spacing, cluster)
     place = voxels.keys >> BITS
     lowest, highest = np.full(len(place), np.inf), np.full(len(place), -np.inf)
     np.minimum.at(lowest, voxel, z)
     np.maximum.at(highest, voxel, z)
     top, base, low = np.full(h * w, -np.inf), np.full(h * w, np.inf), np.full(h * w, np.inf)
-    np.minimum.at(base, place[~suspect], lowest[~suspect])
+    covered, large = _covered(place, number, voxels.counts, spacing, w, h * w, cluster)
+    plain = ~(suspect | covered)
+    np.minimum.at(base, place[plain], lowest[plain])
     np.maximum.at(top, place[~suspect], highest[~suspect])
     # The highest voxel of a column hangs, with nothing close beneath it, as a wire does.
     begins = np.append(begins_run(place), True)
@@ -145,20 +150,20 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     hung, verdict = np.full(h * w, np.nan), np.zeros(len(place), np.uint8)
     hung[place[hangs]] = highest[hangs]
     _high(place, lowest, suspect, size, spacing, top.reshape(h, w), hung.reshape(h, w), gap, verdict)
-    suspect &= verdict == 0
+    suspect = (suspect | covered) & (verdict == 0)
     np.minimum.at(low, place[suspect], lowest[suspect])
     limit = below_ground(low.reshape(h, w), base.reshape(h, w), SIDE, depth)
     low = suspect & (highest < limit.ravel()[place])
-    # Where more is low than noise is, it is none.
+    # Where more is low than noise is, it is none, but for large clusters under others.
     lows, points = (
-        np.bincount(place[of], voxels.counts[of], h * w).reshape(h, w) for of in (low, slice(None))
+        np.bincount(place[of], voxels.counts[of], h * w).reshape(h, w) for of in (low & ~large, slice(None))
     )
     share = [
         sums_around(few, AROUND) > TOO_MANY * sums_around(all_, AROUND)
         for few, all_ in ((lows, points), (lows > 0, points > 0))
     ]
     many = share[0] & share[1] & (sums_around(lows > 0, AROUND) >= COLUMNS)
-    verdict[low & ~many.ravel()[place]] = LOW
+    verdict[low & (large | ~many.ravel()[place])] = LOW
     return verdict[voxel]
 
 
@@ -193,8 +198,11 @@ def surroundings(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float6
     return points / full, np.sqrt(blocks * (BLOCK * SIDE) ** 2 / points)
 
 
-def _small(voxels: Voxels, usual: NDArray[np.float64], most: int) -> tuple[NDArray[np.bool_], NDArray]:
-    """Voxels of small components, and weak ones that no large component touches; points of each one's component."""
+def _small(
+    voxels: Voxels, usual: NDArray[np.float64], most: int, extent: int
+) -> tuple[NDArray[np.bool_], NDArray, NDArray]:
+    """Voxels of small components, and weak ones that no large component touches; points of each one's component; and its
+    number, weak ones joined as well, -1 where it is wider than `extent`, in voxels."""
     keys, number = voxels.keys, len(voxels.keys)
     strong = voxels.counts > (WEAK * usual).astype(np.int64)
     pairs = []
@@ -214,17 +222,20 @@ def _small(voxels: Voxels, usual: NDArray[np.float64], most: int) -> tuple[NDArr
     small[~strong] = True
     for weak, beside in ((one, other), (other, one)):
         small[weak[~strong[weak] & large[beside]]] = False
-    return small, size[label]
+    whole = np.empty(number, np.int64)
+    sides = longest_sides(whole, voxels.places[:2], number_sets(one, other, whole))
+    return small, size[label], np.where(sides[whole] < extent, whole, -1)
 
 
 def small_clusters(
     voxels: Voxels, usual: NDArray[np.float64], spacing: NDArray[np.float64], most: int
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which voxels are of clusters of at most `most` points that nothing joins to the rest, and points of each one's.
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Which voxels are of clusters of at most `most` points that nothing joins to the rest, points of each one's, and the
+    number of clusters that are not wide, whatever their size; -1 for none.
 
     `usual` and `spacing` are what :func:`surroundings` says.
     """
-    small, size = _small(voxels, usual, most)
+    small, size, number = _small(voxels, usual, most, LARGEST_EXTENT)
     row, column, level = voxels.places
     for scale in range(1, SCALES + 1):
         thin = small & (spacing * SPACINGS > SIDE * 2 ** (scale - 1))
@@ -233,9 +244,28 @@ def small_clusters(
         # With one empty column on every side.
         width = (voxels.width >> scale) + 2
         wider, of = Voxels.of((row >> scale) + 1, (column >> scale) + 1, level, width, voxels.counts)
-        still, total = _small(wider, np.ones(len(wider.keys)), most)
+        still, total, numbers = _small(wider, np.ones(len(wider.keys)), most, LARGEST_EXTENT >> scale)
         small[thin], size[thin] = still[of[thin]], total[of[thin]]
-    return small, size
+        number[thin] = np.where(numbers < 0, -1, numbers + number.max() + 1)[of[thin]]
+    return small, size, number
+
+
+def _covered(place, number, counts, spacing, width, columns, most):
+    """Voxels of clusters that others lie above in nearly all of their columns; and those of more than `most` points."""
+    top = np.full(columns, -1)
+    top[place] = np.arange(len(place))  # the last of a column is its highest
+    asked = np.flatnonzero(number >= 0)
+    place, number_of, spacings = place[asked], number[asked], spacing[asked] * SPACINGS / SIDE - 0.5
+    above = np.zeros(len(asked), bool)
+    for dj, di in product(range(-2, 3), repeat=2):
+        other = top[np.clip(place + dj * width + di, 0, columns - 1)]
+        near = max(abs(dj), abs(di)) < spacings + 1
+        above |= near & (other >= 0) & (number[other] != number_of)
+    mostly = np.bincount(number_of, above) >= COVERED * np.bincount(number_of)
+    covered, many = np.zeros((2, len(number)), bool)
+    covered[asked] = mostly[number_of]
+    many[asked] = (mostly & (np.bincount(number_of, counts[asked]) > most))[number_of]
+    return covered, many
 
 
 @njit
