@@ -52,13 +52,16 @@ def _highest(raster: NDArray[np.float32], squares: int, diamonds: int) -> NDArra
     padded = np.full((h + 2 * pad, w + 2 * pad), -HOLE)
     padded[pad : pad + h, pad : pad + w] = raster
     values, stride = padded.ravel(), w + 2 * pad
+    spare, n = np.empty_like(values), values.size
     side = 2 * squares + 1
     for step, length in ((1, side), (stride, side), (stride + 1, diamonds), (stride - 1, diamonds)):
         done = 1
         while done < length:
-            more = min(done, length - done) * step
-            values = np.maximum(values[:-more], values[more:])
-            done += min(done, length - done)
+            more = min(done, length - done)
+            n -= more * step
+            np.maximum(values[:n], values[more * step :][:n], out=spare[:n])
+            values, spare = spare, values
+            done += more
     start = pad * (stride + 1) - squares * (stride + 1) - max(diamonds - 1, 0) * stride
     size = (h - 1) * stride + w
 
@@ -67,8 +70,9 @@ def _highest(raster: NDArray[np.float32], squares: int, diamonds: int) -> NDArra
 
     out = shifted(0)
     if diamonds:
-        for by in (1, -1, stride, -stride):
-            out = np.maximum(out, shifted(by))
+        out = np.maximum(out, shifted(1), out=spare[:size])
+        for by in (-1, stride, -stride):
+            np.maximum(out, shifted(by), out=out)
     rows = np.lib.stride_tricks.as_strided(out, (h, w), (stride * out.itemsize, out.itemsize))
     return np.ascontiguousarray(rows)
 
