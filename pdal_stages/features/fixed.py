@@ -18,6 +18,9 @@ from .names import MOMENT_FEATURES
 from .plan import FeaturePlan, columns_of
 from .shapes import Axes, shapes_of, write_shapes
 
+#: Candidates are filled up to a multiple of so many, by points so far away, meters: a vector loop leaves none over.
+LANES, FAR = 8, 1e150
+
 
 class FixedRadius:
     """The fixed-radius neighborhoods of `plan` on `grid`, the sorted cloud; :meth:`fill` computes a block."""
@@ -116,13 +119,17 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
     window = np.empty((2 * reach + 1, 2 * reach + 2), np.int64)
     px, py, pz, keys = np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64)
     record = np.empty((1, 4), np.float32)
+    places = np.empty(2 * reach + 1, np.int64)
+    line, left = np.int64(0), np.int64(2**62)
     a = 0
     while a < len(qx):
         ix, iy = math.floor(qx[a] / cell), math.floor(qy[a] / cell)
         b = a + 1
         while b < len(qx) and math.floor(qx[b] / cell) == ix and math.floor(qy[b] / cell) == iy:
             b += 1
-        fill_window(grid[3], grid[4], grid[5], grid[6], iy, ix, reach, window)
+        on = iy == line and ix >= left
+        fill_window(grid[3], grid[4], grid[5], grid[6], iy, ix, reach, on, places, window)
+        line, left = iy, ix
         count = 0
         for k in range(len(radii)):
             if k == 0 or radii[k] != radii[k - 1]:
@@ -130,9 +137,14 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
                 for row in range(2 * reach + 1):
                     w = widths[k, row]
                     room += window[row, reach + w + 1] - window[row, reach - w] if w >= 0 else 0
-                if room > len(px):
-                    px, py, pz = np.empty(2 * room), np.empty(2 * room), np.empty(2 * room)
-                    keys = np.empty(2 * room, np.int64)
+                if room + LANES > len(px):
+                    size = 2 * room + LANES
+                    px, py, pz, keys = (
+                        np.empty(size),
+                        np.empty(size),
+                        np.empty(size),
+                        np.empty(size, np.int64),
+                    )
                 count = 0
                 for row in range(2 * reach + 1):
                     w = widths[k, row]
@@ -140,6 +152,9 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
                         first, last = window[row, reach - w], window[row, reach + w + 1]
                         copy_points(grid[0], grid[1], grid[2], first, last, px, py, pz, keys, count)
                         count += last - first
+                while count % LANES:
+                    px[count], py[count], pz[count], keys[count] = FAR, FAR, FAR, 0
+                    count += 1
             r2 = radii[k] * radii[k]
             for q in range(a, b):
                 sums_within(px, py, pz, keys, count, qx[q], qy[q], qz[q], spherical[k], r2, table[k], q)
@@ -154,10 +169,11 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
 
 
 @device
-def fill_window(cell_ix, cell_start, row_iy, row_start, iy, ix, reach, window):
+def fill_window(cell_ix, cell_start, row_iy, row_start, iy, ix, reach, on, places, window):
     """Fill where points begin in the cells round (iy, ix).
 
-    ``window[k, c]`` becomes the first point of row ``iy - reach + k`` whose column is not below ``ix - reach + c``.
+    ``window[k, c]`` becomes the first point of row ``iy - reach + k`` whose column is not below ``ix - reach + c``, and
+    ``places[k]`` the first cell of these; where it goes `on`, from a cell to the left, rows are followed from there.
     """
     row = np.searchsorted(row_iy, iy - reach)
     for k in range(2 * reach + 1):
@@ -165,7 +181,10 @@ def fill_window(cell_ix, cell_start, row_iy, row_start, iy, ix, reach, window):
             window[k] = 0
             continue
         first, last = row_start[row], row_start[row + 1]
-        at = first + np.searchsorted(cell_ix[first:last], ix - reach)
+        at = places[k] if on else first + np.searchsorted(cell_ix[first:last], ix - reach)
+        while at < last and cell_ix[at] < ix - reach:
+            at += 1
+        places[k] = at
         for c in range(2 * reach + 2):
             while at < last and cell_ix[at] < ix - reach + c:
                 at += 1

@@ -128,9 +128,7 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
     """
     n = len(xyz)
     key, width, x0, y0, ranks = _keys(xyz, cell)
-    order = np.lexsort((xyz[:, 2], xyz[:, 1], xyz[:, 0], key))
-    if n < 2**31:
-        order = order.astype(np.int32)
+    order = _sorted(xyz, key, cell)
     key = key[order]
     starts = np.flatnonzero(begins_run(key))
     cells = key[starts]
@@ -155,6 +153,20 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
         row_iy=iy[rows],
         row_start=np.concatenate((rows, [len(ix)])).astype(np.int64),
     )
+
+
+def _sorted(xyz: np.ndarray, key: np.ndarray, cell: float) -> np.ndarray:
+    """Order of the points by cell and coordinates: by one number of cell and x first, of which few are equal."""
+    bits = min(62 - int(key.max(initial=0)).bit_length(), 30)
+    x = xyz[:, 0] * (1.0 / cell)
+    fine = (key << np.uint64(bits)) + np.floor((x - np.floor(x)) * 2.0**bits).astype(np.uint64)
+    order = np.argsort(fine)
+    fine = fine[order]
+    begins = begins_run(fine)
+    tied = np.flatnonzero(~(begins & np.append(begins[1:], True)))
+    again = order[tied]
+    order[tied] = again[np.lexsort((xyz[again, 2], xyz[again, 1], xyz[again, 0], fine[tied]))]
+    return order.astype(np.int32) if len(order) < 2**31 else order
 
 
 def _keys(xyz: np.ndarray, cell: float):
