@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from .errors import StageError
 from .version import __version__
@@ -75,17 +75,15 @@ class Progress(AbstractContextManager):
     def __init__(self, total: int, label: str, unit: str = "points", *, enabled: bool | None = None) -> None:
         self.total, self.label, self.unit = int(total), label, unit
         # filters.python redirects sys.stdout, never stderr: stderr is always the user's.
-        self.stream = sys.__stderr__
+        self.stream = cast(Any, sys.__stderr__)
         wanted = os.environ.get("PDAL_STAGES_PROGRESS", "1")
-        silenced = enabled is False or wanted == "0"
-        self.enabled = self.stream is not None and not silenced
+        self.enabled = self.stream is not None and enabled is not False and wanted != "0"
         self.count = 0
         self.started = time.monotonic()
-        self._terminal = self.stream is not None and self.enabled and self.stream.isatty()
+        self._terminal = self.enabled and wanted != "lines" and self.stream.isatty()
+        self._every = 0.2 if self._terminal else 15.0
         if wanted == "lines":
-            self._terminal, self._every, self.delay = False, 1.0, 0.5
-        else:
-            self._every = 0.2 if self._terminal else 15.0
+            self._every, self.delay = 1.0, 0.5
         self._next = self.started + self.delay
         self._shown = False
 
@@ -110,8 +108,6 @@ class Progress(AbstractContextManager):
             text += f", {seconds:.1f} s"
         elif self.total and 100 * self.count >= self.total:  # before, it is mostly what starting took
             text += f", {duration(max(self.total - self.count, 0) / rate)} left"
-        if self.stream is None:
-            return
         try:
             self.stream.write(f"\r{text}\x1b[K" if self._terminal else f"{text}\n")
             self.stream.flush()
@@ -121,7 +117,7 @@ class Progress(AbstractContextManager):
 
     def clear(self) -> None:
         """Take the line away, for something else to be printed; it comes back when it is due."""
-        if self._terminal and self._shown and self.stream is not None and self.enabled:
+        if self._terminal and self._shown and self.enabled:
             self.stream.write("\r\x1b[K")
             self.stream.flush()
 
@@ -129,7 +125,7 @@ class Progress(AbstractContextManager):
         """Draw the last state, if anything was drawn at all."""
         if self._shown and self.enabled:
             self._draw(time.monotonic(), end=True)
-            if self._terminal and self.stream is not None:
+            if self._terminal:
                 self.stream.write("\n")
         self.enabled = False
 

@@ -16,7 +16,7 @@ from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
-from ..base.files import HTML, JSON, Output, check_writable, write_whole
+from ..base.files import HTML, JSON, Output, write_whole
 from ..base.messages import Report, plain
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
@@ -114,8 +114,6 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
 
     def check(self) -> None:
         Merge.parse(self.merge)
-        for output in self.outputs():
-            check_writable(output.path, output.what, output.kind)
         if self.model_file:
             loaded_model(self.model_file)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.files import Output
+from ..base.files import Output, check_writable
 from ..base.units import named_unit
 from .options import Option, option, parse_options
 from .points import Points
@@ -111,6 +111,8 @@ class Stage(ABC):
                     named_unit(self.options[name], name)
             self._condition = None if self.where is None else Expression(self.where)
             self.check()
+            for output in self.outputs():
+                check_writable(output.path, output.what, output.kind)
         except StageError as error:
             raise error.within(place or self.type) from None
 

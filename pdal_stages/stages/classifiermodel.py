@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import ModelError, OptionError
-from ..base.files import MODEL, Output, check_writable
+from ..base.files import MODEL, Output
 from ..base.messages import Report
 from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
 from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, required, trainer, welcome
@@ -201,8 +201,6 @@ classes.
             )
         if self.training.classes is not None:
             ClassMap.parse(self.training.classes)
-        for output in self.outputs():
-            check_writable(output.path, output.what, output.kind)
 
     def outputs(self) -> list[Output]:
         return [Output(self.filename, "model", MODEL), *self._trainer.outputs(self.training)]
