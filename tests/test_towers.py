@@ -19,8 +19,8 @@ from pdal_stages.terrain.wires import find_wires
 
 
 @functools.cache
-def scene(name, density=8.0):
-    xyz, codes = CORRIDORS[name](density)
+def scene(name):
+    xyz, codes = CORRIDORS[name](8.0 if name == "highest voltage" else 4.0)  # whose towers are wide
     height = filtered_ground(xyz)["HeightAboveGround"]
     return xyz, codes, height, find_wires(xyz, height, np.ones(len(xyz), bool))
 
