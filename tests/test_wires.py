@@ -135,7 +135,7 @@ def test_degenerate_clouds_and_points_left_out():
 
 
 def test_a_street_of_poles_in_the_town():
-    town = ps.synthetic.make_town(200.0, 8.0, 4, progress=False)
+    town = ps.synthetic.make_town(150.0, 6.0, 4, progress=False)
     wire = find_wires(town.xyz, town.height_above_ground.astype(float), town.classification != 7)
     assert f1(wire, town.classification == 14) > 0.85
     assert (wire & ~np.isin(town.classification, (14, 15))).sum() < 0.0005 * len(wire)
