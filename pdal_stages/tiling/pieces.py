@@ -62,12 +62,9 @@ def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]
     """Write points uncompressed, with the header of the file that they are from."""
     import laspy
 
-    try:
-        with laspy.open(path, mode="w", header=copy.deepcopy(header), do_compress=False) as writer:
-            for block in records:
-                writer.write_points(laspy.PackedPointRecord(block, header.point_format))
-    except OSError as error:
-        raise StageError("a temporary file could not be written", where=path, found=error) from error
+    with laspy.open(path, mode="w", header=copy.deepcopy(header), do_compress=False) as writer:
+        for block in records:
+            writer.write_points(laspy.PackedPointRecord(block, header.point_format))
 
 
 # ---- the copy, sorted by place -------------------------------------------------------------------------------
@@ -86,35 +83,27 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     tiles: Counter[tuple[int, int]] = Counter()
     found = []
     total = 0
-    try:
-        with open(f"{target}.partial", "wb") as out:
-            for records in record_blocks(path, most=_PART):
-                x, y = coordinates(records, header)
-                low = np.minimum(low, (x.min(), y.min()))
-                high = np.maximum(high, (x.max(), y.max()))
-                column, line = cells.index(x), cells.index(y)
-                order = np.lexsort((column, line))
-                column, line = column[order], line[order]
-                starts = np.flatnonzero(begins_run(column) | begins_run(line))
-                rows = np.empty(len(records), dtype)
-                rows["number"] = total + order
-                rows["record"] = records[order]
-                out.write(rows.tobytes())
-                counts = np.diff([*starts, len(order)])
-                made = np.column_stack([column[starts], line[starts], total + starts, counts]).tolist()
-                for i, j, _, number in made:  # cells divide tiles exactly: powers of two do in floats
-                    tiles[i // _CELLS, j // _CELLS] += number
-                check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
-                found += made
-                total += len(records)
-        os.replace(f"{target}.partial", target)
-    except OSError as error:
-        raise StageError(
-            "the points could not be copied into the run's folder",
-            where=path,
-            found=f"{target}: {error.strerror or error}",
-            cure="Make room on the disk: --dry-run says how much is needed",
-        ) from error
+    with open(f"{target}.partial", "wb") as out:
+        for records in record_blocks(path, most=_PART):
+            x, y = coordinates(records, header)
+            low = np.minimum(low, (x.min(), y.min()))
+            high = np.maximum(high, (x.max(), y.max()))
+            column, line = cells.index(x), cells.index(y)
+            order = np.lexsort((column, line))
+            column, line = column[order], line[order]
+            starts = np.flatnonzero(begins_run(column) | begins_run(line))
+            rows = np.empty(len(records), dtype)
+            rows["number"] = total + order
+            rows["record"] = records[order]
+            out.write(rows.tobytes())
+            counts = np.diff([*starts, len(order)])
+            made = np.column_stack([column[starts], line[starts], total + starts, counts]).tolist()
+            for i, j, _, number in made:  # cells divide tiles exactly: powers of two do in floats
+                tiles[i // _CELLS, j // _CELLS] += number
+            check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
+            found += made
+            total += len(records)
+    os.replace(f"{target}.partial", target)
     box = [*low.tolist(), *high.tolist()]
     return {"count": total, "box": box, "tiles": [(*t, n) for t, n in sorted(tiles.items())], "cells": found}
 
@@ -135,13 +124,10 @@ def points_near(path: str, index: CloudIndex, grid: TileGrid, box: Box) -> tuple
     near = index.cells[(i >= i0) & (i <= i1) & (j >= j0) & (j <= j1)]
     dtype = _copy_type(header)
     parts = [np.empty(0, dtype)]
-    try:
-        with open(index.copy, "rb") as file:
-            for _, _, first, count in near.tolist():
-                file.seek(first * dtype.itemsize)
-                parts.append(np.fromfile(file, dtype, count))
-    except OSError as error:
-        raise StageError("the copy of an input cannot be read", where=path, found=error) from error
+    with open(index.copy, "rb") as file:
+        for _, _, first, count in near.tolist():
+            file.seek(first * dtype.itemsize)
+            parts.append(np.fromfile(file, dtype, count))
     rows = np.concatenate(parts)
     x, y = coordinates(rows["record"], header)
     rows = rows[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]

@@ -41,40 +41,21 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class TilingOptions:
-    """How a pipeline is run in tiles.
+    """How a pipeline is run in tiles."""
 
-    Attributes
-    ----------
-    tile : float, optional
-        Side of a tile, in the unit of the coordinates. By default as large as the memory allows.
-    workers : int, optional
-        Worker processes; 0 works in this process. Default: one for every two cores.
-    scheduler : str
-        Address of a running Dask scheduler (``tcp://host:8786``) instead of processes on this machine.
-    per : str
-        ``file`` writes one output for each input file, in that file's order of points; ``tile`` one for each
-        tile; ``auto`` is ``file`` for LAS and LAZ inputs and ``tile`` for others.
-    buffer : float, optional
-        Meters of halo each tile is read with, for PDAL filters that look at neighbors; it is added
-        to what our stages ask for.
-    memory : int, optional
-        Bytes that all processes of this machine together may hold; of a run on a scheduler, each worker. Default: half of
-        what is free.
-    resume : bool
-        Keep what an earlier run finished.
-    most_points : int
-        A tile whose neighborhoods turn out to reach farther than its halo is read again with a
-        wider one, up to so many points.
-    """
-
+    #: side of a tile, in the unit of the coordinates; by default as large as the memory allows
     tile: float | None = None
-    workers: int | None = None
+    workers: int | None = None  #: processes, 0 works in this one; default: one for every two cores
+    #: address of a running Dask scheduler, ``tcp://host:8786``, instead of processes on this machine
     scheduler: str = ""
+    #: ``file``: one output for each input, in its order of points; ``tile``: one for each; ``auto``: file, but for EPT
     per: str = "auto"
+    #: meters of halo for PDAL filters that look at neighbors, beside what our stages ask for
     buffer: float | None = None
+    #: bytes that all processes here together may hold, of a run on a scheduler each worker; default: half of what is free
     memory: int | None = None
-    resume: bool = False
-    most_points: int = 5_000_000
+    resume: bool = False  #: keep what an earlier run finished
+    most_points: int = 5_000_000  #: a tile that has to look farther is read again with up to so many points
 
     def __post_init__(self) -> None:
         # 20 and 20.0 are one run
