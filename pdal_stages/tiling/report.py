@@ -45,9 +45,8 @@ class Job:
     points: int = 0  #: its own; 0 where not known before it is read
     tile: tuple[int, int] = (0, 0)  #: of a tile or block: column and row
     source: InputSource | None = None  #: the input that an output is of
-    outputs: list[str] | None = (
-        None  #: what the writers write; None for a tile whose points go into outputs of files
-    )
+    #: what the writers write; None for a tile whose points go into outputs of files
+    outputs: list[str] | None = None
     jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is put together from
     mark: str = ""  #: fingerprint of all that decides its result
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
