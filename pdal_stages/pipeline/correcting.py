@@ -32,16 +32,8 @@ def write_corrections(
 
     All else stays as it is in `before`, whatever the program of the person dropped.
 
-    Parameters
-    ----------
-    before, output : str
-        The file as it was classified, and where the marked points go.
-    after : str
-        The same points as a person left them; empty for none.
-    areas : sequence of str
-        Files of polygons inside of which all was looked at, and what was not changed is right.
-    around : float
-        Meters around a changed point within which all was looked at.
+    `after` is a file of the same points as a person left them, empty for none; `areas` are files of polygons inside of which
+    all was looked at, and what was not changed is right; so is all within `around` meters of a changed point.
     """
     import laspy
 

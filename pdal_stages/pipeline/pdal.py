@@ -116,13 +116,9 @@ _one_run = threading.RLock()
 def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
-    try:
-        text = json.dumps(adapted(stages))
-    except (TypeError, ValueError) as error:  # a pipeline of Python objects that are not JSON
-        raise PipelineError("the pipeline contains values JSON cannot represent", found=str(error)) from None
     pipeline = None
     try:
-        pipeline = pdal.Pipeline(text, loglevel=loglevel)
+        pipeline = pdal.Pipeline(json.dumps(adapted(stages)), loglevel=loglevel)
         count = pipeline.execute()
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         keep(stdout)

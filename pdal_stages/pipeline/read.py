@@ -150,7 +150,7 @@ def _checked(source: PipelineSource) -> PipelineSource:
 def _check_values(stage: Any, where: str) -> None:
     """Refuse what PDAL cannot be given: it takes UTF-8 without NUL, and numbers that a double holds."""
     try:
-        text = json.dumps(stage, allow_nan=False, ensure_ascii=False, default=str)
+        text = json.dumps(stage, allow_nan=False, ensure_ascii=False)
         text.encode()
         if "\\u0000" in text.replace("\\\\", ""):  # a backslash before it makes it a text
             raise ValueError("a text holds a NUL character")
@@ -158,7 +158,7 @@ def _check_values(stage: Any, where: str) -> None:
         found = ascii(error.object[max(0, error.start - 40) : error.end])
         cure = "If it is a file's name, rename the file"
         raise PipelineError("a text is not valid UTF-8", where=where, found=found, cure=cure) from None
-    except (ValueError, RecursionError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise PipelineError("a stage holds what PDAL cannot be given", where=where, found=error) from None
 
 
