@@ -193,11 +193,8 @@ def write_layers(
     check_target(path, list(layers))
     driver, many = DRIVERS[Path(path).suffix.lower()]
     files = target_files(path, list(layers))
-    styles = (
-        styles
-        if styles is not None
-        else {name: verdict_style(layer.kind, name) for name, layer in layers.items()}
-    )
+    if styles is None:
+        styles = {name: verdict_style(layer.kind, name) for name, layer in layers.items()}
     beside = [] if many else [file.with_suffix(".qml") for file in files]
     with whole_files(*files, *beside, what="objects") as parts:
         for number, (name, layer) in enumerate(layers.items()):
@@ -206,8 +203,6 @@ def write_layers(
                 parts[number + len(files)].write_text(styles[name], encoding="utf-8")
         if many:
             _write_styles(parts[0], styles)
-        for number, (name, layer) in enumerate(layers.items()):
-            _check_whole(parts[0 if many else number], name if many else None, layer)
     return files
 
 
@@ -221,7 +216,9 @@ def write_objects(
 
 
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
+    """Write a layer, and count what was written: GDAL goes on after some writes that fail."""
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
+    named = name if driver == "GPKG" else None
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
@@ -234,21 +231,13 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
                 driver=driver,
                 geometry_type=layer.kind,
                 crs=wkt or None,
-                layer=name if driver == "GPKG" else None,
+                layer=named,
             )
+        found = pyogrio.read_info(path, layer=named, force_feature_count=True)["features"]
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
         raise StageError("objects could not be written", found=str(error)) from None
-
-
-def _check_whole(path: Path, name: str | None, layer: Layer) -> None:
-    """Read back what was written: GDAL goes on after some writes that fail."""
-    pyogrio = vector("pyogrio")
-    try:
-        found = pyogrio.read_info(path, layer=name, force_feature_count=True)["features"]
-        lost = f"{found:,} of {len(layer.shapes):,} {name or ''}" if found != len(layer.shapes) else ""
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
-        lost = str(error)
-    if lost:
+    if found != len(layer.shapes):
+        lost = f"{found:,} of {len(layer.shapes):,} {name}"
         raise StageError("objects could not be written completely", found=lost, cure="Make room on the disk")
 
 
