@@ -41,23 +41,10 @@ def named_files(stages: list[dict[str, Any]]) -> list[str]:
     """Files there are that options of PDAL's stages name, whichever the options: polygons, rasters, scripts."""
     found: list[str] = []
     for stage in stages:
-        own = ("filename",) if is_writer(stage, stages) else ()
-        for name, value in stage.items():
-            if name not in (*_NO_FILES, *own):
-                found += [
-                    file
-                    for text in _texts(value)
-                    if "\0" not in text and os.path.isfile(text)
-                    for file in _parts(text)
-                ]
+        own = (*_NO_FILES, *(("filename",) if is_writer(stage, stages) else ()))
+        texts = _texts({name: value for name, value in stage.items() if name not in own})
+        found += [text for text in texts if "\0" not in text and os.path.isfile(text)]
     return found
-
-
-def _parts(name: str) -> list[str]:
-    """A file and those beside it that belong to it: a Shapefile is several."""
-    stem, suffix = os.path.splitext(name)
-    others = (".dbf", ".shx", ".prj", ".cpg") if suffix.lower() == ".shp" else ()
-    return [name, *(stem + other for other in others if os.path.isfile(stem + other))]
 
 
 def _texts(value: Any) -> Iterator[str]:
