@@ -79,16 +79,8 @@ def roof_cells(high: NDArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
 def continued(high: NDArray, leaves: NDArray, thick: NDArray, size: float, reach: int) -> NDArray:
     """Heights of roofs, gone on into cells of vegetation that lie in their planes: what a classifier took for leaves.
 
-    Parameters
-    ----------
-    high, leaves : (r, c) float64
-        Height of the highest point of a roof, and of vegetation, in each cell; NaN where there is none.
-    thick : (r, c) float64
-        How far the lowest point of vegetation in each cell lies below the highest.
-    size : float
-        Side of a cell, meters.
-    reach : int
-        How many cells far at most.
+    `high` and `leaves` (r, c) are heights of the highest point of a roof, and of vegetation, in each cell, meters, NaN for
+    none; `thick` is how far the lowest point of vegetation lies below. It goes on by `reach` cells of `size` meters.
     """
     for _ in range(reach):
         east, north, above, scatter = planes(high, np.where(np.isnan(high), leaves, np.nan), size, 1.0)
@@ -106,15 +98,8 @@ def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
     """Heights of roofs with the holes filled from which nothing came back, neither roof nor ground: dark or wet ones.
 
     A hole is filled where nearly all around it is roof, at nearly one height, and no cell of it lies more than `reach`
-    cells from the rim.
-
-    Parameters
-    ----------
-    high : (r, c) float64
-        Height of the highest point of a building in each cell, NaN where there is none.
-    seen : (r, c) bool
-        Whether points of the ground or of vegetation lie in the cell.
-    reach : int
+    cells from the rim. `high` (r, c) is the height of a building's highest point, meters, NaN for none; `seen` (r, c) says
+    where points of ground or vegetation lie.
     """
     out, empty = high.copy(), np.isnan(high) & ~seen
     holes, count = scipy.ndimage.label(empty)

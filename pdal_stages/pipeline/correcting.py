@@ -170,17 +170,9 @@ def partners(
 ) -> NDArray[np.int64]:
     """For each point of `before` its place in `after`, -1 where there is none; each of `after` is taken once.
 
-    Parameters
-    ----------
-    before, after : (n, 3) and (m, 3) float64
-        Coordinates.
-    step : float
-        What coordinates are whole numbers of, the coarser of both files.
-    more : sequence of pairs of arrays
-        Values that tell points of one place apart: times, return numbers, then classes. Values that no longer agree only
-        change which of them are paired.
-    apart : float
-        Points that have no partner at their place take the nearest left within this distance.
+    Coordinates, (n, 3) and (m, 3), are whole numbers of `step`, the coarser of both files'. Pairs of arrays, `more`, tell
+    points of one place apart: times, return numbers, then classes; values that no longer agree only change which of them
+    are paired. Points without a partner at their place take the nearest that is left within `apart`.
     """
     from scipy.spatial import cKDTree
 

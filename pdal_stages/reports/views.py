@@ -176,14 +176,7 @@ def triptych(
 ) -> np.ndarray:
     """Heights, classes and errors (wrong points red) side by side, (height, width, 3) uint8.
 
-    Parameters
-    ----------
-    x, y, z : (n,) float
-    predicted : (n,) integer
-    truth : (n,) integer, optional
-        Reference classes; without them there is no panel of errors.
-    width : int
-        Pixels across all panels, about.
+    Without `truth`, the reference classes (n,), there is no panel of errors; `width` is of all panels, about, in pixels.
     """
     panels = 2 if truth is None else 3
     s = surface(x, y, z, (int(width) - _GAP * (panels - 1)) // panels)
