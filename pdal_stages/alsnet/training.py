@@ -20,9 +20,9 @@ from ..base.errors import DependencyError, ModelError, OptionError
 from ..base.files import CHECKPOINT, Output, write_whole
 from ..base.messages import Progress
 from ..base.resources import map_blocks, resolve_threads
-from ..classifier.algorithms import gather, versions, with_returns
+from ..classifier.algorithms import gather, with_returns
 from ..classifier.classes import ClassMap
-from ..classifier.clouds import TrainingCloud, densities, density, label_classes, listed
+from ..classifier.clouds import TrainingCloud, density, label_classes
 from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.trainoptions import TrainingOptions
@@ -74,23 +74,10 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     finally:
         torch.set_num_threads(before)
     count = np.bincount(position[position >= 0], minlength=len(known.classes.codes))
-    info: dict[str, Any] = {
-        **known.described(
-            options, ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
-        ),
-        "training": {
-            "clouds": listed(clouds),
-            "count": int(count.sum()),
-            "seed": options.seed,
-            "samples": int(count.sum()),
-            **session.notes(),
-        },
-        "densities": densities(clouds),
-        "voxel": options.voxel,
-        "accuracy": {"cross_validation": None},
-        "passes": [{"importances": None}],
-        "created_by": versions("numpy", "torch"),
-    }
+    counts = ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
+    every = int(count.sum())
+    training = {"count": every, "seed": options.seed, "samples": every, **session.notes()}
+    info = known.described(options, counts, training, [None], ("numpy", "torch"))
     classes = list(zip(known.classes.codes, known.classes.names, strict=True))
     return Model((net,), classes, info)
 

@@ -11,10 +11,8 @@ which yields (rows, what `finish` made of their probabilities) block by block. W
 from __future__ import annotations
 
 import pkgutil
-import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +21,6 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import DimensionError, ModelError
 from ..base.messages import Report
-from ..base.version import __version__
 from ..features import returns
 from ..features.index import CellGrid
 
@@ -148,12 +145,6 @@ def algorithm(name: str) -> Any:
 def trainer(name: str) -> Any:
     """What trains a kind, one of :data:`ALGORITHMS`."""
     return pkgutil.resolve_name(ALGORITHMS[name][1])
-
-
-def versions(*packages: str) -> dict[str, str]:
-    """Of this package, Python and others, for a manifest."""
-    used = {name: metadata.version(name) for name in packages}
-    return {"pdal_stages": __version__, "python": platform.python_version(), **used}
 
 
 def required(names: Iterable[str]) -> tuple[str, ...]:

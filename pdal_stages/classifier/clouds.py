@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import platform
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from ..base.arrays import begins_run, hash_of
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
 from ..base.messages import Progress
+from ..base.version import __version__
 from ..features.cells import cell_keys
 from ..features.voxels import represent
 from .algorithms import known
@@ -226,8 +229,17 @@ class Labeled:
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
         return (self[number] for number in range(len(self)))
 
-    def described(self, options: TrainingOptions, counts: Iterable[Mapping[str, int]]) -> dict[str, Any]:
-        """What a manifest says of the task and of each class, whose samples `counts` tells."""
+    def described(
+        self,
+        options: TrainingOptions,
+        counts: Iterable[Mapping[str, int]],
+        training: Mapping[str, Any],
+        importances: Iterable[Sequence[float] | None],
+        packages: Iterable[str],
+        crossed: Mapping[str, Any] | None = None,
+        **more: Any,
+    ) -> dict[str, Any]:
+        """What a manifest says: `counts` of each class's samples, `importances` of each pass, `crossed` is the score."""
         classes = zip(self.classes.codes, self.classes.names, self.classes.labels, counts, strict=True)
         return {
             "strategy": options.strategy,
@@ -237,6 +249,17 @@ class Labeled:
                 {"code": code, "name": name, "labels": list(labels), **counted}
                 for code, name, labels, counted in classes
             ],
+            "training": {"clouds": listed(self.clouds), **training},
+            **more,
+            "densities": densities(self.clouds),
+            "voxel": options.voxel,
+            "accuracy": {"cross_validation": crossed},
+            "passes": [{"importances": one} for one in importances],
+            "created_by": {
+                "pdal_stages": __version__,
+                "python": platform.python_version(),
+                **{name: metadata.version(name) for name in packages},
+            },
         }
 
 

@@ -17,8 +17,8 @@ from ..base.messages import Progress
 from ..base.resources import free_memory
 from ..features.engine import fit_clouds
 from ..features.returns import SOURCES
-from .algorithms import WHERE_THERE, PredictRequest, gather, required, versions
-from .clouds import TrainingCloud, densities, label_classes, listed
+from .algorithms import WHERE_THERE, PredictRequest, gather, required
+from .clouds import TrainingCloud, label_classes
 from .context import OWN, Context
 from .featureforest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
 from .forest import Forest, grow_forest
@@ -165,27 +165,20 @@ class _ForestTraining:
         priors = (
             None if self.factors is None else {"weight": o.prior_weight, "factors": self.factors.tolist()}
         )
-        info = {
-            **self.labeled.described(o, map(self.samples.counts, range(len(self.codes)))),
-            "training": {
-                "clouds": listed(self.clouds),
-                "count": o.count,
-                "seed": o.seed,
-                "samples": len(self.samples),
-                "max_samples": self.setting["max_samples"],
-                "max_features": o.max_features,
-                "min_samples_leaf": o.min_samples_leaf,
-                **notes,
-                **self._held_by_base(),
-                **({SHORT: self.short} if self.short else {}),
-            },
-            "priors": priors,
-            "densities": densities(self.clouds),
-            "voxel": o.voxel,
-            "accuracy": {"cross_validation": validation},
-            "passes": [{"importances": one} for one in importances],
-            "created_by": versions("numpy", "scikit-learn", "numba"),
+        training = {
+            "count": o.count,
+            "seed": o.seed,
+            "samples": len(self.samples),
+            "max_samples": self.setting["max_samples"],
+            "max_features": o.max_features,
+            "min_samples_leaf": o.min_samples_leaf,
+            **notes,
+            **self._held_by_base(),
+            **({SHORT: self.short} if self.short else {}),
         }
+        counts = map(self.samples.counts, range(len(self.codes)))
+        packages = ("numpy", "scikit-learn", "numba")
+        info = self.labeled.described(o, counts, training, importances, packages, validation, priors=priors)
         if validation is not None and self.sureness.right:
             info["sureness"] = self.sureness.to_dict()
         names = dict(zip(self.codes, self.labeled.classes.names, strict=True))
