@@ -33,7 +33,7 @@ def stages(source, kind, target, **more):
 @pytest.mark.parametrize("kind", TYPES)
 @pytest.mark.parametrize("more", [{}, {"inputs": ["in"]}], ids=["", "inputs"])
 def test_no_ground_is_an_error(tmp_path, kind, more):
-    if not pdal_env.crashes_without_ground():
+    if pdal_env.version() >= (2, 9, 0):
         pytest.skip("this PDAL goes on without ground")
     job = ps.Pipeline(
         stages(write(tmp_path / "a.las", [1] * 90 + [5] * 10), kind, tmp_path / "o.las", **more)

@@ -189,7 +189,7 @@ def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]
     named = str(writer.get("filename", "")).lower().endswith(".laz")
     compresses = named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
     if (
-        pdal_env.writes_extended_classes_to_laz()
+        pdal_env.version() >= (2, 3, 0)
         or writer.get("type") not in ("writers.las", None)
         or not compresses
         or las_version(writer, before)[1] <= 5

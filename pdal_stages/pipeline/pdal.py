@@ -334,23 +334,9 @@ def las_writer_defaults() -> tuple[int, int]:
     return int(minor.group(1)) if minor else 4, int(format_id.group(1)) if format_id else 7
 
 
-def writes_extended_classes_to_laz() -> bool:
-    """Whether LAZ 1.4 can be written with class codes above 31 (PDAL 2.2 cannot)."""
-    return version() >= (2, 3, 0)
-
-
 def writes_copc() -> bool:
     """Whether this PDAL has writers.copc."""
     return version() >= (2, 4, 0)
-
-
-def crashes_without_ground() -> bool:
-    """Whether filters.hag_nn and filters.hag_delaunay end the process where no point is ground (PDAL 2.2 does)."""
-    return version() < (2, 9, 0)
-
-
-#: Dimensions of newer PDAL for the flags of a point.
-FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 
 
 @cache
@@ -364,7 +350,7 @@ def flags_inside_classification(dimensions, metadata: Any) -> bool:
 
     Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
     """
-    if any(name in dimensions for name in (*FLAGS, "ClassFlags")):
+    if any(name in dimensions for name in ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")):
         return False
     formats = [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
     return bool(formats) and all(f <= 5 for f in formats)

@@ -292,7 +292,7 @@ class Callbacks(AbstractContextManager):
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """The stages, with a check before each that ends the process of old PDAL where no point is ground."""
-        if not pdal_env.crashes_without_ground():
+        if pdal_env.version() >= (2, 9, 0):
             return list(stages)
         out: list[dict[str, Any]] = []
         for stage in stages:
