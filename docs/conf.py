@@ -1,4 +1,4 @@
-"""Sphinx configuration: MyST pages, stage pages generated from the registry at each build."""
+"""Sphinx configuration: MyST pages, stage pages generated from their declarations at each build."""
 
 import sys
 from pathlib import Path

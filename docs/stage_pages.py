@@ -1,4 +1,4 @@
-"""Pages of stages, generated from the registry: the same declaration gives JSON Schema, help, errors and these.
+"""Pages of stages, generated from their declarations: the same declaration gives JSON Schema, help, errors and these.
 
 python docs/stage_pages.py        # writes docs/stages/*.md
 """
@@ -9,8 +9,7 @@ import json
 from pathlib import Path
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.stages import registry
-from pdal_stages.stages.base import Stage
+from pdal_stages.stages.base import Stage, stage_types
 
 FOLDER = Path(__file__).resolve().parent / "stages"
 
@@ -88,15 +87,15 @@ def _row(stage: type[Stage], option) -> str:
 def index() -> str:
     """The list of stages."""
     lines = ["# Stages", "", "| stage | does |", "|---|---|"]
-    lines += [f"| [{s.type}]({s.type}.md) | {s.summary} |" for s in registry.stages().values()]
-    lines += ["", "```{toctree}", ":hidden:", "", *registry.stages(), "```", ""]
+    lines += [f"| [{s.type}]({s.type}.md) | {s.summary} |" for s in stage_types().values()]
+    lines += ["", "```{toctree}", ":hidden:", "", *stage_types(), "```", ""]
     return "\n".join(lines)
 
 
 def write() -> None:
     """Write all pages."""
     FOLDER.mkdir(exist_ok=True)
-    for stage in registry.stages().values():
+    for stage in stage_types().values():
         (FOLDER / f"{stage.type}.md").write_text(page(stage), encoding="utf-8")
     (FOLDER / "index.md").write_text(index(), encoding="utf-8")
 

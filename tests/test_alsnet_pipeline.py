@@ -10,7 +10,7 @@ from alsnet_scenes import TINY, model_of, random_net, scene
 import pdal_stages as ps
 from pdal_stages.base.errors import DimensionError, OptionError
 from pdal_stages.classifier import load_model
-from pdal_stages.stages import registry
+from pdal_stages.stages.base import stage_type
 
 WRITER = "writers.classifiermodel"
 
@@ -139,7 +139,7 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
 
 
 def test_stage_options(model, tmp_path):
-    classifier, writer = registry.get("filters.modelclassifier"), registry.get(WRITER)
+    classifier, writer = stage_type("filters.modelclassifier"), stage_type(WRITER)
     made = classifier({"model": str(model)})
     assert made.halo_m() == load_model(model).halo_m
     given = {"filename": str(tmp_path / "m"), "algorithm": "alsnet", "alsnet": {"coordinates": "XYZ"}}

@@ -18,8 +18,7 @@ import pdal_stages as ps
 from pdal_stages.base.errors import ModelError
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import parse_pipeline
-from pdal_stages.stages import registry
-from pdal_stages.stages.base import Stage
+from pdal_stages.stages.base import Stage, stage_types
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -42,7 +41,7 @@ def test_json_in_the_docs_is_valid(tmp_path, monkeypatch):
                 if isinstance(value, list)
                 else value.get("pipeline", [value] if "type" in value else [])
             )
-            ours = [s for s in stages if isinstance(s, dict) and s.get("type") in registry.stages()]
+            ours = [s for s in stages if isinstance(s, dict) and s.get("type") in stage_types()]
             for stage in ours:
                 found += 1
                 try:
@@ -106,12 +105,12 @@ def test_stage_pages_are_made_from_the_registry(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     import stage_pages
 
-    for stage in registry.stages().values():
+    for stage in stage_types().values():
         text = stage_pages.page(stage)
         assert all(f"`{option.name}`" in text for option in stage.all_options())
         example = json.loads(blocks_of(text, "json")[0])
         assert stage.example in example
-    assert all(name in stage_pages.index() for name in registry.stages())
+    assert all(name in stage_pages.index() for name in stage_types())
 
 
 def blocks_of(text: str, language: str) -> list[str]:
@@ -119,7 +118,7 @@ def blocks_of(text: str, language: str) -> list[str]:
 
 
 def test_links_between_pages_lead_somewhere():
-    made = {f"stages/{name}.md" for name in registry.stages()} | {"stages/index.md"}
+    made = {f"stages/{name}.md" for name in stage_types()} | {"stages/index.md"}
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+?)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             path = (page.parent / target).resolve()

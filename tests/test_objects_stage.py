@@ -9,7 +9,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.stages import registry
+from pdal_stages.stages.base import stage_type
 from pdal_stages.synthetic import write_town
 
 pytestmark = pytest.mark.pdal
@@ -24,7 +24,7 @@ def town(tmp_path_factory):
 
 def run_stage(arrays, **options):
     """The stage on arrays, as PDAL's runtime calls it."""
-    stage = registry.get("filters.objects")(options)
+    stage = stage_type("filters.objects")(options)
     made = {name: np.zeros(len(arrays["X"]), "u8") for name in stage.creates() if name not in arrays}
     return stage.run(stage.points({**arrays, **made}))
 
@@ -96,7 +96,7 @@ def test_where_and_refusals(town):
 )
 def test_wrong_options(options, text):
     with pytest.raises(StageError, match=text):
-        registry.get("filters.objects")(options)
+        stage_type("filters.objects")(options)
 
 
 def test_points_without_classes_or_ground():

@@ -21,7 +21,7 @@ import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.read import apply_overrides, parse_overrides
 from pdal_stages.plugin import answers, building
-from pdal_stages.stages import registry
+from pdal_stages.stages.base import stage_types
 
 pytestmark = pytest.mark.pdal
 PIPELINES = sorted((Path(__file__).resolve().parent.parent / "pipelines").glob("*.json"))
@@ -120,7 +120,7 @@ def test_every_stage_is_listed_with_its_options(stock):
     listed = {
         entry["name"]: entry["description"] for entry in json.loads(stock("--drivers", "--showjson").stdout)
     }
-    for name, kind in registry.stages().items():
+    for name, kind in stage_types().items():
         assert listed[name] == kind.summary
         described = stock("--options", name).stdout
         for option in kind.all_options():
@@ -150,7 +150,7 @@ def test_all_stages_give_the_same_bytes(pipeline, town, tmp_path):
     """The others are in ready pipelines; filters.polygons, of a vector file, is not compared."""
     ready = {stage["type"] for path in PIPELINES for stage in json.loads(path.read_text())}
     tested = {stage["type"] for stage in EVERY} | ready | {"writers.objects", "filters.polygons"}
-    assert set(registry.stages()) <= tested
+    assert set(stage_types()) <= tested
     pipeline(las([str(town), *EVERY], tmp_path / "stock.laz"))
     ps.Pipeline(las([str(town), *EVERY], tmp_path / "ours.laz")).execute()
     assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.stages import registry
+from pdal_stages.stages.base import stage_types
 from pdal_stages.stages.preparation import MAKES_GROUND, NEEDS_GROUND, PDAL_OPTIONS, check, same
 
 HAG = {"type": "filters.hag_morphological"}
@@ -17,13 +17,13 @@ HAG = {"type": "filters.hag_morphological"}
 _PATHS = ("filename", "mapping", "string")
 
 
-CARRIED = {name: kind.in_models for name, kind in registry.stages().items() if kind.in_models} | {
+CARRIED = {name: kind.in_models for name, kind in stage_types().items() if kind.in_models} | {
     name: tuple(one.name for one in options) for name, options in PDAL_OPTIONS.items()
 }
 
 
 def test_no_option_that_holds_a_path_is_carried():
-    for kind in registry.stages().values():
+    for kind in stage_types().values():
         declared = {one.name: one.kind for one in kind.all_options()}
         assert not any(declared[name] in _PATHS for name in kind.in_models), kind.type
         assert not {"threads", "horizontal_unit", "vertical_unit"} & set(kind.in_models)
@@ -102,7 +102,7 @@ _JSON = st.recursive(
     lambda inside: st.lists(inside, max_size=4) | st.dictionaries(st.text(max_size=8), inside, max_size=3),
     max_leaves=8,
 )
-_KINDS = [*registry.stages(), *PDAL_OPTIONS, "filters.python", "filters.stats", "filters.head"]
+_KINDS = [*stage_types(), *PDAL_OPTIONS, "filters.python", "filters.stats", "filters.head"]
 _NAMES = [
     *{name for names in CARRIED.values() for name in names},
     "log",

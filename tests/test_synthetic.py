@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.model import load_model
-from pdal_stages.stages import registry
+from pdal_stages.stages.base import stage_type, stage_types
 from pdal_stages.synthetic import Town, make_town, write_town
 from pdal_stages.synthetic.demo import pipelines
 from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene, first_hit
@@ -225,5 +225,5 @@ def test_stages_of_the_demo_take_their_options(tmp_path):
     for stages in pipelines(tmp_path, 0.0, 1).values():
         for options in map(dict, stages):
             kind = options.pop("type")
-            if kind in registry.stages():
-                registry.get(kind)(options)
+            if kind in stage_types():
+                stage_type(kind)(options)

@@ -182,10 +182,10 @@ def switch(takes: Callable, flag: str, default: bool, help: str) -> None:
 
 def takes_options(takes: Callable, stage: str, *names: str) -> None:
     """Add flags for options of a stage, in the words that these are declared in."""
-    from ..stages import registry
+    from ..stages.base import stage_type
 
     kinds = {"integer": int, "number": float}
-    for option in registry.get(stage).all_options():
+    for option in stage_type(stage).all_options():
         if option.name in names:
             what, choices = option.help.replace("%", "%%"), option.choices or None
             how = {"type": kinds.get(option.kind), "choices": choices, "help": what}

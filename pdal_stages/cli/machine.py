@@ -63,9 +63,9 @@ def add_commands(parser: Parser) -> None:
 
 def _drivers(options: argparse.Namespace) -> None:
     from ..pipeline.pdal import ask_program
-    from ..stages import registry
+    from ..stages.base import stage_types
 
-    ours = {name: stage.summary for name, stage in registry.stages().items()}
+    ours = {name: stage.summary for name, stage in stage_types().items()}
     if options.showjson:
         listed = [{"name": n, "description": text, "link": "", "extensions": []} for n, text in ours.items()]
         if not options.ours:  # where our plugin is built, PDAL names ours too
@@ -85,21 +85,21 @@ def _drivers(options: argparse.Namespace) -> None:
 def _options(options: argparse.Namespace) -> None:
     """The options of a stage, of ours or of PDAL's, in PDAL's form."""
     from ..pipeline.pdal import ask_program
-    from ..stages import registry
+    from ..stages.base import stage_type, stage_types
 
     name = options.stage
-    if name not in registry.stages():
+    if name not in stage_types():
         answer = ""
         with contextlib.suppress(DependencyError, PipelineError):
             answer = ask_program("--options", name, *(["--showjson"] if options.showjson else []))
         if not answer.strip() or "Unable to create" in answer or "not found" in answer:
             raise PipelineError(
                 f"there is no stage '{name}', neither of ours nor of PDAL's",
-                cure=f"{suggest(name, registry.stages())}List them with: pdal-stages drivers",
+                cure=f"{suggest(name, stage_types())}List them with: pdal-stages drivers",
             )
         print(answer, end="")
         return
-    stage = registry.get(name)
+    stage = stage_type(name)
     if options.showjson:
         print(json.dumps(stage.schema(), indent=2))
         return
@@ -139,7 +139,7 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     from ..base.asprs import NAMES, class_color
     from ..base.version import __version__
     from ..classifier.modelfile import shipped
-    from ..stages import registry
+    from ..stages.base import stage_types
 
     answer = {
         "format": _FORMAT,
@@ -159,7 +159,7 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
         },
         "stages": {
             name: {"help": stage.summary, "options": [_option(stage, one) for one in stage.all_options()]}
-            for name, stage in registry.stages().items()
+            for name, stage in stage_types().items()
         },
     }
     return json.dumps(answer, indent=1)

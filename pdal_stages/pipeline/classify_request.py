@@ -10,7 +10,8 @@ from ..base.asprs import BRIDGE
 from ..base.errors import ModelError, OptionError, suggest
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
-from ..stages import preparation, registry
+from ..stages import preparation
+from ..stages.base import stage_types
 from .expansion import expand_stage
 from .filenames import LAS_WRITERS
 from .inputs_outputs import overridden, reader_of, writer_of
@@ -147,7 +148,7 @@ class ClassifyRequest:
         for stage in self.stages:
             if stage["type"] in preparation.OF_PDAL:
                 made["HeightAboveGround"] = "double"
-            elif stage["type"] in registry.stages():
+            elif stage["type"] in stage_types():
                 made |= expand_stage(overridden(stage, self.overrides)).stage.creates()
         made.pop("Classification", None)
         for name in self.dimensions:

@@ -16,8 +16,8 @@ from typing import Any
 
 from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.las import extra_dimensions, read_header
-from ..stages import preparation, registry
-from ..stages.base import Stage
+from ..stages import preparation
+from ..stages.base import Stage, stage_type, stage_types
 from ..stages.points import MAKERS
 from . import pdal as pdal_env
 from .filenames import is_reader, reader_files
@@ -67,7 +67,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
     several = len(readers) > 1 or any(c in name for name in readers for c in "*?[")
     for index, stage in enumerate(stages):
         type_name = stage.get("type", "")
-        if type_name not in registry.stages():
+        if type_name not in stage_types():
             out.stages.append(stage)
             if flags and index == last_reader:
                 out.stages.append(flag_splitter(flags))
@@ -79,7 +79,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
                     merge |= {"inputs": stage["inputs"], "tag": f"pdal_stages_merge_{index}"}
                     stage["inputs"] = [merge["tag"]]
                 out.stages.append(merge)
-            taken = registry.get(type_name).from_pipeline(stage, stages[:index])
+            taken = stage_type(type_name).from_pipeline(stage, stages[:index])
             expanded = expand_stage({**taken, **stage}, index, len(out.stages))
         except StageError as error:
             raise error.within(places[index]) from None
@@ -91,7 +91,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
 
 
 def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
-    flags = files_with_flags_to_split(stages, any(stage.get("type") in registry.stages() for stage in stages))
+    flags = files_with_flags_to_split(stages, any(stage.get("type") in stage_types() for stage in stages))
     readers = [number for number in range(len(stages)) if is_reader(stages, number)]
     if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
         raise PipelineError(
@@ -129,7 +129,7 @@ def _may_be_apart(stages: Sequence[dict[str, Any]], number: int) -> bool:
     if any(stage.get("type") in _SPLITS for stage in stages[:number]):
         return False
     before = stages[number - 1].get("type") if number else None
-    return "inputs" in stages[number] or before not in ("filters.merge", *registry.stages())
+    return "inputs" in stages[number] or before not in ("filters.merge", *stage_types())
 
 
 def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str]) -> None:
@@ -258,7 +258,7 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
 
 def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> ExpandedStage:
     """One stage of ours, checked, and the ``filters.python`` that stands for it."""
-    kind = registry.get(given["type"])
+    kind = stage_type(given["type"])
     named = place(kind.type, given.get("tag"))
     options = {k: v for k, v in given.items() if k not in ("type", *PDAL_OWN)}
     stage = kind(options, named)

@@ -16,8 +16,7 @@ from typing import Any
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.las import LasHeader, extra_dimensions, read_header, supersede_copc
-from ..stages import registry
-from ..stages.base import Stage
+from ..stages.base import Stage, stage_types
 from . import pdal as pdal_env
 from .filenames import is_reader, is_writer, reader_files, writes_las
 from .runtime import python_filter
@@ -159,7 +158,7 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
     if True not in old:
         return []
     mixed = any(one > 5 for formats in read for one in formats)
-    writers = [s for s in stages if is_writer(s, list(stages)) and s.get("type") not in registry.stages()]
+    writers = [s for s in stages if is_writer(s, list(stages)) and s.get("type") not in stage_types()]
     written = [las_version(one, stages)[1] for one in writers if writes_las(one)]
     together, apart = any(one <= 5 for one in written), any(one > 5 for one in written)
     if together and (apart or mixed):

@@ -10,8 +10,7 @@ import logging
 from typing import Any
 
 from ..base.errors import StageError
-from ..stages import registry
-from ..stages.base import Stage
+from ..stages.base import Stage, stage_type, stage_types
 from . import pdal as pdal_env
 from . import runtime
 from .expansion import expand_stage
@@ -27,7 +26,7 @@ class _Family:
         if name.startswith("_"):
             raise AttributeError(name)
         try:
-            kind = registry.get(f"{self._family}.{name}")
+            kind = stage_type(f"{self._family}.{name}")
         except StageError as error:
             raise AttributeError(str(error)) from None  # as completion and hasattr expect
         signature = _signature(kind)
@@ -56,7 +55,7 @@ class _Family:
 
     def __dir__(self):
         prefix = self._family + "."
-        return [name[len(prefix) :] for name in registry.stages() if name.startswith(prefix)]
+        return [name[len(prefix) :] for name in stage_types() if name.startswith(prefix)]
 
 
 def _signature(kind: type[Stage]) -> inspect.Signature:

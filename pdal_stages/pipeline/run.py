@@ -16,7 +16,7 @@ from ..base.files import Output, check_outputs, whole_files
 from ..base.las import odd_text, supersede_copc
 from ..base.lascheck import check_complete, check_readable
 from ..base.messages import Report
-from ..stages import registry
+from ..stages.base import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand
@@ -242,7 +242,7 @@ class Pipeline:
         if error.cure is None and _NO_STAGE.search(found):
             error.found = found.splitlines()[0]
             theirs = [one["name"] for one in json.loads(pdal_env.ask_program("--drivers", "--showjson"))]
-            near = suggest(named[0], [*registry.stages(), *theirs])
+            near = suggest(named[0], [*stage_types(), *theirs])
             error.cure = f"{near}List the stages there are with: pdal-stages drivers"
         return error
 
@@ -265,9 +265,7 @@ def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[Repo
     if not isinstance(inner, dict):
         return metadata
     scripts = filter(None, _several(inner.pop("filters.python", None)))
-    theirs = [
-        s for s in scripts if not (isinstance(s, dict) and any(name in registry.stages() for name in s))
-    ]
+    theirs = [s for s in scripts if not (isinstance(s, dict) and any(name in stage_types() for name in s))]
     named = [(name.partition(" ")[0], report.to_dict()) for name, views in reports for report in views]
     for kind, node in [*(("filters.python", node) for node in theirs), *named]:
         inner[kind] = [*_several(inner[kind]), node] if kind in inner else node

@@ -23,8 +23,7 @@ import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
 from ..base.messages import Report
-from ..stages import registry
-from ..stages.base import Stage
+from ..stages.base import Stage, stage_type
 from ..stages.points import Points
 from ..stages.preparation import NEEDS_GROUND
 from . import pdal as pdal_env
@@ -126,7 +125,7 @@ def points_of_views(
 
 def _made_again(arguments: Mapping[str, Any]) -> Stage:
     """The stage of an expanded pipeline that runs in another process than the one that expanded it."""
-    kind = registry.get(arguments["stage"])
+    kind = stage_type(arguments["stage"])
     stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
     stage.makes_again = arguments.get("makes_again", False)
     stage.follows(arguments.get("preparation", []))

@@ -17,8 +17,7 @@ from typing import Any
 from ..base.errors import StageError
 from ..base.version import __version__
 from ..pipeline import expansion, runtime
-from ..stages import registry
-from ..stages.base import Stage
+from ..stages.base import Stage, stage_type, stage_types
 from . import declarations
 
 #: Stages made when a pipeline was prepared, until it has run; of pipelines that never run, so many are kept.
@@ -70,7 +69,7 @@ def _prepare(question: Mapping[str, Any]) -> list[_Leaf]:
 
 def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     """The stage of a question, and what its user should know of the stages before it."""
-    kind = registry.get(question["stage"])
+    kind = stage_type(question["stage"])
     if (question["version"], question["digest"]) != (__version__, declarations.digest(kind)):
         raise StageError(
             "PDAL's plugin of this stage was built for another version of pdal_stages",
@@ -103,10 +102,10 @@ def _own(stage: Mapping[str, Any]) -> dict[str, Any]:
 
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
     """What a stage before makes, as far as it matters: of ours, what it says; of PDAL's, heights."""
-    if stage.get("type") not in registry.stages():
+    if stage.get("type") not in stage_types():
         return expansion.heights_of(stage)
     try:
-        return registry.get(stage["type"])(_own(stage)).creates()
+        return stage_type(stage["type"])(_own(stage)).creates()
     except StageError:  # its own preparation has said so
         return {}
 

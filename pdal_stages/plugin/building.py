@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from ..base.errors import DependencyError, StageError
 from ..pipeline import pdal as pdal_env
-from ..stages import registry
+from ..stages.base import stage_types
 from . import declarations
 
 SOURCE = Path(__file__).with_name("stage.cpp")
@@ -32,7 +32,7 @@ _OTHER_DOORS = "every other door works: pdal-stages pipeline, pdal-stages expand
 
 def libraries() -> list[str]:
     """The files that PDAL looks for: ``filters.hag_minima`` is in ``libpdal_plugin_filter_hag_minima.so``."""
-    parts = (name.partition(".") for name in registry.stages())
+    parts = (name.partition(".") for name in stage_types())
     return [f"libpdal_plugin_{family.removesuffix('s')}_{name}{SUFFIX}" for family, _, name in parts]
 
 

@@ -6,8 +6,7 @@ import hashlib
 import json
 
 from ..base.version import __version__
-from ..stages import registry
-from ..stages.base import Stage
+from ..stages.base import Stage, stage_types
 from ..stages.options import Option
 
 #: Kind of option -> how PDAL's parser takes it; all else as text, which Python parses.
@@ -68,7 +67,7 @@ constexpr std::size_t COUNT = {count};
 def header() -> str:
     """The text of ``declarations.hpp``."""
     options, stages = [], []
-    for number, kind in enumerate(registry.stages().values()):
+    for number, kind in enumerate(stage_types().values()):
         name = f"OPTIONS_{number}"
         options.append(f"const Option {name}[] = {{{_options(kind)}}};")
         texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")

@@ -1,15 +1,20 @@
-"""What a stage is: an object made once from checked options, which then answers every question about itself."""
+"""What a stage is: an object made once from checked options, which then answers every question about itself.
+
+And where each is found by its type name: its module is imported when it is asked for.
+"""
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
+from collections import UserDict
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import StageError
+from ..base.errors import PipelineError, StageError, suggest
 from ..base.files import Output, check_writable
 from ..base.units import named_unit
 from .options import Option, option, parse_options
@@ -210,3 +215,34 @@ class ClassStage(Stage):
 
     def creates(self) -> dict[str, str]:
         return {"Classification": "uint8_t"}
+
+
+class _Types(UserDict):
+    """Modules that hold the stages, by type name; the stage itself when it is asked for."""
+
+    def __getitem__(self, name: str) -> type[Stage]:
+        module = importlib.import_module(f"{__package__}.{self.data[name]}")
+        return next(v for v in vars(module).values() if getattr(v, "type", None) == name)
+
+
+_TYPES = _Types(
+    {f"filters.{name}": name for name in (
+        "accuracy", "bridges", "consistency", "detachednoise", "hag_minima", "hag_morphological", "modelclassifier",
+        "multiscalefeatures", "objects", "polygons", "wires",
+    )} | {"writers.classifiermodel": "classifiermodel", "writers.objects": "objectswriter"}
+)  # fmt: skip
+
+
+def stage_types() -> Mapping[str, type[Stage]]:
+    """All stages, by type name, in alphabetical order."""
+    return _TYPES
+
+
+def stage_type(name: str) -> type[Stage]:
+    """The stage of a type name; an error names the nearest one."""
+    if name not in _TYPES:
+        raise PipelineError(
+            f"there is no stage '{name}' in pdal_stages",
+            cure=f"{suggest(name, _TYPES)}Stages: {', '.join(_TYPES)}",
+        )
+    return _TYPES[name]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, StageError
 from ..base.las import number_type
-from . import registry
+from .base import stage_type, stage_types
 from .options import Option, split_list
 
 #: The stage that makes the dimensions a model is trained on by default.
@@ -102,7 +102,7 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _checked(stage: Mapping[str, Any]) -> dict[str, Any]:
     kind = str(stage["type"])
-    ours = registry.stages().get(kind)
+    ours = stage_types().get(kind)
     options = {one.name: one for one in PDAL_OPTIONS.get(kind, ())}
     if ours is not None:
         options = {one.name: one for one in ours.all_options() if one.name in ours.in_models}
@@ -159,10 +159,10 @@ def made_of_coordinates(
 
     `usable` (n,) are points that may form the ground; the others only receive heights.
     """
-    if len(preparation) != 1 or "where" in preparation[0] or preparation[0]["type"] not in registry.stages():
+    if len(preparation) != 1 or "where" in preparation[0] or preparation[0]["type"] not in stage_types():
         return {}
     options = {name: value for name, value in preparation[0].items() if name != "type"}
-    stage = registry.get(preparation[0]["type"])({**options, "ignore": "withheld", "threads": threads or 0})
+    stage = stage_type(preparation[0]["type"])({**options, "ignore": "withheld", "threads": threads or 0})
     there = {name: np.zeros(len(xyz), number_type(kind)) for name, kind in stage.creates().items()}
     withheld = np.zeros(len(xyz), np.uint8) if usable is None else (~usable).view(np.uint8)
     columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **there}

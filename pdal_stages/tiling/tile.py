@@ -19,7 +19,7 @@ from ..pipeline.inputs_outputs import NO_REFERENCE
 from ..pipeline.las_output import check_writers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
-from ..stages import registry
+from ..stages.base import stage_types
 from ..stages.hag_morphological import HagMorphological
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
 from .inputs import CloudIndex, InputSource
@@ -108,7 +108,7 @@ def run_head(
         begins = len(stages)
         for number in range(begin, len(plan.head)):
             stages.append(_with_threads(plan.head[number], context.threads))
-            kind = registry.stages().get(stages[-1]["type"])
+            kind = stage_types().get(stages[-1]["type"])
             if kind is not None and kind.open_ended and not everything:
                 stages.append(callbacks.filter(partial(reach, len(stages) - 1, plan.later[number])))
         stages += [callbacks.filter(function) for function in (take, last) if function is not None]
@@ -160,7 +160,7 @@ def _marked(number: int, piece: Piece, unit: float, changed: Changed) -> NewValu
 
 
 def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
-    if given["type"] not in registry.stages():
+    if given["type"] not in stage_types():
         return dict(given)
     asked = int(given.get("threads") or 0)
     return {**given, "threads": min(asked, threads) if asked else threads}
