@@ -9,7 +9,7 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import passes
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.context import OWN, WHOLE, Context, around, count_shares
-from pdal_stages.classifier.passes import PassRun
+from pdal_stages.classifier.passes import Asked, PassRun
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
@@ -85,9 +85,8 @@ def test_band_by_band_is_the_same(seed, kind, size):
     got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(passes, "BAND", size)
-        for rows, columns in PassRun(
-            [Said(blocks=blocks), Said(context)], (3, 3), request, (None, None)
-        ).blocks(lambda columns, rows: columns):
+        run = PassRun([Asked(Said(blocks=blocks), 3), Asked(Said(context), 3)], request)
+        for rows, columns in run.blocks(lambda columns, rows: columns):
             seen[rows] += 1
             got[rows] = columns
     rows = np.arange(300) if wanted is None else wanted

@@ -184,7 +184,7 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.classifier.passes import predict
+    from pdal_stages.classifier.passes import Asked, predict
 
     first = two.passes[0]
 
@@ -194,7 +194,7 @@ def test_a_pass_may_come_from_elsewhere(two, other):
 
         def predict(self, request, finish):
             p = np.zeros((len(request.xyz), 3))
-            for found, result in predict((first,), (3,), (None,), request, lambda p: p):
+            for found, result in predict([Asked(first, 3)], request, lambda p: p):
                 p[found] = result
             rows = slice(None) if request.rows is None else request.rows
             request.report.figures["batches"] = 1

@@ -23,7 +23,7 @@ from .context import OWN, Context
 from .featureforest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
 from .forest import Forest, grow_forest
 from .model import Model
-from .passes import FoldForests, sample_context
+from .passes import Asked, FoldForests, sample_context
 from .sampling import BLOCK, Folds, draw_samples, figures, split
 from .summary import Sureness
 from .trainoptions import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
@@ -329,9 +329,9 @@ class _ForestTraining:
         """(samples, columns): what a pass reads of those before, a base's and forests that have not seen the samples."""
         o, context = self.options, self.reads[number]
         assert context is not None
-        passes, classes, factors = ((), [], []) if self.base is None else self.base.asked
-        classes = [*classes, *(len(self._codes_after(k)) for k in range(number))]
-        out = np.empty((len(self.samples), len(context.tokens) * classes[-1]), np.float32)
+        base = [] if self.base is None else self.base.asked
+        classes = len(self._codes_after(number - 1)) if number else base[-1].classes
+        out = np.empty((len(self.samples), len(context.tokens) * classes), np.float32)
         with self.progress(
             len(out), f"context for pass {number + 1}" if number else "what the base says"
         ) as bar:
@@ -339,13 +339,13 @@ class _ForestTraining:
                 at, rows = self.samples.of_cloud(place)
                 if not len(at):
                     continue
-                mine: list[Any] = []
+                mine = []
                 if folds is not None:
                     fold = folds.points(cloud.xyz, self.flights[place])
-                    mine = [FoldForests(forests, fold) for forests in held_out]
+                    each = (FoldForests(forests, fold) for forests in held_out)
+                    mine = [Asked(one, len(self._codes_after(k))) for k, one in enumerate(each)]
                 request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
-                weights = [*factors, *[None] * number]
-                out[at] = sample_context([*passes, *mine], classes, weights, request, context)
+                out[at] = sample_context([*base, *mine], request, context)
         return out
 
     # ---- on top of a base ----------------------------------------------------------------------------------

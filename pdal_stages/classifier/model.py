@@ -31,7 +31,7 @@ from .algorithms import (
 )
 from .clouds import density
 from .featureforest import weighed
-from .passes import plan_of, predict
+from .passes import Asked, plan_of, predict
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1
@@ -77,11 +77,11 @@ class Model:
         return None if priors is None else np.array(priors["factors"])
 
     @property
-    def asked(self) -> tuple[tuple[Any, ...], list[int], list[npt.NDArray[np.float64] | None]]:
-        """Passes, their numbers of classes and their factors, as :class:`PassRun` takes them, to ask what it says."""
+    def asked(self) -> list[Asked]:
+        """Its passes, to ask what it says."""
         given = [one.get("factors") for one in self.info["passes"][:-1]]
-        between = [None if one is None else np.array(one) for one in given]
-        return self.passes, [len(codes) for codes in self.codes_of], [*between, self.factors]
+        factors = [*(None if one is None else np.array(one) for one in given), self.factors]
+        return list(map(Asked, self.passes, map(len, self.codes_of), factors))
 
     @property
     def required_dimensions(self) -> tuple[str, ...]:
@@ -217,7 +217,7 @@ class Model:
         request = PredictRequest(xyz, given, rows, how.threads, how.memory_mb, shown, grid)
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
-        for at, decided in predict(*self.asked, request, lambda p: decide(weighed(p, factors), codes, how)):
+        for at, decided in predict(self.asked, request, lambda p: decide(weighed(p, factors), codes, how)):
             place: Any = slice(None)
             if order is not None:
                 at = order[at]

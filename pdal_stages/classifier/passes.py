@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -69,73 +69,58 @@ class FoldForests:
         return out
 
 
+class Asked(NamedTuple):
+    """A pass that is asked."""
+
+    #: It has `features` (None where it reads context alone), `context` (None for the first), and
+    #: ``probabilities(read, rows)``, (b, classes) of points by their features and then their context, side by side.
+    #: A first one without features is asked as the kind it is.
+    one: Any
+    classes: int
+    #: (classes,) what these probabilities are multiplied by before they are handed on
+    factors: npt.NDArray[np.float64] | None = None
+
+
 def predict(
-    passes: Sequence[Any],
-    classes: Sequence[int],
-    factors: Sequence[npt.NDArray[np.float64] | None],
-    request: PredictRequest,
-    finish: Callable[[npt.NDArray[np.float64]], Any],
+    passes: Sequence[Asked], request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
 ) -> Iterator[tuple[Any, Any]]:
-    """Classify by some passes, see :class:`PassRun`: (rows, what `finish` made of them) block by block.
+    """Classify by some passes: (rows, what `finish` made of them) block by block.
 
     `finish` makes the results of the (b, classes) float64 probabilities of a block, which it may change, in a worker's
     thread where there are any.
     """
-    if len(passes) == 1 and passes[0].features is None:
-        yield from passes[0].predict(request, finish)
+    last = passes[-1].one
+    if len(passes) == 1 and last.features is None:
+        yield from last.predict(request, finish)
         return
-    run = PassRun(passes, classes, request, factors)
-    yield from run.blocks(lambda read, rows: finish(passes[-1].probabilities(read, rows)))
+    yield from PassRun(passes, request).blocks(lambda read, rows: finish(last.probabilities(read, rows)))
 
 
 def sample_context(
-    passes: Sequence[Any],
-    classes: Sequence[int],
-    factors: Sequence[npt.NDArray[np.float64] | None],
-    request: PredictRequest,
-    context: Context,
+    passes: Sequence[Asked], request: PredictRequest, context: Context
 ) -> npt.NDArray[np.float32]:
     """(m, columns): the context that some passes give the m points asked for, ascending."""
     asked: Any = request.rows
-    out = np.empty((len(asked), len(context.tokens) * classes[-1]), np.float32)
-    last = SimpleNamespace(context=context, features=None)
-    run = PassRun([*passes, last], [*classes, 0], request, [*factors, None])
-    for rows, columns in run.blocks(lambda columns, rows: columns):
+    out = np.empty((len(asked), len(context.tokens) * passes[-1].classes), np.float32)
+    last = Asked(SimpleNamespace(context=context, features=None), 0)
+    for rows, columns in PassRun([*passes, last], request).blocks(lambda columns, rows: columns):
         out[np.searchsorted(asked, rows)] = columns
     return out
 
 
 class PassRun:
-    """Passes at work on one cloud.
+    """Passes at work on one cloud; of the last only its features and context are looked at."""
 
-    Parameters
-    ----------
-    members : sequence
-        Each has `features` (None where it reads context alone), `context` (None for the first), and
-        ``probabilities(read, rows)``, (b, classes) of points by their features and then their context, side by side; of
-        the last only the former two are looked at. A first one without features is asked as the kind it is.
-    classes : sequence of int
-        Of each pass.
-    request : PredictRequest
-    factors : sequence of (classes,) float64 or None
-        Of each pass: what its classes' probabilities are multiplied by before they are handed on; None for nothing.
-    """
-
-    def __init__(
-        self,
-        members: Sequence[Any],
-        classes: Sequence[int],
-        request: PredictRequest,
-        factors: Sequence[npt.NDArray[np.float64] | None],
-    ) -> None:
-        self._members, self._request, self._factors = members, request, factors
+    def __init__(self, passes: Sequence[Asked], request: PredictRequest) -> None:
+        members = [asked.one for asked in passes]
+        self._members, self._request, self._factors = members, request, [asked.factors for asked in passes]
         wanted = [request.rows]  # of each pass
         for one in members[:0:-1]:
             wanted.insert(0, around(request.xyz, wanted[0], one.context))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
         width = max((one.context.strip for one in members[1:]), default=0.0) or 8.0
         self._strips = Strips(request.xyz, wanted[0], width)
-        self._shares = [np.zeros((len(self._strips), n), np.uint16) for n in classes[:-1]]
+        self._shares = [np.zeros((len(self._strips), n), np.uint16) for _, n, _ in passes[:-1]]
         self._features: list[CloudFeatures | None] = []
         for one in members:
             # One for passes that read the same features, so that these are computed once.
