@@ -251,8 +251,8 @@ def ground_raster(
     left, bottom, shape = left + (part[1].start or 0), bottom + (part[0].start or 0), raster.shape
     held = lowest >= 0
     low, place = lowest[held], np.zeros((*shape, 3))
-    for axis, (at, number) in enumerate(((x, column), (y, row))):
-        place[held, axis] = at[low] / cell - number[low] - 0.5
+    for axis, (at, cells) in enumerate(((x, column), (y, row))):
+        place[held, axis] = at[low] / cell - cells[low] - 0.5
     place[held, 2] = z[low]
     on_deck = (deck != 0)[lowest] & held
     del lowest, bad
