@@ -197,7 +197,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         k = (*c, levels[-1])
         alone = len(levels) == 1 or levels[-1] - levels[-2] > detached.BENEATH
         if alone and (small[k] or highest[k] - base[c] > detached.HANGING):
-            hung[c] = highest[k]
+            hung[c] = highest[k], small[k]
     j, i = np.mgrid[:h, :w]
     codes = {}
     for k in count:
@@ -215,14 +215,23 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         if len(near) < belowground.ENOUGH or lowest[k] - near.max() < least:
             continue
         others = []
-        for (b, a), z in hung.items():
+        for (b, a), (z, suspect) in hung.items():
             square = (b - k[0]) ** 2 + (a - k[1]) ** 2
             if 4 < square <= detached.FAR**2 and abs(z - lowest[k]) <= 1 + 0.3 * SIDE * np.sqrt(square):
-                others.append((a - k[1], b - k[0]))
-        moments = np.array(others).reshape(-1, 2).T @ np.array(others).reshape(-1, 2)
-        thin = np.linalg.det(moments) <= detached.ACROSS * np.trace(moments) ** 2
-        if len(others) < detached.STRUNG or not thin:
-            codes[k] = 18
+                others.append((a - k[1], b - k[0], z - lowest[k], suspect))
+        codes[k] = 18
+        for u, v, dz, _ in others:
+            far = np.hypot(u, v)
+            on = [
+                (u * p + v * q) / far
+                for p, q, rise, _ in others
+                if abs(u * q - v * p) / far <= 1 and abs(rise - (u * p + v * q) / far**2 * dz) <= 2
+            ]
+            places = {int((part + detached.FAR) / 3) for part in on}
+            few = detached.STRUNG_SHARE * sum(other[3] for other in others)
+            if len(places) >= detached.STRUNG and len(on) > few:
+                del codes[k]
+                break
     low = np.full((h, w), np.inf)
     lone = {k for k in count if small[k] or k in covered} - codes.keys()
     for k in lone:

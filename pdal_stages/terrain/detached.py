@@ -54,8 +54,9 @@ ASIDE, SPACINGS_ASIDE = 3, 2.5
 HANGING, BENEATH = 5.0, 2
 #: Columns within which others of a line are looked for.
 FAR = 20
-#: A line has so many others, which scatter no more across than that: of the moments' matrix, determinant over squared trace.
-STRUNG, ACROSS = 8, 0.13
+#: A line has others at so many places of three columns each, and such a share of all suspects near: two wires hang side
+#: by side, as over pylons.
+STRUNG, STRUNG_SHARE = 4, 0.3
 #: More than such a share of the points and of the columns within so many around, so many columns at least, is no noise.
 TOO_MANY, COLUMNS = 0.025, 6
 #: Low noise of any size has others above it in such a share of its voxels.
@@ -147,9 +148,11 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     begins = np.append(begins_run(place), True)
     hangs = begins[1:] & (begins[:-1] | (np.diff(voxels.keys, prepend=0) > BENEATH))
     hangs &= suspect | (highest - base[place] > HANGING)
-    hung, verdict = np.full(h * w, np.nan), np.zeros(len(place), np.uint8)
-    hung[place[hangs]] = highest[hangs]
-    _high(place, lowest, suspect, size, spacing, top.reshape(h, w), hung.reshape(h, w), gap, verdict)
+    hung, hung_suspect = np.full(h * w, np.nan), np.zeros(h * w, bool)
+    hung[place[hangs]], hung_suspect[place[hangs]] = highest[hangs], suspect[hangs]
+    verdict = np.zeros(len(place), np.uint8)
+    rasters = (a.reshape(h, w) for a in (top, hung, hung_suspect))
+    _high(place, lowest, suspect, size, spacing, *rasters, gap, verdict)
     suspect = (suspect | covered) & (verdict == 0)
     np.minimum.at(low, place[suspect], lowest[suspect])
     limit = below_ground(low.reshape(h, w), base.reshape(h, w), SIDE, depth)
@@ -269,9 +272,10 @@ def _covered(place, number, counts, spacing, width, columns, most):
 
 
 @njit
-def _high(place, lowest, suspect, size, spacing, top, hung, gap, verdict):
+def _high(place, lowest, suspect, size, spacing, top, hung, hung_suspect, gap, verdict):
     """Say which suspects are above all that is near, and not of a line."""
     h, w = top.shape
+    u, v, dz = np.empty((3, (2 * FAR + 1) ** 2))
     for k in range(len(place)):
         if not suspect[k]:
             continue
@@ -289,18 +293,34 @@ def _high(place, lowest, suspect, size, spacing, top, hung, gap, verdict):
                 break
             r = min(2 * r, FAR)
         if seen >= ENOUGH and lowest[k] - highest >= least:
-            verdict[k] = 0 if _in_line(hung, j, i, lowest[k]) else HIGH
+            verdict[k] = 0 if _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz) else HIGH
 
 
 @device
-def _in_line(hung, j, i, z):
+def _in_line(hung, hung_suspect, j, i, z, u, v, dz):
     """Whether others that hang are strung along a line through a place, as wires are, or single points of them."""
     h, w = hung.shape
-    n, xx, xy, yy = 0, 0.0, 0.0, 0.0
+    n = suspects = 0
     for b in range(max(j - FAR, 0), min(j + FAR + 1, h)):
         for a in range(max(i - FAR, 0), min(i + FAR + 1, w)):
-            u, v = a - i, b - j
-            square = u * u + v * v
+            square = (b - j) ** 2 + (a - i) ** 2
             if 4 < square <= FAR * FAR and abs(hung[b, a] - z) <= 1.0 + 0.3 * SIDE * np.sqrt(square):
-                n, xx, xy, yy = n + 1, xx + u * u, xy + u * v, yy + v * v
-    return n >= STRUNG and xx * yy - xy * xy <= ACROSS * (xx + yy) ** 2
+                u[n], v[n], dz[n] = a - i, b - j, hung[b, a] - z
+                n += 1
+                suspects += hung_suspect[b, a]
+    for a in range(n):
+        far = np.sqrt(u[a] * u[a] + v[a] * v[a])
+        along, places = 0, 0
+        for b in range(n):
+            part = (u[a] * u[b] + v[a] * v[b]) / far
+            aside = abs(u[a] * v[b] - v[a] * u[b]) / far
+            if aside <= 1.0 and abs(dz[b] - part / far * dz[a]) <= 2.0:
+                along += 1
+                places |= 1 << int((part + FAR) / 3.0)
+        number = 0
+        while places > 0:
+            number += places & 1
+            places >>= 1
+        if number >= STRUNG and along > STRUNG_SHARE * suspects:
+            return True
+    return False
