@@ -190,7 +190,7 @@ def test_error_map_shows_the_errors(full):
     inside = (columns / scale > 11.5) & (columns / scale < 28.5)
     inside &= (40 - rows / scale > 10.5) & (40 - rows / scale < 13.5)
     assert inside.mean() > 0.7
-    differs = (reference != prediction).any(axis=2)
+    differs = (np.abs(reference.astype(int) - prediction) > 40).any(axis=2)  # each has a palette of its own
     assert red[differs].mean() > 0.5
 
 
