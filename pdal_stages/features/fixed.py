@@ -192,7 +192,7 @@ def fill_window(cell_ix, cell_start, row_iy, row_start, iy, ix, reach, on, place
         row += 1
 
 
-@device
+@device(forceinline=True)  # a call would count who holds the arrays, for all threads
 def copy_points(x, y, z, first, last, px, py, pz, keys, at):
     """Append the points first..last - 1."""
     for i in range(last - first):
