@@ -20,9 +20,6 @@ from ..pipeline import expansion, runtime
 from ..stages.base import Stage, stage_type, stage_types
 from . import declarations
 
-#: Stages made when a pipeline was prepared, until it has run; of pipelines that never run, so many are kept.
-_MOST = 16
-_prepared: dict[str, Stage] = {}
 _Leaf = dict[str, Any]
 
 
@@ -38,21 +35,17 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
         PDAL's dimensions, and the ones to write back.
     """
     question = module["pdalargs"]
-    label, where = question["label"], runtime.place(question["stage"], question.get("tag"))
+    where = runtime.place(question["stage"], question.get("tag"))
     _end_on_interrupt()
     # PDAL's module object stays alive; the register need not grow.
-    sys.modules.pop(label, None)
+    sys.modules.pop(question["label"], None)
     try:
         if question["step"] == "prepare":
             said = _prepare(question)
         else:
-            stage = _prepared.get(label) or _made(question)[0]
-            said = runtime.leaves(runtime.run_on_view(stage, module, ins, outs))
-            if question.get("last"):
-                _prepared.pop(label, None)
+            said = runtime.leaves(runtime.run_on_view(_made(question)[0], module, ins, outs))
     except BaseException as error:
         outs.clear()
-        _prepared.pop(label, None)
         said = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
     module["out_metadata"] = runtime.node("pdal_stages", said)
     return True
@@ -60,9 +53,6 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
 
 def _prepare(question: Mapping[str, Any]) -> list[_Leaf]:
     stage, warning = _made(question)
-    _prepared[question["label"]] = stage
-    while len(_prepared) > _MOST:
-        del _prepared[next(iter(_prepared))]
     made = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
     return [*made, *([] if warning is None else [runtime.leaf("pdal_stages_warning", warning)])]
 

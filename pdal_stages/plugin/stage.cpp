@@ -377,10 +377,8 @@ private:
             m_gathered = merged();
             view = m_gathered;
         }
-        const bool last = m_gather || view == m_views.back();
         InnerTable table(*m_table);
-        const std::string words = request("run", last ? ",\"last\":true" : "");
-        for (MetadataNode& leaf : ask(getName(), m_label, words, { view }, table, this->log()))
+        for (MetadataNode& leaf : ask(getName(), m_label, request("run"), { view }, table, this->log()))
             this->m_metadata.add(leaf);
         out.insert(view);
         return out;
@@ -432,8 +430,8 @@ private:
         return out.str();
     }
 
-    std::string request(const std::string& step, const std::string& more = "") const
-        { return "{\"step\":" + quoted(step) + "," + m_request + more + "}"; }
+    std::string request(const std::string& step) const
+        { return "{\"step\":" + quoted(step) + "," + m_request + "}"; }
 };
 
 // PDAL makes stages without arguments.
