@@ -23,6 +23,7 @@ from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.filenames import LAS_WRITERS
 from ..pipeline.runtime import Callbacks
+from ..stages.points import class_counts
 from .inputs import InputSource
 from .pieces import BLOCK, Piece, header_of, record_blocks, write_records
 from .plan import TilePlan
@@ -59,15 +60,6 @@ def of_own_points(result: PieceResults) -> NewValues:
     kept = np.zeros(len(result.piece.index), bool)
     kept[result.rows] = True
     return NewValues(kept, {name: (result.rows, values) for name, values in result.values.items()})
-
-
-def class_counts(values: Iterable[Mapping[str, NDArray]]) -> dict[str, int]:
-    """Number of points of each class code, as far as there are new ones."""
-    counts = np.zeros(256, np.int64)
-    for one in values:
-        if "Classification" in one:
-            counts += np.bincount(one["Classification"].astype(np.uint8), minlength=256)
-    return {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
 
 
 def flags_in_classes(path: str) -> bool:
@@ -305,7 +297,8 @@ class FileTask:
 
 
 def _classes(new: NewValues) -> dict[str, int]:
-    return class_counts([{name: values for name, (_, values) in new.values.items()}])
+    _, codes = new.values.get("Classification", (None, np.zeros(0, np.uint8)))
+    return class_counts(codes)
 
 
 # ---- an output for each tile ---------------------------------------------------------------------------------

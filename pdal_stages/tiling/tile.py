@@ -21,9 +21,9 @@ from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages.base import stage_types
 from ..stages.hag_morphological import HagMorphological
-from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
+from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
 from .inputs import CloudIndex, InputSource
-from .outputs import NewValues, PieceResults, arrays_of, class_counts, flags_in_classes, read_with, write_tile
+from .outputs import NewValues, PieceResults, arrays_of, flags_in_classes, read_with, write_tile
 from .pieces import Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, TilePlan
 from .report import left_alone
@@ -253,6 +253,7 @@ class TileTask:
             raise NoTerrainError(
                 "no terrain: no point near the tile may form one", found=f"within {halo_m:.0f} m"
             )
+        given = (one.values["Classification"] for one in head.results if "Classification" in one.values)
         return head.results, {
             "points": own,
             "read": read,
@@ -260,7 +261,7 @@ class TileTask:
             "short": short,
             "widened": halo_m > least_m,
             "dropped": own - sum(len(result.rows) for result in head.results),
-            "classes": class_counts(result.values for result in head.results),
+            "classes": class_counts(np.concatenate([np.zeros(0, np.uint8), *given])),
             "messages": head.messages,
             "left_alone": head.left_alone,
         }
