@@ -18,7 +18,7 @@ from pdal_stages.terrain.openings import HOLE
 # ---- a slow reference -----------------------------------------------------------------------------------
 
 
-def slow_pits(raster, cell=1.0):
+def slow_pits(raster, highest, cell=1.0):
     cells = np.argwhere(np.isfinite(raster))
     z = raster[tuple(cells.T)]
     away = np.linalg.norm(cells[:, None] - cells[None], axis=2)
@@ -26,7 +26,10 @@ def slow_pits(raster, cell=1.0):
     one, other = np.nonzero((away <= 3) & step)
     count, label = connected_components(coo_matrix((np.ones(len(one)), (one, other)), shape=(len(z),) * 2))
     sets = [cells[label == k] for k in range(count)]
-    small = [len(mine) <= 30 and (np.ptp(mine, axis=0) < 20).all() for mine in sets]
+    covered = np.pad(highest > raster + 2.5, 1)
+    under = lambda j, i: covered[j : j + 3, i : i + 3].any()  # noqa: E731
+    few = [len(mine) <= 30 or np.mean([under(*at) for at in mine]) >= 0.8 for mine in sets]
+    small = [some and (np.ptp(mine, axis=0) < 20).all() for some, mine in zip(few, sets, strict=True)]
     island = np.zeros(raster.shape, bool)
     island[tuple(cells.T)] = np.array(small)[label]
     low, base = np.where(island, raster, np.inf), np.where(island, np.inf, raster)
@@ -52,8 +55,10 @@ def rough(seed, shape=(44, 50), holes=0.2):
 @pytest.mark.parametrize("seed", range(2))
 def test_pits_equal_the_slow_reference(seed):
     raster = rough(seed, holes=0.2 if seed % 2 else 0.7)
-    found = pits(raster, 1.0)
-    assert np.array_equal(found, slow_pits(raster))
+    highest = np.where(raster < 0, 3.0, raster)
+    raster[20:30, 20:28] -= 9
+    found = pits(raster, highest, 1.0)
+    assert np.array_equal(found, slow_pits(raster, highest))
     assert found.any()
 
 
@@ -62,7 +67,8 @@ def test_pits_equal_the_slow_reference(seed):
 def test_pits_do_not_depend_on_where_the_raster_ends(seed):
     far = pits_reach(1.0)
     raster = rough(seed, (2 * far + 15, 2 * far + 23))
-    whole, cut = pits(raster, 1.0), pits(raster[3:-3, 3:-3].copy(), 1.0)
+    highest = raster + np.where(raster < 0, 8, 0)
+    whole, cut = pits(raster, highest, 1.0), pits(*(a[3:-3, 3:-3].copy() for a in (raster, highest)), 1.0)
     inner = slice(far, -far)
     assert np.array_equal(cut[inner, inner], whole[3:-3, 3:-3][inner, inner])
 
@@ -82,7 +88,7 @@ def test_clusters_at_one_depth_are_pits():
         for i in (12, 32, 52):
             raster[j : j + 3, i : i + 3] = rng.normal(-6, 0.3, (3, 3)) - 0.5 * j / 10
     low = raster < -2
-    assert np.array_equal(pits(raster, 1.0), low)
+    assert np.array_equal(pits(raster, raster, 1.0), low)
 
 
 @pytest.mark.parametrize("what", ["ditch", "quarry", "cellar beside a street", "wood"])
@@ -100,9 +106,17 @@ def test_what_is_deep_but_ground_is_kept(what):
         raster[:] = rng.uniform(6, 16, raster.shape)
         seen = rng.random(raster.shape) < 0.05
         raster[seen] = 0
-        assert pits(raster, 1.0)[seen].mean() < 0.05
+        assert pits(raster, np.where(seen, 12, raster), 1.0)[seen].mean() < 0.05
         return
-    assert not pits(raster, 1.0)[raster < (4 if what.startswith("cellar") else -1.5)].any()
+    assert not pits(raster, raster, 1.0)[raster < (4 if what.startswith("cellar") else -1.5)].any()
+
+
+def test_a_wide_floor_is_a_pit_where_others_lie_above_it():
+    raster, _ = field()
+    highest = raster.copy()
+    raster[20:29, 20:30] -= 12
+    assert not pits(raster, raster, 1.0).any()
+    assert np.array_equal(pits(raster, highest, 1.0), raster < -11)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.65])

@@ -10,8 +10,13 @@ from test_terrain_morphological import town
 import pdal_stages as ps
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.cells import lowest_of_cells
-from pdal_stages.terrain.decks import level_points
-from pdal_stages.terrain.groundblocks import GroundCells, by_block, cells_of_block, reach_of_block
+from pdal_stages.terrain.groundblocks import (
+    GroundCells,
+    around_blocks,
+    by_block,
+    cells_of_block,
+    reach_of_block,
+)
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions
 from pdal_stages.tiling import run_tiled, tile
 from pdal_stages.tiling.ground import FirstRoundTask
@@ -28,14 +33,15 @@ def test_the_lowest_points_of_cells(cell):
     x[:5] += 1e7  # strays
     z[7] = -1e7
     use = rng.random(3000) < 0.9
-    found = lowest_of_cells(x, y, z, use, cell)
+    found, top = lowest_of_cells(x, y, z, use, cell)
+    assert (top >= z[found]).all()
     best: dict[tuple[int, int], tuple] = {}
     for n in np.flatnonzero(use & (np.abs(z) < 1e6)):
         key = (int(np.floor(x[n] / cell)), int(np.floor(y[n] / cell)))
         best[key] = min(best.get(key, (np.inf,)), (z[n], x[n], y[n]))
     assert {(z[n], x[n], y[n]) for n in found} == set(best.values())
     assert len(found) == len(best)
-    assert lowest_of_cells(x, y, z, np.zeros(3000, bool), cell).size == 0
+    assert lowest_of_cells(x, y, z, np.zeros(3000, bool), cell)[0].size == 0
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +155,7 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_pat
 def blocks_of(points, options, near):
     """The cells of all blocks that points need, each made of the lowest points that it may look at."""
     cell = options.cell
-    low = points[:, lowest_of_cells(*points, np.ones(points.shape[1], bool), cell)]
+    low = around_blocks(*points, np.ones(points.shape[1], bool), options).T
     side, around = BLOCK_SIDE * cell, (reach_of_block(options) + 1) * cell
     inside = by_block(*points, np.ones(points.shape[1], bool), cell)
     found = []
@@ -159,7 +165,7 @@ def blocks_of(points, options, near):
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
             mine = inside.get((i, j), np.empty((0, 3)))
             found.append(
-                cells_of_block(*low[:, seen], (i, j), options, [mine[::2], mine[1::2]]).in_parts(256)
+                cells_of_block(low[:, seen].T, (i, j), options, [mine[::2], mine[1::2]]).in_parts(256)
             )
     return GroundCells.of_blocks(found, len(options.openings))
 
@@ -198,7 +204,7 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
 
 
 def test_a_block_without_points_has_no_cells():
-    none = cells_of_block(*np.empty((3, 0)), (3, -4), FilterOptions(openings=(5,)))
+    none = cells_of_block(np.empty((0, 4)), (3, -4), FilterOptions(openings=(5,)))
     assert none.cells["opened"].shape == (0, 1)
 
 
@@ -212,14 +218,10 @@ def test_decks_of_blocks_are_those_of_the_whole():
     options = {"decks": True, "openings": (5,)}
     whole = filtered_ground(x, y, z, mask=use, **options)
     assert np.count_nonzero(whole["Deck"]) > 300
-    left = np.union1d(lowest_of_cells(x, y, z, use, 1.0), level_points(x, y, z, use))
     made = FilterOptions(openings=(5,), decks=True)
+    left = around_blocks(x, y, z, use, made)
     inside = by_block(x, y, z, use, 1.0)
-    parts = [
-        cells_of_block(x[left], y[left], z[left], (i, j), made, [inside[i, j]]).in_parts(256)
-        for i in (0, 1)
-        for j in (1, 2)
-    ]
+    parts = [cells_of_block(left, (i, j), made, [inside[i, j]]).in_parts(256) for i in (0, 1) for j in (1, 2)]
     assert all(len(part["decks"]) for part in parts)
     some = filtered_ground(x, y, z, mask=use, cells=GroundCells.of_blocks(parts, 1), **options)
     for key, values in some.items():

@@ -10,9 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..terrain.cells import lowest_of_cells
-from ..terrain.decks import level_points
-from ..terrain.groundblocks import GroundCells, by_block, cells_of_block, reach_of_block
+from ..terrain.groundblocks import GroundCells, around_blocks, by_block, cells_of_block, reach_of_block
 from ..terrain.groundcells import BLOCK_SIDE, FilterOptions
 from ..terrain.morphological import filtered_ground
 from ..terrain.openings import opening_names
@@ -105,7 +103,8 @@ class HagMorphological(Stage):
         "stands on it, else 0",
     )
     details = """
-The lowest point of every cell of a grid is taken, low outliers left out, alone or in clusters, and the grid opened with
+The lowest point of every cell of a grid is taken, low outliers left out, alone or in clusters of any number of points that
+others lie above, and the grid opened with
 windows of growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an
 object.
 A surface is fitted through what is left, ground that was taken from ridges and dams is regained where it continues the
@@ -158,17 +157,12 @@ of Z.
         return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
 
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
-        """First, the points (n, 3) that blocks need: ``around`` them, and inside each (:func:`inside_block`)."""
+        """First, what blocks need of the points ``around`` them, and those (n, 3) inside each (:func:`inside_block`)."""
         x, y, z = points.axes
         usable = points.usable(self.ignore)
-        chosen = np.zeros(len(x), bool)
-        chosen[lowest_of_cells(x, y, z, usable, self.cell)] = True
-        if self.decks:
-            chosen[level_points(x, y, z, usable)] = True
-        left = np.flatnonzero(chosen)
         inside = by_block(x, y, z, usable, self.cell)
         return {
-            "around": np.column_stack([x[left], y[left], z[left]]),
+            "around": around_blocks(x, y, z, usable, self._filter),
             **{inside_block(block): xyz for block, xyz in inside.items()},
         }
 
@@ -176,8 +170,7 @@ of Z.
         self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
     ) -> dict[str, NDArray]:
         """Then, what tiles need of a block (column, row): from what was left around it and, in parts, inside."""
-        x, y, z = around.T
-        return cells_of_block(x, y, z, block, self._filter, inside).in_parts(_PART)
+        return cells_of_block(around, block, self._filter, inside).in_parts(_PART)
 
     def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
         """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have them."""

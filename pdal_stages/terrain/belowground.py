@@ -29,8 +29,9 @@ SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
 #: are compared within so many meters, but for the nearest, which may be of the same cluster.
 CLOSED, AROUND, OTHERS, APART = 1 / 3, 20, 45.0, 12.0
 #: Cells of a minimum grid are linked within so many cells, across a step of so many meters, and so many per meter of
-#: distance; an island has at most so many, and is no longer, in cells, along either axis.
-LINK, STEP, GRADE, MOST, EXTENT = 3, 0.35, 0.15, 30, 20
+#: distance; an island has at most so many, or such a share of them lies under others, so many meters above at least, or
+#: beside such a cell; and it is no longer, in cells, along either axis.
+LINK, STEP, GRADE, MOST, COVERED, ABOVE, EXTENT = 3, 0.35, 0.15, 30, 0.8, 2.5, 20
 
 
 def reach(side: float) -> int:
@@ -173,13 +174,15 @@ def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -
     return limit
 
 
-def pits(raster: NDArray[np.float32], cell: float) -> NDArray[np.bool_]:
+def pits(raster: NDArray[np.float32], highest: NDArray[np.floating], cell: float) -> NDArray[np.bool_]:
     """Cells (h, w) of a minimum grid whose lowest point is below the ground, of islands from which one walks nowhere.
 
-    `raster` has heights, holes ``inf``; `cell` is a cell's side; meters.
+    `raster` has heights, holes ``inf``; `highest` those of the highest points; `cell` is a cell's side; meters.
     """
     number, size, side = linked_cells(raster, LINK, lambda away: STEP + GRADE * cell * away)
-    island = np.append((size <= MOST) & (side < EXTENT), False)[number]
+    covered = sums_around(highest > raster + ABOVE, 1) > 0
+    share = np.bincount(number[covered & (number >= 0)], minlength=len(size))
+    island = np.append(((size <= MOST) | (share >= COVERED * size)) & (side < EXTENT), False)[number]
     if not island.any():
         return island
     return below_ground(np.where(island, raster, HOLE), np.where(island, HOLE, raster), cell) > -np.inf
@@ -187,4 +190,4 @@ def pits(raster: NDArray[np.float32], cell: float) -> NDArray[np.bool_]:
 
 def pits_reach(cell: float) -> int:
     """How far away cells change what is a pit, in cells."""
-    return reach(cell) + EXTENT + LINK
+    return reach(cell) + EXTENT + LINK + 1

@@ -98,11 +98,16 @@ def lowest_of_cells(
     z: NDArray[np.float64],
     use: NDArray[np.bool_],
     cell: float,
-) -> NDArray[np.int64]:
-    """Numbers of the points that are the lowest usable ones of their cells, ascending; meters, finite coordinates."""
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Numbers of the points that are the lowest usable ones of their cells, and the heights of the highest ones there.
+
+    In meters, finite coordinates.
+    """
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     x, y, z = x[mine], y[mine], z[mine]
-    return np.sort(mine[lowest_points(x, y, z, keys_of(cell_numbers(x, cell), cell_numbers(y, cell)))])
+    key = keys_of(cell_numbers(x, cell), cell_numbers(y, cell))
+    low, high = lowest_points(x, y, z, key), lowest_points(x, y, -z, key)
+    return mine[low], z[high]
 
 
 def levels(z: NDArray[np.float64], cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import HIGHEST, cell_numbers, keys_of, runs
-from .decks import CELL, decks_of_levels, levels_near_decks
+from .cells import HIGHEST, cell_numbers, keys_of, lowest_of_cells, runs
+from .decks import CELL, decks_of_levels, level_points, levels_near_decks
 from .groundcells import (
     BLOCK_SIDE,
     NEAR,
@@ -121,19 +121,35 @@ def by_block(
     }
 
 
-def cells_of_block(
+def around_blocks(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     z: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    options: FilterOptions,
+) -> NDArray[np.float64]:
+    """What of points must be known around blocks (n, 4), meters: the lowest of each cell and how high the highest one there
+    is; for decks, the points of levels as well."""
+    low, top = lowest_of_cells(x, y, z, use, options.cell)
+    chosen, highest = np.zeros(len(x), bool), z.copy()
+    chosen[low], highest[low] = True, top
+    if options.decks:
+        chosen[level_points(x, y, z, use)] = True
+    return np.column_stack([axis[chosen] for axis in (x, y, z, highest)])
+
+
+def cells_of_block(
+    outer: NDArray[np.float64],
     block: tuple[int, int],
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
 ) -> GroundCells:
     """The cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
 
-    x, y, z are the lowest points of cells, in meters: all within :func:`reach_of_block` cells of the block, and few more.
+    `outer` is (n, 4) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the block, and few more.
     `points` are all that may be ground in the block, in parts (n, 3).
     """
+    x, y, z, top = np.ascontiguousarray(outer.T)
     own = CellWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     cell, openings = options.cell, options.opening_radii
     # Openings reach into cells without points.
@@ -143,11 +159,11 @@ def cells_of_block(
     if options.decks:
         levels = levels_near_decks(cell_numbers(x, CELL), cell_numbers(y, CELL), z)
 
-    def given(x, y, z) -> GroundPoints:
+    def given(x, y, z, top) -> GroundPoints:
         use = np.ones(len(x), bool)
-        return GroundPoints.of(x, y, z, use, decks_of_levels(x, y, z, use, levels), cell)
+        return GroundPoints.of(x, y, z, top, use, decks_of_levels(x, y, z, use, levels), cell)
 
-    low = given(x, y, z)
+    low = given(x, y, z, top)
     if not own.grown(margin).holds(low.column, low.row).any():
         return GroundCells.of_blocks([], len(openings))
     raster, _ = ground_raster(low, options, margin=spill, wanted=own.grown(margin))
@@ -159,7 +175,8 @@ def cells_of_block(
     raster, planes = raster.cut(part), planes[part].copy()
     sums = np.zeros((*raster.shape, 4), np.int64)
     for xyz in points:
-        some = given(*np.ascontiguousarray(xyz.T))
+        x, y, z = np.ascontiguousarray(xyz.T)
+        some = given(x, y, z, z)
         height, gradient = np.empty((2, len(xyz)))
         heights_above(*some[:3], cell, raster.left, raster.bottom, planes, height, gradient)
         is_ground = options.is_ground(some.use, some.deck, height, gradient)

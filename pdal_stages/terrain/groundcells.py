@@ -193,15 +193,16 @@ class GroundPoints(NamedTuple):
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     z: NDArray[np.float64]
+    top: NDArray[np.float64]  #: as high as others of the same cell are, where these are not given
     use: NDArray[np.bool_]  #: whether they may be ground, where they are not of a deck
     deck: NDArray[np.uint8]
     column: NDArray[np.int64]
     row: NDArray[np.int64]
 
     @classmethod
-    def of(cls, x, y, z, use, deck, cell: float) -> GroundPoints:
+    def of(cls, x, y, z, top, use, deck, cell: float) -> GroundPoints:
         """Of a grid of such cells."""
-        return cls(x, y, z, use, deck, cell_numbers(x, cell), cell_numbers(y, cell))
+        return cls(x, y, z, top, use, deck, cell_numbers(x, cell), cell_numbers(y, cell))
 
     def some(self, which: NDArray | slice) -> GroundPoints:
         """Part of them."""
@@ -221,7 +222,7 @@ def ground_raster(
     On every side are `margin` empty cells, one at least: points blend the four cells round them. Where only some
     cells are `wanted`, the raster holds these and as many around as steps still look at, when that is known.
     """
-    x, y, z, use, deck, column, row = points
+    x, y, z, top, use, deck, column, row = points
     left, bottom, w, h = points.window().grown(margin)
     shape = h, w
     mine = np.flatnonzero(use)
@@ -230,7 +231,9 @@ def ground_raster(
     lowest[row[low] - bottom, column[low] - left] = low
     cell = options.cell
     raster = np.where(lowest >= 0, z[lowest], HOLE).astype(np.float32)
-    bad = pits(raster, cell)
+    highest = np.full(shape, -np.inf)
+    np.maximum.at(highest, (row[mine] - bottom, column[mine] - left), top[mine])
+    bad = pits(raster, highest, cell)
     pit_points = lowest[bad]
     raster[bad] = HOLE
     objects, floor, opened, wide = objects_of(

@@ -133,7 +133,7 @@ def filtered_ground(
     if decks:
         deck = find_decks(x, y, z, use) if cells is None else decks_of_levels(x, y, z, use, cells.decks)
     if len(x):
-        points = GroundPoints.of(x, y, z, use, deck, cell)
+        points = GroundPoints.of(x, y, z, z, use, deck, cell)
         pieces = _found(points, options, counts) if cells is None else _given(points, options, cells)
         for of, own, raster, means in pieces:
             found = _measured(points.some(of), own, raster, means, options, slope_too, threads, counts)
@@ -182,7 +182,7 @@ def _measured(
     counts: dict[str, int],
 ) -> dict[str, NDArray]:
     """Heights of points above the ground of a raster, and what they say of that themselves, where no `means` say it."""
-    x, y, z, use, deck, column, row = points
+    x, y, z, _, use, deck, column, row = points
     cell, left, bottom = options.cell, raster.left, raster.bottom
     needed = around(column, row, left, bottom, raster.shape)
     planes = surface_of(raster, options, NEAR, needed)

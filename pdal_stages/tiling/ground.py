@@ -61,7 +61,7 @@ class FirstRoundTask:
     def run(self) -> dict[str, Any]:
         """Write what is left of the tile's own points, and what the stages before the one that wants it made of them."""
         context, plan, first = self.context, self.context.plan, self.first
-        stage, left = stage_of(plan), [{"around": np.empty((0, 3))}]
+        stage, left = stage_of(plan), [{"around": np.empty((0, 4))}]
 
         def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
             mine = ins[OUTSIDE] < 0
@@ -98,9 +98,9 @@ class BlockTask:
         assert self.plan.first is not None
         blocks = self.plan.first.blocks
         low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(self.block, blocks.reach)
-        parts = [np.empty((3, 0))]  # whose rows are taken as they are
+        parts = [np.empty((4, 0))]  # whose rows are taken as they are
         for path in self.tiles:
-            x, y, _ = points = load_arrays(path, ["around"])["around"].T
+            x, y, *_ = points = load_arrays(path, ["around"])["around"].T
             parts.append(points[:, (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)])
         inside = (load_arrays(path, [inside_block(self.block)]) for path in self.tiles)
         mine = (points for found in inside for points in found.values())
