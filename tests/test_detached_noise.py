@@ -97,7 +97,7 @@ def slow_small(count, usual, most, widest):
 
 
 def slow_covered(count, whole, spacing, most):
-    """Voxels of clusters that others lie above, in most of their columns; and those of more than `most` points."""
+    """Voxels of clusters of more than `most` points that others lie above, in most of their columns."""
     top, above = {}, defaultdict(list)
     for k in sorted(count):
         top[k[:2]] = k
@@ -108,8 +108,11 @@ def slow_covered(count, whole, spacing, most):
             tops = [top.get((k[0] + b, k[1] + a)) for b, a in columns]
             above[whole[k]].append(any(t is not None and whole[t] != whole[k] for t in tops))
     under = {c for c, seen in above.items() if np.mean(seen) >= detached.COVERED}
-    large = {c for c in under if sum(n for k, n in count.items() if whole[k] == c) > most}
-    return [{k for k in count if whole[k] in clusters} for clusters in (under, large)]
+    return {
+        k
+        for k in count
+        if whole[k] in under and sum(n for o, n in count.items() if whole[o] == whole[k]) > most
+    }
 
 
 def slow_plane(base, j, i, radius, inner=0):
@@ -182,7 +185,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         for k in thin:
             small[k], size[k] = still[wider(k)], total[wider(k)]
             cluster[k] = all_of[wider(k)] and (scale, all_of[wider(k)])
-    covered, large = slow_covered(count, cluster, lambda k: density(k)[1], most)
+    covered = slow_covered(count, cluster, lambda k: density(k)[1], most)
     top, base = np.full((h, w), -np.inf), np.full((h, w), np.inf)
     lowest = {k: xyz[m, 2].min() for k, m in members.items()}
     highest = {k: xyz[m, 2].max() for k, m in members.items()}
@@ -241,7 +244,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
     out = np.array([codes.get(k, 0) for k in voxel], np.uint8)
     points, lows = np.zeros((2, h, w), np.int64)
     np.add.at(points, (at[:, 0], at[:, 1]), 1)
-    bare = np.array([k not in large for k in voxel])
+    bare = np.array([k not in covered for k in voxel])
     np.add.at(lows, (at[:, 0], at[:, 1]), (out == 7) & bare)
     for c in zip(*np.nonzero(lows), strict=True):
         near = np.maximum(abs(j - c[0]), abs(i - c[1])) <= 20

@@ -140,8 +140,8 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     np.minimum.at(lowest, voxel, z)
     np.maximum.at(highest, voxel, z)
     top, base, low = np.full(h * w, -np.inf), np.full(h * w, np.inf), np.full(h * w, np.inf)
-    covered, large = _covered(place, number, voxels.counts, spacing, w, h * w, cluster)
-    plain = ~(suspect | covered)
+    large = _covered(place, number, voxels.counts, spacing, w, h * w, cluster)
+    plain = ~(suspect | large)
     np.minimum.at(base, place[plain], lowest[plain])
     np.maximum.at(top, place[~suspect], highest[~suspect])
     # The highest voxel of a column hangs, with nothing close beneath it, as a wire does.
@@ -153,7 +153,7 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     verdict = np.zeros(len(place), np.uint8)
     rasters = (a.reshape(h, w) for a in (top, hung, hung_suspect))
     _high(place, lowest, suspect, size, spacing, *rasters, gap, verdict)
-    suspect = (suspect | covered) & (verdict == 0)
+    suspect = (suspect | large) & (verdict == 0)
     np.minimum.at(low, place[suspect], lowest[suspect])
     limit = below_ground(low.reshape(h, w), base.reshape(h, w), SIDE, depth)
     low = suspect & (highest < limit.ravel()[place])
@@ -254,7 +254,7 @@ def small_clusters(
 
 
 def _covered(place, number, counts, spacing, width, columns, most):
-    """Voxels of clusters that others lie above in nearly all of their columns; and those of more than `most` points."""
+    """Voxels of clusters of more than `most` points that others lie above in nearly all of their columns."""
     top = np.full(columns, -1)
     top[place] = np.arange(len(place))  # the last of a column is its highest
     asked = np.flatnonzero(number >= 0)
@@ -264,11 +264,11 @@ def _covered(place, number, counts, spacing, width, columns, most):
         other = top[np.clip(place + dj * width + di, 0, columns - 1)]
         near = max(abs(dj), abs(di)) < spacings + 1
         above |= near & (other >= 0) & (number[other] != number_of)
-    mostly = np.bincount(number_of, above) >= COVERED * np.bincount(number_of)
-    covered, many = np.zeros((2, len(number)), bool)
+    size = np.bincount(number_of, counts[asked])
+    mostly = (size > most) & (np.bincount(number_of, above) >= COVERED * np.bincount(number_of))
+    covered = np.zeros(len(number), bool)
     covered[asked] = mostly[number_of]
-    many[asked] = (mostly & (np.bincount(number_of, counts[asked]) > most))[number_of]
-    return covered, many
+    return covered
 
 
 @njit
