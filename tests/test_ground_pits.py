@@ -13,7 +13,7 @@ from test_detached_noise import closed_wood, slow_below
 
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.belowground import pits, pits_reach
-from pdal_stages.terrain.openings import HOLE
+from pdal_stages.terrain.cells import HOLE
 
 # ---- a slow reference -----------------------------------------------------------------------------------
 

@@ -13,9 +13,8 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import cells, filtered_ground, groundcells, openings
 from pdal_stages.terrain.groundcells import FilterOptions
-from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii
+from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii, remove_plateaus
 from pdal_stages.terrain.planes import surface
-from pdal_stages.terrain.plateaus import remove_plateaus
 
 SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
 

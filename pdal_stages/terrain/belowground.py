@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .linked import linked_cells, sums_around
-from .openings import HOLE
+from .cells import HOLE, linked_cells, sums_around
 
 #: Columns within which a plane is fitted through the ground; how many it needs.
 NEAR, ENOUGH = 9, 12

@@ -28,8 +28,16 @@ from ..base.errors import StageError
 from ..base.jit import device, njit
 from .belowground import AROUND, ENOUGH, below_ground
 from .belowground import reach as below_reach
-from .cells import HIGHEST, cell_numbers, columns, patches, places_among
-from .linked import longest_sides, number_sets, sums_around
+from .cells import (
+    HIGHEST,
+    cell_numbers,
+    columns,
+    longest_sides,
+    number_sets,
+    patches,
+    places_among,
+    sums_around,
+)
 
 LOW, HIGH = NOISE
 #: Side of a voxel, meters.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import HIGHEST, cell_numbers, keys_of, lowest_of_cells, runs
+from .cells import HIGHEST, HOLE, cell_numbers, keys_of, lowest_of_cells, runs
 from .decks import CELL, decks_of_levels, level_points, levels_near_decks
 from .groundcells import (
     BLOCK_SIDE,
@@ -24,7 +24,6 @@ from .groundcells import (
     means_of,
     surface_of,
 )
-from .openings import HOLE
 from .planes import around, heights_above
 from .planes import reach as planes_reach
 

@@ -18,14 +18,12 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.jit import njit
 from .belowground import pits, pits_reach
-from .cells import SIDE, cell_numbers, keys_of, lowest_points
+from .cells import HOLE, SIDE, cell_numbers, keys_of, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
-from .openings import HOLE, objects_of, opening_radius
+from .openings import objects_of, opening_radius, plateau_reach, remove_plateaus
 from .planes import from_parents, planes_of_blocks, surface
 from .planes import reach as planes_reach
-from .plateaus import reach as plateau_reach
-from .plateaus import remove_plateaus
 
 #: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
 NEAR, FAR = 8.0, 32.0

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .linked import sums_around
+from .cells import sums_around
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
 #: ground of a fit lies to one side or on a line.

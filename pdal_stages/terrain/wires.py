@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from .cells import cell_numbers, levels, patches
-from .linked import longest_sides, number_sets
+from .cells import cell_numbers, levels, longest_sides, number_sets, patches
 
 #: Side of the cells, meters.
 CELL = 1.0
