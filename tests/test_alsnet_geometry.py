@@ -10,7 +10,7 @@ from pdal_stages.alsnet import Circles, parse_configuration
 from pdal_stages.alsnet.circles import halo_m, spacing_for
 from pdal_stages.alsnet.geometry import ball_query, build, farthest_points, scramble, stack, three_nearest
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.clouds import density
+from pdal_stages.features.cells import density
 
 # ---- references ------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ import sys
 
 
 def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
-    code = "import numpy; from pdal_stages.features.kdtree import build_tree; build_tree(*numpy.eye(3))"
+    code = "import numpy; from pdal_stages.features.index import build_tree; build_tree(*numpy.eye(3))"
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "lines"}
 
     def said() -> str:

@@ -11,7 +11,7 @@ from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without
 
 from pdal_stages.base.arrays import hash_of
 from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
-from pdal_stages.features.voxels import represent
+from pdal_stages.features.cells import represent
 from pdal_stages.stages.preparation import PREPARATION
 
 #: Points per square meter of thinned copies.

@@ -22,10 +22,11 @@ from ..base.messages import Progress
 from ..base.resources import map_blocks, resolve_threads
 from ..classifier.algorithms import gather, with_returns
 from ..classifier.classes import ClassMap
-from ..classifier.clouds import TrainingCloud, density, label_classes
+from ..classifier.clouds import TrainingCloud, label_classes
 from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.trainoptions import TrainingOptions
+from ..features.cells import density
 from ..features.index import check_xyz
 from . import batches
 from .algorithm import AlsNet, make_pyramid, scaled

@@ -16,19 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ..accuracy.labels import as_codes
-from ..base.arrays import begins_run, hash_of
-from ..base.asprs import UNINFORMATIVE
+from ..base.arrays import hash_of
 from ..base.errors import OptionError, StageError
+from ..base.las import UNINFORMATIVE
 from ..base.messages import Progress
 from ..base.version import __version__
-from ..features.cells import cell_keys
-from ..features.voxels import represent
+from ..features.cells import density, represent
 from .algorithms import known
 from .classes import MAX_LABEL, ClassMap
 from .trainoptions import TrainingOptions
 
-#: Side in meters of the cells that density is measured in.
-CELL = 2.0
 #: A thinned copy is made where it would have less than this share of the points.
 WORTH = 0.75
 
@@ -300,19 +297,6 @@ def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
         key = os.path.basename(cloud.name), number if cloud.own is None else -1
         rows[key] = rows.get(key, 0) + cloud.points
     return [{"name": name, "points": points} for (name, _), points in rows.items()]
-
-
-def density(xyz: npt.NDArray[np.float64]) -> float:
-    """Points per square meter: the median over the occupied cells of :data:`CELL` meters, 0 for an empty cloud.
-
-    Strays, holes and the cloud's outline do not matter, and the order of the points does not.
-    """
-    if not len(xyz):
-        return 0.0
-    keys, _ = cell_keys(xyz[:, :2], CELL)
-    keys.sort()
-    starts = np.flatnonzero(begins_run(keys))
-    return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
 
 
 def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from ..base.errors import DimensionError, ModelError, OptionError, suggest
 from ..base.messages import Report
 from ..features import FeaturePlan
+from ..features.cells import check_side, density, represent
 from ..features.index import build_grid, check_xyz
-from ..features.voxels import check_side, represent
 from . import modelfile, summary
 from .algorithms import (
     InputPlan,
@@ -29,7 +29,6 @@ from .algorithms import (
     required,
     welcome,
 )
-from .clouds import density
 from .featureforest import weighed
 from .passes import Asked, plan_of, predict
 

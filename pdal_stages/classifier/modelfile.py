@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base import strictjson
+from ..base.checks import strict_json
 from ..base.errors import ModelError, StageError
 from ..base.files import whole_files
 from .algorithms import ArrayRule
@@ -232,7 +232,7 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
 def parse(data: bytes, own: bool = False) -> dict[str, Any]:
     """The manifest in `data`, valid by its schema; `own` ones, which came with the package, are known to be."""
     try:
-        manifest = strictjson.loads(data.decode("utf-8"))
+        manifest = strict_json(data.decode("utf-8"))
     except RecursionError:
         raise ModelError("the manifest is nested too deeply") from None
     except ValueError as error:

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..base.asprs import class_name
 from ..base.errors import StageError
+from ..base.las import class_name
 from ..base.messages import one_line, print_messages
 from . import INPUTS, Parser, switch, takes_options, tiles
 

@@ -13,9 +13,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ..base.asprs import class_name
 from ..base.errors import OptionError
 from ..base.files import check_writable, write_whole
+from ..base.las import class_name
 from ..base.messages import print_messages
 from ..base.resources import parse_size
 from ..tiling.report import LEFT_ALONE, InterruptedRun, TiledRun

@@ -22,8 +22,7 @@ from ..base.jit import device, njit
 from ..base.resources import map_blocks
 from .bins import ShapeBins
 from .entropy import add_up, eigenvalues_of, lowest_entropy, make_sums, write_moments
-from .index import CellGrid
-from .kdtree import build_tree
+from .index import CellGrid, build_tree
 from .moments import COINCIDENT, RADIUS, REACH, ROWS, finish
 from .names import MOMENT_FEATURES, SURFACES
 from .neighborhoods import AROUND, COPT_REACH

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import NOISE, by_height
 from ..base.errors import StageError
+from ..base.las import NOISE, by_height
 
 #: Rules in the order in which they are applied, and how many voxels to each side they look.
 RULES = {"ground": 2, "islands": 1, "lone": 1}

@@ -17,8 +17,7 @@ from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from .classify_request import ClassifyRequest
 from .expansion import expand_stage
-from .filenames import stage_files
-from .inputs_outputs import in_folders, input_files, reader_of
+from .inputs_outputs import in_folders, input_files, reader_of, stage_files
 from .read import Override, apply_overrides
 from .run import Pipeline
 from .runtime import points_of_views

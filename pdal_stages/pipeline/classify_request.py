@@ -6,17 +6,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from ..base.asprs import BRIDGE
 from ..base.errors import ModelError, OptionError, suggest
+from ..base.las import BRIDGE
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation
 from ..stages.base import stage_types
 from .expansion import expand_stage
-from .filenames import LAS_WRITERS
 from .inputs_outputs import overridden, reader_of, writer_of
 from .las_output import extra_dims_option
-from .read import Override
+from .read import LAS_WRITERS, Override
 from .run import Pipeline
 
 #: What finds bridge decks along with the heights.

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import checks
-from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
+from ..base.las import LEGACY_LIMIT
 from ..classifier.algorithms import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of

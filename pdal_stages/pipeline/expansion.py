@@ -20,9 +20,8 @@ from ..stages import preparation
 from ..stages.base import Stage, stage_type, stage_types
 from ..stages.points import MAKERS
 from . import pdal as pdal_env
-from .filenames import is_reader, reader_files
 from .las_output import check_copc, check_writers, files_with_flags_to_split, flag_splitter
-from .read import PipelineSource
+from .read import PipelineSource, is_reader, reader_files
 from .runtime import TRAMPOLINE, made, place, python_filter
 
 #: Options of every PDAL stage that an expanded stage hands on.

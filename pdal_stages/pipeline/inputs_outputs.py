@@ -14,9 +14,10 @@ from typing import Any
 from ..base.errors import PipelineError, StageError, optional_import, suggest
 from ..base.las import projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, units_of_wkt
+from ..classifier.modelfile import find
+from ..stages.base import Stage
 from . import pdal as pdal_env
-from .filenames import is_writer, readers_files
-from .read import Override, apply_overrides
+from .read import Override, apply_overrides, is_writer, readers_files
 
 #: What the description of an EPT source is called.
 EPT = "ept.json"
@@ -318,3 +319,13 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
     of_kind = {kind: reference_of(reader, horizontal) for kind, reader in kinds.items()}
     found = {path: of_kind[kind] for path, (kind, _) in readers.items()}
     return check_one_reference(found)
+
+
+def stage_files(stage: Stage) -> list[str]:
+    """Files that a stage of ours reads."""
+    written = {output.path for output in stage.outputs()}
+    if stage.type.startswith("writers."):  # whose outputs may be named after it
+        written.add(stage.options["filename"])
+    given = [(o.kind, stage.options[o.name]) for o in stage.all_options() if o.kind in ("filename", "model")]
+    found = [find(name) if kind == "model" else name for kind, name in given if name]
+    return [name for name in [*found, *stage.inputs()] if name not in written]

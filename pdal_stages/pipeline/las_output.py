@@ -13,12 +13,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
-from ..base.las import LasHeader, extra_dimensions, read_header, supersede_copc
+from ..base.las import LEGACY_LIMIT, LasHeader, extra_dimensions, read_header, supersede_copc
 from ..stages.base import Stage, stage_types
 from . import pdal as pdal_env
-from .filenames import is_reader, is_writer, reader_files, writes_las
+from .read import is_reader, is_writer, reader_files, writes_las
 from .runtime import python_filter
 
 #: A variable-length record of LAS holds 65,535 bytes; the description of an extra dimension takes 192.

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import NOISE
 from ..base.errors import StageError
-from ..base.las import read_header
+from ..base.las import NOISE, read_header
 from ..stages.points import Points
 from . import pdal as pdal_env
 from .inputs_outputs import reader_of

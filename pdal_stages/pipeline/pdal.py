@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
 from ..base.lascheck import DAMAGED, check_readable
-from .filenames import readers_files
+from .read import readers_files
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "

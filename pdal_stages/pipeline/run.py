@@ -20,17 +20,19 @@ from ..stages.base import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand
-from .filenames import (
+from .inputs_outputs import check_readers, stage_files
+from .read import (
+    Override,
+    PipelineSource,
+    apply_overrides,
     is_reader,
     is_writer,
     named_files,
+    read_pipeline,
     readers_files,
-    stage_files,
     with_outputs,
     writers_outputs,
 )
-from .inputs_outputs import check_readers
-from .read import Override, PipelineSource, apply_overrides, read_pipeline
 
 
 class Pipeline:

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import class_color
 from ..base.errors import DependencyError, StageError
 from ..base.files import check_writable, whole_files
+from ..base.las import class_color
 from ..base.units import Units
 from ..objects import Cells, Objects, ObjectSettings, find_objects
 from ..objects.cells import CLASSES, Kind, refuse_unclassified

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..base.asprs import class_name
 from ..base.files import write_whole
+from ..base.las import class_name
 from ..base.messages import duration
 from .page import render
 

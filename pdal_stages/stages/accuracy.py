@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
-from ..base.asprs import UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, write_whole
+from ..base.las import UNINFORMATIVE
 from ..base.messages import Report, plain
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import BRIDGE
+from ..base.las import BRIDGE
 from ..terrain.decks import PARTS, SURFACE
 from .base import ClassStage
 from .options import ignore_option, keep_option, option

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import HIGH as HIGH_VEGETATION
-from ..base.asprs import LOW, MEDIUM, by_height
 from ..base.errors import OptionError
+from ..base.las import HIGH as HIGH_VEGETATION
+from ..base.las import LOW, MEDIUM, by_height
 from ..base.messages import Progress
 from ..classifier import Model
 from ..classifier.model import UNCLASSIFIED, loaded_model

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import strictjson
+from ..base.checks import strict_json
 from ..base.errors import OptionError
 from ..base.files import JSON, Output, write_whole
 from ..base.messages import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
+from ..features.cells import LARGEST, check_side, represent
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
-from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage
 from .options import ignore_option, option
 from .points import Points
@@ -166,7 +166,7 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
     if path is None or not Path(path).exists():
         return None, None
     try:
-        content = strictjson.loads(Path(path).read_bytes())
+        content = strict_json(Path(path).read_bytes())
         bins, threshold = content["bins"], content["copt_threshold"]
         return (
             ShapeBins.from_dict(bins) if bins is not None else None,

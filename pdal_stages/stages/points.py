@@ -11,8 +11,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, OptionError, StageError
+from ..base.las import LEGACY_LIMIT, OVERLAP
 from ..base.messages import Report
 from ..base.resources import give_back
 from ..base.units import Units, reprojection_cure, units_of_wkt

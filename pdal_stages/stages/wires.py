@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import TOWER, WIRE
+from ..base.las import TOWER, WIRE
 from ..terrain import towers
 from ..terrain.towers import find_towers
 from ..terrain.wires import REACH, find_wires

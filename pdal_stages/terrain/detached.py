@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.arrays import begins_run
-from ..base.asprs import NOISE
 from ..base.errors import StageError
 from ..base.jit import device, njit
+from ..base.las import NOISE
 from .belowground import AROUND, ENOUGH, below_ground
 from .belowground import reach as below_reach
 from .cells import (

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import las, lascheck, strictjson
+from ..base import las, lascheck
+from ..base.checks import strict_json
 from ..base.errors import OptionError, PipelineError, StageError
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
-from ..pipeline.filenames import LAS_READERS, named_files
 from ..pipeline.inputs_outputs import Reference, check_one_reference, locations, reference_of
+from ..pipeline.read import LAS_READERS, named_files
 from .plan import TilePlan, outputs_for
 from .settings import (
     Box,
@@ -141,7 +142,7 @@ def read_ept(path: str) -> dict[str, Any]:
         else:
             with open(path, "rb") as file:
                 text = file.read(_LARGEST)
-        found = strictjson.loads(text)
+        found = strict_json(text)
         x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
         named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
         if int(found["points"]) < 0 or not (x0 <= x1 and y0 <= y1) or not named:

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import las
-from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import StageError
 from ..base.files import whole_files
+from ..base.las import LEGACY_LIMIT
 from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.filenames import LAS_WRITERS
+from ..pipeline.read import LAS_WRITERS
 from ..pipeline.runtime import Callbacks
 from ..stages.points import class_counts
 from .inputs import InputSource

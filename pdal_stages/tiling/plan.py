@@ -12,9 +12,8 @@ from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
 from ..pipeline import pdal as pdal_env
-from ..pipeline.filenames import writes_las
 from ..pipeline.inputs_outputs import MOVING, is_ept, named_outputs, outputs_of
-from ..pipeline.read import Override, PipelineSource
+from ..pipeline.read import Override, PipelineSource, writes_las
 from ..pipeline.run import Pipeline
 from ..stages.base import Stage
 from ..stages.hag_morphological import Blocks, HagMorphological

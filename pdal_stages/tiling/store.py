@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import strictjson
+from ..base.checks import strict_json
 from ..base.errors import StageError
 from ..base.files import try_lock, whole_files
 
@@ -106,7 +106,7 @@ class Store:
     def note(self, name: str) -> dict[str, Any]:
         """What was noted of something that is done, with its fingerprint; nothing where it is not."""
         try:
-            found = strictjson.loads(self._note(name).read_bytes())
+            found = strict_json(self._note(name).read_bytes())
             return found if isinstance(found, dict) else {}
         except (OSError, ValueError, RecursionError):
             return {}
