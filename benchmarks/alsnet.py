@@ -17,8 +17,8 @@ from pathlib import Path
 import laspy
 import numpy as np
 
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.terrain.minima import hag_minima
 
 

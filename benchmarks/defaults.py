@@ -24,8 +24,8 @@ from typing import Any
 import laspy
 import numpy as np
 
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.accuracy import Accuracy
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.algorithms import ALWAYS, WHERE_THERE
 from pdal_stages.classifier.model import load_model
 from pdal_stages.features.names import SURFACES

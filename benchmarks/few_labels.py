@@ -16,7 +16,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.algorithms import preparing
 from pdal_stages.classifier.model import load_model
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from pdal_stages.objects import Cells, ObjectSettings, find_objects
+from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
 from pdal_stages.objects.compare import compare_buildings, matched_by_overlap, matched_by_place
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines

@@ -30,9 +30,10 @@ from typing import Any
 import laspy
 import numpy as np
 
+from pdal_stages import load_model
 from pdal_stages.base.version import __version__
-from pdal_stages.classifier import Forest, load_model
 from pdal_stages.classifier import context as contexts
+from pdal_stages.classifier.forest import Forest
 from pdal_stages.features import engine as feature_engine
 from pdal_stages.objects.consistency import consistent
 from pdal_stages.synthetic import make_town, write_town

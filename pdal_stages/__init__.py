@@ -13,23 +13,23 @@ from .base.version import __version__
 
 _WHERE = {
     "Accuracy": "accuracy",
-    "Cells": "objects",
+    "Cells": "objects.cells",
     "Filter": "pipeline.native",
-    "Model": "classifier",
-    "ObjectSettings": "objects",
+    "Model": "classifier.model",
+    "ObjectSettings": "objects.found",
     "FeatureTable": "features",
     "Pipeline": "pipeline.run",
     "PointClassifier": "classifier.estimator",
     "StageError": "base.errors",
-    "TrainingCloud": "classifier",
-    "TrainingOptions": "classifier",
+    "TrainingCloud": "classifier.clouds",
+    "TrainingOptions": "classifier.trainoptions",
     "Writer": "pipeline.native",
     "compute_features": "features",
     "detached_noise": "terrain",
-    "find_objects": "objects",
+    "find_objects": "objects.find",
     "filtered_ground": "terrain",
     "hag_minima": "terrain",
-    "load_model": "classifier",
+    "load_model": "classifier.model",
     "make_town": "synthetic",
     "object_frames": "reports.objectlayers",
     "object_layers": "reports.objectlayers",
@@ -38,7 +38,7 @@ _WHERE = {
     "run_stage": "pipeline.runtime",
     "run_tiled": "tiling",
     "TilingOptions": "tiling.settings",
-    "train": "classifier",
+    "train": "classifier.training",
     "write_accuracy_report": "reports.accuracypage",
 }
 
@@ -47,11 +47,16 @@ __all__ = [*_WHERE, "__version__"]
 if TYPE_CHECKING:
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
-    from .classifier import Model, TrainingCloud, TrainingOptions, load_model, train
+    from .classifier.clouds import TrainingCloud
     from .classifier.estimator import PointClassifier
+    from .classifier.model import Model, load_model
+    from .classifier.training import train
+    from .classifier.trainoptions import TrainingOptions
     from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
-    from .objects import Cells, ObjectSettings, find_objects
+    from .objects.cells import Cells
+    from .objects.find import find_objects
+    from .objects.found import ObjectSettings
     from .pipeline.native import Filter, Writer
     from .pipeline.run import Pipeline, run_pipeline
     from .reports.accuracypage import write_accuracy_report

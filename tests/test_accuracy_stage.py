@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import StageError
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.cli import main
 from pdal_stages.pipeline.accuracy_files import paired
 from pdal_stages.pipeline.inputs_outputs import input_files

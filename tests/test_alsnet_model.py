@@ -8,11 +8,12 @@ from alsnet_scenes import TINY, coverage, model_of, random_net, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdal_stages import load_model
 from pdal_stages.alsnet import AlsNet, Circles
 from pdal_stages.alsnet.algorithm import make_pyramid, scaled
 from pdal_stages.alsnet.geometry import build, scramble
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import load_model, modelfile
+from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.algorithms import PredictRequest
 
 INPUTS = ("Z", "HeightAboveGround", "Intensity")
@@ -240,8 +241,8 @@ def test_hostile_parameters_are_refused(parameters, text, tmp_path):
 def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
     import sys
 
+    from pdal_stages import TrainingCloud, TrainingOptions, train
     from pdal_stages.base.errors import DependencyError
-    from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "pdal_stages.alsnet.network", raising=False)
@@ -264,7 +265,7 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
     ],
 )
 def test_options_are_checked(values, text):
-    from pdal_stages.classifier import TrainingOptions
+    from pdal_stages import TrainingOptions
 
     with pytest.raises(OptionError, match=text):
         TrainingOptions(**values)

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pdal_stages
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.alsnet import Circles, Configuration, Level
 from pdal_stages.alsnet.batches import (
     JITTER,
@@ -29,7 +30,6 @@ from pdal_stages.alsnet.batches import (
 from pdal_stages.alsnet.geometry import build
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.base.files import CHECKPOINT, kind_of
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 
 needs_torch = pytest.mark.skipif(
     importlib.util.find_spec("torch") is None,

@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 from test_classifier_training import SMALL, scene
 
+from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import (
-    TrainingCloud,
-    TrainingOptions,
-    foresttraining,
-    load_model,
-    modelfile,
-    passes,
-    train,
-)
+from pdal_stages.classifier import foresttraining, modelfile, passes
 from pdal_stages.classifier.trainoptions import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 

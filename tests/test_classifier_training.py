@@ -3,16 +3,10 @@
 import numpy as np
 import pytest
 
+from pdal_stages import Model, TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError
-from pdal_stages.classifier import (
-    Model,
-    Prediction,
-    TrainingCloud,
-    TrainingOptions,
-    foresttraining,
-    load_model,
-    train,
-)
+from pdal_stages.classifier import foresttraining
+from pdal_stages.classifier.algorithms import Prediction
 
 SMALL = {
     "neighborhoods": "c1,s2,kopt(5,20)",

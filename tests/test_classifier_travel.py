@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_classifier_training import SMALL, scene
 
+from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.classifier.clouds import prepared
 from pdal_stages.classifier.sampling import draw_samples, share_out
 from pdal_stages.features.cells import density

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.features import FeatureEngine, FeaturePlan
 from pdal_stages.features.engine import fit_clouds
 from pdal_stages.features.shapes import SAMPLES, smallest_hashes

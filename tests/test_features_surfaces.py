@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_features_adaptive import CLOUDS, some, town
 
+from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features
 from pdal_stages.features.eigen import eigen3
 from pdal_stages.features.names import SURFACES

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.modelfile import find
 from pdal_stages.classifier.summary import BINS, Sureness, of_the_base, said, sureness_of
 from pdal_stages.cli import main

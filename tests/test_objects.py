@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from town_truth import true_objects
 
 import pdal_stages as ps
+from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.base.errors import StageError
-from pdal_stages.objects import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import CLASSES, Kind, cell_keys, kind_of_code, object_id
 from pdal_stages.objects.roofs import connected
 from pdal_stages.objects.view import fill_gaps

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages import cli
+from pdal_stages import Cells, cli
 from pdal_stages.base.errors import StageError
-from pdal_stages.objects import Cells
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.synthetic import write_town
@@ -77,7 +76,7 @@ def test_neighbors_share_their_wall():
 
 
 def test_holes_stay_and_small_ones_close():
-    from pdal_stages.objects import find_objects
+    from pdal_stages import find_objects
     from pdal_stages.objects.cells import Kind
 
     x, y = (v.ravel() for v in np.meshgrid(np.arange(0, 40, 0.25), np.arange(0, 40, 0.25)))

@@ -11,15 +11,9 @@ from test_classifier_passes import FEW
 from test_classifier_training import scene
 
 import pdal_stages as ps
+from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import (
-    TrainingCloud,
-    TrainingOptions,
-    foresttraining,
-    load_model,
-    modelfile,
-    train,
-)
+from pdal_stages.classifier import foresttraining, modelfile
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.context import count_shares
 from pdal_stages.classifier.featureforest import EVEN, Blend, trust, weighed

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, train
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.classifier.clouds import TiledCloud
 from pdal_stages.classifier.foresttraining import SHORT
 from pdal_stages.classifier.training import reach

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pdal_stages as ps
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.features import compute_features
 from pdal_stages.features.cells import represent
 

@@ -18,7 +18,7 @@ from leave_one_out import tables
 from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
 from rules import table
 
-from pdal_stages.classifier import load_model
+from pdal_stages import load_model
 from pdal_stages.stages.preparation import PREPARATION, as_json
 
 

@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 from recipe import OPTIONS, training_clouds
 
-from pdal_stages.classifier import FeatureForest, Forest, Model, TrainingCloud
+from pdal_stages import Model, TrainingCloud
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.clouds import label_classes
 from pdal_stages.classifier.context import Context, count_shares
-from pdal_stages.classifier.featureforest import CloudFeatures, Features
-from pdal_stages.classifier.forest import grow_forest
+from pdal_stages.classifier.featureforest import CloudFeatures, FeatureForest, Features
+from pdal_stages.classifier.forest import Forest, grow_forest
 from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.sampling import draw_samples

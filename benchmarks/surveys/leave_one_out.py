@@ -22,8 +22,8 @@ from clouds import SURVEYS, Cloud, load, slug, thinned, with_heights
 from folds import TREES, LeaveOneOut
 from recipe import contradicted
 
+from pdal_stages import Model, TrainingCloud, load_model
 from pdal_stages.accuracy import Accuracy
-from pdal_stages.classifier import Model, TrainingCloud, load_model
 from pdal_stages.reports.views import triptych, write_png
 
 SAMPLES = (11, 12, 21, 31, 41, 51, 54, 61)

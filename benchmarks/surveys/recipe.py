@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without_returns
 
+from pdal_stages import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.base.arrays import hash_of
-from pdal_stages.classifier import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.features.cells import represent
 from pdal_stages.stages.preparation import PREPARATION
 

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from clouds import SURVEYS, published, slug, true_classes
 
-from pdal_stages import detached_noise, filtered_ground, load_model
+from pdal_stages import Model, detached_noise, filtered_ground, load_model
 from pdal_stages.base.las import BRIDGE
-from pdal_stages.classifier import Model
 from pdal_stages.objects.consistency import RULES, consistent
 
 #: Codes of labels for which a deck found is none: ground, vegetation, building, water.

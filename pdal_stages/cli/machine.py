@@ -229,7 +229,9 @@ def _warmup(options: argparse.Namespace) -> None:
     """What the demo, the default heights, training and classification use, on a few points of no meaning."""
     import numpy as np
 
-    from ..classifier import TrainingCloud, TrainingOptions, train
+    from ..classifier.clouds import TrainingCloud
+    from ..classifier.training import train
+    from ..classifier.trainoptions import TrainingOptions
     from ..synthetic import make_town
     from ..terrain import detached_noise, filtered_ground, hag_minima
 

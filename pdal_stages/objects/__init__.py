@@ -3,9 +3,3 @@
 Everything is derived from records of cells of an absolute grid (:mod:`.cells`), in which only whole numbers are counted,
 added and compared. They do not depend on the order of points, nor on how these are spread over files and tiles.
 """
-
-from .cells import Cells
-from .find import find_objects
-from .found import Objects, ObjectSettings
-
-__all__ = ["Cells", "ObjectSettings", "Objects", "find_objects"]

@@ -15,9 +15,9 @@ from ..base.errors import DependencyError, StageError
 from ..base.files import check_writable, whole_files
 from ..base.las import class_color
 from ..base.units import Units
-from ..objects import Cells, Objects, ObjectSettings, find_objects
-from ..objects.cells import CLASSES, Kind, refuse_unclassified
-from ..objects.found import Table
+from ..objects.cells import CLASSES, Cells, Kind, refuse_unclassified
+from ..objects.find import find_objects
+from ..objects.found import Objects, ObjectSettings, Table
 from ..objects.measure import CHECK
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines, vector
 

@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
 from ..base.messages import Report
-from ..classifier import Model, TrainingCloud, TrainingOptions, summary, train
+from ..classifier import summary
 from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, required, trainer, welcome
 from ..classifier.classes import ClassMap
+from ..classifier.clouds import TrainingCloud
 from ..classifier.foresttraining import SHORT
-from ..classifier.model import loaded_model
+from ..classifier.model import Model, loaded_model
 from ..classifier.modelfile import digest_of, find
 from ..classifier.summary import of_the_base
+from ..classifier.training import train
+from ..classifier.trainoptions import TrainingOptions
 from .base import Stage, files_read
 from .checked import SURE, CheckedChoice, Looked
 from .options import option

@@ -12,8 +12,7 @@ from ..base.errors import OptionError
 from ..base.las import HIGH as HIGH_VEGETATION
 from ..base.las import LOW, MEDIUM, by_height
 from ..base.messages import Progress
-from ..classifier import Model
-from ..classifier.model import UNCLASSIFIED, loaded_model
+from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.modelfile import find
 from ..classifier.summary import Limit, Sureness, said, sureness_of
 from .base import Stage

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import checks
-from ..objects import Cells, Objects, ObjectSettings, find_objects
-from ..objects.cells import CLASSES, ENOUGH, Kind, kind_of_code, refuse_unclassified
-from ..objects.find import FOUND
+from ..objects.cells import CLASSES, ENOUGH, Cells, Kind, kind_of_code, refuse_unclassified
+from ..objects.find import FOUND, find_objects
+from ..objects.found import Objects, ObjectSettings
 from ..objects.measure import CHECK, REASONS
 from ..objects.view import MARGIN
 from .base import Stage

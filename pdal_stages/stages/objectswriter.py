@@ -5,7 +5,7 @@ from __future__ import annotations
 from numpy.typing import NDArray
 
 from ..base.files import Output
-from ..objects import find_objects
+from ..objects.find import find_objects
 from ..objects.outlines import with_vector
 from .base import Stage
 from .objects import ObjectOptions

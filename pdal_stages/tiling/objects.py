@@ -18,8 +18,9 @@ from ..base.files import JSON, Output, check_outputs, write_whole
 from ..base.messages import Progress, print_messages
 from ..base.units import Units
 from ..base.version import __version__
-from ..objects import Cells, Objects, ObjectSettings, find_objects
-from ..objects.cells import refuse_unclassified
+from ..objects.cells import Cells, refuse_unclassified
+from ..objects.find import find_objects
+from ..objects.found import Objects, ObjectSettings
 from ..pipeline.inputs_outputs import check_one_reference, input_files, reference_of_file
 from ..pipeline.parts import arrays_in_parts, reads_in_parts
 from ..pipeline.read import Override

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs
 from ..base.messages import Report
-from ..classifier import Model, TrainingCloud, TrainingOptions, train
-from ..classifier.clouds import TiledCloud
+from ..classifier.clouds import TiledCloud, TrainingCloud
+from ..classifier.model import Model
 from ..classifier.summary import FILE_NUMBER
-from ..classifier.training import reach
+from ..classifier.training import reach, train
+from ..classifier.trainoptions import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import expand_stage

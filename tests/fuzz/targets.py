@@ -24,9 +24,10 @@ from typing import Any
 import laspy
 import numpy as np
 
+from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base import las, lascheck
 from pdal_stages.base.errors import StageError
-from pdal_stages.classifier import TrainingCloud, TrainingOptions, load_model, modelfile, train
+from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.model import assemble
 from pdal_stages.pipeline.expansion import expand
