@@ -28,7 +28,7 @@ from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier.algorithms import ALWAYS, WHERE_THERE
 from pdal_stages.classifier.model import load_model
-from pdal_stages.features.names import SURFACES
+from pdal_stages.features.plan import SURFACES
 from pdal_stages.terrain import filtered_ground
 
 #: What ``pdal-stages train`` takes where points have it.

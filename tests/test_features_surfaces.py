@@ -11,7 +11,7 @@ from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features
 from pdal_stages.features.eigen import eigen3
-from pdal_stages.features.names import SURFACES
+from pdal_stages.features.plan import SURFACES
 
 TOKENS = "k3,k20"
 

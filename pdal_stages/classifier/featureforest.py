@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.names import GROUPS, RELATIVE
+from ..features.plan import GROUPS, RELATIVE
 from .algorithms import REFINED, ArrayRule, Column, PredictRequest, gather, with_returns
 from .context import OWN, Context
 from .forest import Forest

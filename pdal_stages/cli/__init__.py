@@ -21,7 +21,8 @@ from ..base.version import __version__
 #: Modules and their commands, which are imported for these alone; for ``commands`` all are.
 _COMMANDS = {
     "pipelines": ("pipeline", "expand", "validate"),
-    "files": ("classify", "objects", "review", "corrections"),
+    "tiles": ("classify",),
+    "files": ("objects", "review", "corrections"),
     "models": ("models", "train", "adapt", "accuracy", "model"),
     "machine": ("drivers", "options", "doctor", "plugin", "demo", "warmup"),
 }

@@ -1,57 +1,19 @@
-"""Files in, files out: classes, objects, what to review, and what was corrected."""
+"""What follows classes: objects, what to review, and what was corrected."""
 
 from __future__ import annotations
 
 import argparse
-import shlex
-from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ..base.errors import StageError
-from ..base.las import class_name
-from ..base.messages import one_line, print_messages
-from . import INPUTS, Parser, switch, takes_options, tiles
+from . import Parser, takes_options
 
 if TYPE_CHECKING:
-    from ..tiling.classify import ClassifyTask
-    from ..tiling.report import Job
+    pass
 
 
 def add_commands(parser: Parser) -> None:
-    """``classify``, ``objects``, ``review`` and ``corrections``."""
-    takes = parser.command("classify", _classify, "Classify clouds with a model", overrides=True, logged=True)
-    takes("inputs", nargs="+", metavar="input", help=INPUTS)
-    takes("output", help="A file; of several inputs a folder, or a name with # where the input's goes")
-    takes("--model", default="standard", help="A model file, or one of pdal-stages models; default standard")
-    takes(
-        "--dimensions",
-        metavar="LIST",
-        help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
-        "default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 (1.6 %%), which keeps files small",
-    )
-    switch(takes, "--noise", True, "Mark low and high noise first (filters.detachednoise)")
-    takes(
-        "--polygons",
-        action="append",
-        default=[],
-        metavar="FILE=CODE",
-        help="Class of ground inside the polygons of an OGR file, e.g. lakes.gpkg=9; of other classes too: "
-        "bridges.gpkg=17:2,6; may be repeated (filters.polygons)",
-    )
-    takes(
-        "--objects", metavar="FILE", help="Then write objects of all outputs to a vector file (see objects)"
-    )
-    switch(takes, "--bridges", True, "Find bridge decks (17), with heights of filters.hag_morphological")
-    switch(takes, "--wires", False, "Find wires (14); tiles take 85 m more around them")
-    switch(takes, "--towers", False, "Find wires, and towers and poles (15) with them; tiles take 145 m more")
-    switch(takes, "--consistency", True, "Mend classes that contradict their surroundings, at the end")
-    takes_options(takes, "filters.modelclassifier", "vegetation_heights", "keep_sure")
-    takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
-    takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
-    tiles.add_arguments(parser.commands["classify"], survey=True)
-
+    """``objects``, ``review`` and ``corrections``."""
     what = "Write buildings, trees, spans and decks of classified files to a vector file"
     takes = parser.command("objects", _objects, what, overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
@@ -79,96 +41,6 @@ def add_commands(parser: Parser) -> None:
     area = "Polygons in which all was looked at (of review: where 'done' is 1); may be repeated"
     takes("--area", action="append", default=[], metavar="FILE", help=area)
     takes("--around", type=float, default=1.0, metavar="METERS", help="Around changes all was looked at (1)")
-
-
-def _classify(options: argparse.Namespace) -> int:
-    from ..pipeline.classify_request import WRITTEN, ClassifyRequest
-    from ..tiling.classify import ClassifyTask
-
-    own, others = [], list(options.overrides)
-    if options.objects:
-        from ..tiling.objects import OPTIONS_OF, refuse_tiles, write_objects, writer
-
-        own = [one for one in others if not one.by_tag and one.selector in OPTIONS_OF]
-        others = [one for one in others if one not in own]
-    listed = options.dimensions
-    named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
-    same = ("noise", "bridges", "towers", "consistency", "keep_sure")
-    request = ClassifyRequest(
-        options.model,
-        tuple(others),
-        options.where,
-        named,
-        wires=options.wires or options.towers,
-        polygons=tuple(options.polygons),
-        vegetation_heights=options.vegetation_heights or "",
-        **{name: getattr(options, name) for name in same},
-    )
-    print_messages(*request.cost)
-    task = ClassifyTask(
-        tuple(options.inputs),
-        options.output,
-        request,
-        tiles.options_of(options),
-        metadata=options.metadata or "",
-        log=options.log or "",
-        reports=bool(options.report),
-    )
-    tiles.check_reports(options)
-    then = None
-    if options.objects:
-        stage = writer(options.objects, own)
-        refuse_tiles(task, options.objects)
-        then = partial(write_objects, task.outputs, stage, max(1, task.options.local_workers))
-    names = {code: one_line(name) for code, name in request.loaded.classes}
-    if not task.in_one_piece:
-        return _classify_tiles(task, options, names, then)
-    if options.dry_run:
-        request.pipeline(task.files[0], task.outputs[0])
-        print("1 input, in one piece")
-        return 0
-    tiles.end_at_once(options)
-    written = task.run_whole()
-    print_messages(*written.messages)
-    print(f"{tiles.counted(written.points, 'point')} written to {written.path}")
-    tiles.print_classes(written.classes, written.left_alone, names)
-    if then is not None:
-        then()
-    return 0
-
-
-def _classify_tiles(
-    task: ClassifyTask,
-    options: argparse.Namespace,
-    names: Mapping[int, str],
-    then: Callable[[], dict[str, Any]] | None,
-) -> int:
-    def finished(job: Job) -> None:  # out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %
-        assert job.outputs is not None
-        classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
-        total = sum(classes.values())
-        shares = [
-            f"{code} {names.get(code, class_name(code))} {100.0 * n / total:.1f} %"
-            for code, n in sorted(classes.items())
-        ]
-        said = f"; {', '.join(shares)}" if shares else ""
-        print(f"{job.outputs[0]}: {tiles.counted(job.record.get('written', 0), 'point')}{said}", flush=True)
-
-    run, interrupted = tiles.ran(lambda: task.run_tiles(dry_run=options.dry_run, finished=finished))
-    if options.dry_run:
-        tiles.print_dry(run)
-    else:
-        tiles.print_run(run)
-        tiles.print_classes(run.summary["classes"], run.summary["left_alone"], names)
-        if then is not None and not interrupted and not run.failures:
-            try:
-                run.objects = then()
-            except StageError:
-                tiles.end_run(options, run, "")
-                raise
-    words = [word for word in options.arguments if word != "--resume"]
-    same = shlex.join(["pdal-stages", *words]) if len(words) <= 20 else "the same command with"
-    return tiles.end_run(options, run, f"{same} --resume" if interrupted else "")
 
 
 def _objects(options: argparse.Namespace) -> None:

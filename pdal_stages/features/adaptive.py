@@ -24,9 +24,8 @@ from .bins import ShapeBins
 from .entropy import add_up, eigenvalues_of, lowest_entropy, make_sums, write_moments
 from .index import CellGrid, build_tree
 from .moments import COINCIDENT, RADIUS, REACH, ROWS, finish
-from .names import MOMENT_FEATURES, SURFACES
 from .neighborhoods import AROUND, COPT_REACH
-from .plan import Columns, FeaturePlan, columns_of
+from .plan import MOMENT_FEATURES, SURFACES, Columns, FeaturePlan, columns_of
 from .search import CROWD, FIRST2, LEAST2, MORE, ROOM, gather_near, make_groups, make_near, sort_near
 from .shapes import Axes, shapes_of, write_shapes
 from .surfaces import COLUMNS, FAR, SURFACE, UP, agreement
@@ -104,6 +103,7 @@ class AdaptiveNeighborhoods:
         fixed = ("cylinder", "sphere")
         self.chosen = [c for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
         #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
+        self.shaped = any(c.shapes for c in self.chosen)
         self.tokens = [c.neighborhood.token for c in self.chosen]
         self.columns = columns_of(self.chosen, MOMENT_FEATURES)
         self.surface_columns = columns_of(self.chosen, SURFACES)
@@ -148,11 +148,11 @@ class AdaptiveNeighborhoods:
 
     def shape_values(self, points: Axes, seed: int, copt_threshold: float | None) -> dict[str, np.ndarray]:
         """By neighborhood the metrics of all pulls round a few points, (m, 5, 255) float32, comparable."""
+        if not self.shaped:
+            return {}
         shapes = shapes_of(self.chosen, points, seed, None)
         for search in self.searches:
             self.choose(search, points, copt_threshold, shapes)
-        if shapes is None:
-            return {}
         return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes}
 
     def fill(
@@ -174,7 +174,7 @@ class AdaptiveNeighborhoods:
         returned, meters.
         """
         reach = 0.0
-        shapes = shapes_of(self.chosen, points, seed, bins)
+        shapes = shapes_of(self.chosen, points, seed, bins) if self.shaped else None
         for search in self.searches:
             table = self.choose(search, points, copt_threshold, shapes, out)
             for number, rows in zip(search.numbers, table, strict=True):

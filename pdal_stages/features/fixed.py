@@ -14,8 +14,7 @@ from ..base.jit import device, njit
 from .bins import ShapeBins
 from .index import CellGrid
 from .moments import ROWS, SX, SY, SZ, N, distance2, finish, height_key, sums_within
-from .names import MOMENT_FEATURES
-from .plan import FeaturePlan, columns_of
+from .plan import MOMENT_FEATURES, FeaturePlan, columns_of
 from .shapes import Axes, shapes_of, write_shapes
 
 #: Candidates are filled up to a multiple of so many, by points so far away, meters: a vector loop leaves none over.
@@ -29,6 +28,7 @@ class FixedRadius:
         self.grid = grid
         fixed = [c for c in plan.layout if c.neighborhood.kind in ("cylinder", "sphere") and c.at]
         self.chosen = sorted(fixed, key=lambda c: c.neighborhood.parameters[0])
+        self.shaped = any(c.shapes for c in self.chosen)
         self.tokens = [c.neighborhood.token for c in self.chosen]
         self.radii = np.array([c.neighborhood.parameters[0] for c in self.chosen], np.float64)
         self.spherical = np.array([c.neighborhood.kind == "sphere" for c in self.chosen], np.float64)
@@ -40,9 +40,9 @@ class FixedRadius:
 
     def shape_values(self, points: Axes, seed: int) -> dict[str, np.ndarray]:
         """By neighborhood the metrics of all pulls round a few points, (m, 5, 255) float32, comparable."""
-        shapes = shapes_of(self.chosen, points, seed, None)
-        if shapes is None:
+        if not self.shaped:
             return {}
+        shapes = shapes_of(self.chosen, points, seed, None)
         self._run(points, shapes, np.empty((len(points[0]), 0), np.float32))
         return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes}
 
@@ -60,7 +60,8 @@ class FixedRadius:
         Each stands for so many `copies` of the user's. `few` (neighborhoods,) is raised by the number with fewer than three
         points. `bins` are needed where shapes are wanted.
         """
-        table = self._run(points, shapes_of(self.chosen, points, seed, bins), out)
+        shapes = shapes_of(self.chosen, points, seed, bins) if self.shaped else None
+        table = self._run(points, shapes, out)
         for k, (radius, spherical) in enumerate(zip(self.radii, self.spherical, strict=True)):
             volume = 4.0 / 3.0 * math.pi * radius**3 if spherical else math.pi * radius * radius
             finish(table[k], volume, points[2], few[k : k + 1], copies, self.columns[k], out)

@@ -34,8 +34,7 @@ import numpy as np
 from ..base.arrays import GOLDEN, finalise
 from ..base.jit import device, njit
 from .bins import ShapeBins
-from .names import SHAPE_FEATURES
-from .plan import Columns, columns_of
+from .plan import SHAPE_FEATURES, Columns, columns_of
 
 #: x, y and z of points, (m,) float64 each.
 Axes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -84,13 +83,11 @@ def make_work() -> Work:
     return Work(np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f), np.zeros((5, 9), f))
 
 
-def shapes_of(chosen: Sequence[Columns], points: Axes, seed: int, bins: ShapeBins | None) -> Shapes | None:
-    """What a kernel makes of the shapes of the `chosen` neighborhoods of points; None where no shapes are wanted.
+def shapes_of(chosen: Sequence[Columns], points: Axes, seed: int, bins: ShapeBins | None) -> Shapes:
+    """What a kernel makes of the shapes of the `chosen` neighborhoods of points.
 
     Counts in `bins`, or, without, the metrics of all pulls, to which bins are fitted.
     """
-    if not any(one.shapes for one in chosen):
-        return None
     k, m = len(chosen), len(points[0])
     thresholds, seeds = np.zeros((k, 5, 9), np.float32), np.zeros((k, m), np.uint64)
     for number, one in enumerate(chosen):

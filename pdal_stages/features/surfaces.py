@@ -16,7 +16,7 @@ import numpy as np
 
 from ..base.jit import device
 from .moments import FEATURES, NORMAL
-from .names import MOMENT_FEATURES, SURFACES
+from .plan import MOMENT_FEATURES, SURFACES
 
 #: Columns of the table of surfaces, float32: unit normal, surface variation, distance to the farthest of the 10 (infinite
 #: where there are fewer).

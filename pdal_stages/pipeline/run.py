@@ -34,6 +34,18 @@ from .read import (
     writers_outputs,
 )
 
+#: Points that did not get a class from the classifier, or another one, by their names in the reports of stages.
+LEFT_ALONE = {
+    "rejected": "rejected as unreliable",
+    "ignored": "left out: noise, withheld (ignore)",
+    "kept": "class kept (keep)",
+    "outside_where": "outside where",
+    "decks": "put on bridge decks (bridges)",
+    "wires": "found to be wires (wires)",
+    "towers": "found to be towers and poles (wires)",
+    "changed": "mended by rules (consistency)",
+}
+
 
 class Pipeline:
     """A PDAL pipeline that may hold stages of ours.
@@ -75,6 +87,12 @@ class Pipeline:
         self.log_lines: list[str] = []
         self.reports: list[tuple[str, list[Report]]] = []
         self.warnings: list[str] = []
+
+    @property
+    def left_alone(self) -> dict[str, int]:
+        """Numbers of points by :data:`LEFT_ALONE`, as the last stage says that counts them."""
+        last = [each[-1].figures for _, each in self.reports if each]
+        return {k: one[k] for one in last for k in LEFT_ALONE if isinstance(one.get(k), int) and one[k]}
 
     @property
     def messages(self) -> list[str]:

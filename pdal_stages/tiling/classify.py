@@ -17,7 +17,7 @@ from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
 from .inputs import ept_form, read_ept
 from .plan import plan_of_files
-from .report import Job, TiledRun, left_alone
+from .report import Job, TiledRun
 from .run import run_plan
 from .settings import TilingOptions, fits_whole
 
@@ -107,8 +107,7 @@ class ClassifyTask:
         reports = [each[-1] for _, each in pipeline.reports if each]
         codes = [report.codes for report in reports if report.codes is not None]
         messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
-        alone = left_alone(report.figures for report in reports)
-        return Written(target, count, codes[-1] if codes else {}, alone, messages)
+        return Written(target, count, codes[-1] if codes else {}, pipeline.left_alone, messages)
 
     def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
         """Classify all inputs in tiles; `finished` hears of every output that was written."""

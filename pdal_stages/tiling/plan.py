@@ -20,19 +20,13 @@ from ..stages.hag_morphological import Blocks, HagMorphological
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
-
-
-def _filters(words: str) -> set[str]:
-    return {f"filters.{word}" for word in words.split()}
-
-
 #: PDAL's filters that look at one point at a time.
-_PER_POINT = _filters(
+_PER_POINT = (
     "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay projpipeline range "
     "reprojection transformation"
 )
 #: Filters whose result depends on all points at once.
-_GLOBAL = _filters(
+_GLOBAL = (
     "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad mortonorder "
     "randomize relaxationdartthrowing returns shell sort splitter stats tail teaser"
 )
@@ -99,7 +93,7 @@ class _Step:
 
     @property
     def sees_neighbors(self) -> bool:
-        return self.ours is not None or self.type not in _PER_POINT
+        return self.ours is not None or self.type.removeprefix("filters.") not in _PER_POINT.split()
 
     def reach(self, buffer: float | None) -> float:
         """Meters around a point in which others change its result."""
@@ -272,7 +266,7 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
 def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
     """Refuse stages that need all points at once, that look at neighbors no one knows how far away, or that move points."""
     instead = step.ours.instead_of_tiles if step.ours is not None else ""
-    if instead or step.type in _GLOBAL:
+    if instead or step.type.removeprefix("filters.") in _GLOBAL.split():
         raise PipelineError(
             f"{step.type} needs all points at once, so it cannot be run in tiles",
             where=step.where,

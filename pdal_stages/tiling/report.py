@@ -3,38 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 from ..base.version import __version__
+from ..pipeline.run import LEFT_ALONE
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
 from .inputs import InputSource
 
-#: Points that did not get a class from the classifier, or another one, by their names in the reports of stages.
-LEFT_ALONE = {
-    "rejected": "rejected as unreliable",
-    "ignored": "left out: noise, withheld (ignore)",
-    "kept": "class kept (keep)",
-    "outside_where": "outside where",
-    "decks": "put on bridge decks (bridges)",
-    "wires": "found to be wires (wires)",
-    "towers": "found to be towers and poles (wires)",
-    "changed": "mended by rules (consistency)",
-}
 #: Most different warnings of tiles that a run repeats.
 _MOST_MESSAGES = 20
 _CHANGED = (
     "it changed while it was worked on, so outputs may hold results from before and after. Once it stays as it is, "
     "run it again with --resume"
 )
-
-
-def left_alone(reports: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Their numbers, as the last stage says that counts them; `filters.objects` calls something else "decks"."""
-    return {
-        key: one[key] for one in reports for key in LEFT_ALONE if isinstance(one.get(key), int) and one[key]
-    }
 
 
 @dataclass

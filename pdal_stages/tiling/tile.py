@@ -26,7 +26,6 @@ from .inputs import CloudIndex, InputSource
 from .outputs import NewValues, PieceResults, arrays_of, flags_in_classes, read_with, write_tile
 from .pieces import Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, TilePlan
-from .report import left_alone
 from .settings import Box, TileGrid, inside
 from .store import save_arrays, written
 
@@ -128,8 +127,9 @@ def run_head(
     reports = [report for _, reports in pipeline.reports for report in reports if report.beyond_halo]
     if reports and not everything:
         needs += [plan.halo_m + report.reach for report in reports]
-    alone = left_alone(each[-1].figures for _, each in pipeline.reports if each)
-    return HeadRun(_collect(views, cuts), max(needs), _messages(pipeline, context.scratch), alone)
+    return HeadRun(
+        _collect(views, cuts), max(needs), _messages(pipeline, context.scratch), pipeline.left_alone
+    )
 
 
 def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
