@@ -102,8 +102,8 @@ class AdaptiveNeighborhoods:
         self.grid, self.halo_m = grid, plan.halo_m
         fixed = ("cylinder", "sphere")
         self.chosen = [c for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
-        #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
         self.shaped = any(c.shapes for c in self.chosen)
+        #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
         self.tokens = [c.neighborhood.token for c in self.chosen]
         self.columns = columns_of(self.chosen, MOMENT_FEATURES)
         self.surface_columns = columns_of(self.chosen, SURFACES)
