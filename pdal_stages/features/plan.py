@@ -203,7 +203,7 @@ class FeaturePlan:
         feature_set : str or iterable of str
             Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` .. ``D4``), features
             (``Linearity``) or features of one neighborhood (``Linearity_c1``). Only what is named is computed; columns
-            come in the order of ``names.ALL_FEATURES``, neighborhood by neighborhood.
+            come in the order of ``ALL_FEATURES``, neighborhood by neighborhood.
         dimensions : str or iterable of str
             Dimensions of the points to use as features besides those that a preset brings. A preset brings
             its own (``HeightAboveGround``, ``Z``) with the groups ``all`` and ``geometric``.
