@@ -73,15 +73,17 @@ def njit(function: Callable | None = None, **options):
     """``numba.njit`` with the package's defaults. Use as ``@njit`` or ``@njit(...)``."""
     if function is None:
         return lambda f: njit(f, **options)
-    return Kernel(function, {"nogil": True, "cache": True, "no_cfunc_wrapper": True, **_ERRORS, **options})
+    made = {"nogil": True, "cache": True, "no_cfunc_wrapper": True, "_nrt": True, **_ERRORS, **options}
+    return Kernel(function, made)
 
 
 def device(function: Callable | None = None, **options):
     """For a function that kernels call: compiled into them, without an entry of its own for Python.
 
-    That entry would take as long to compile as many a function. Where Python calls it, it runs as it is written.
+    That entry would take as long to compile as many a function. Where Python calls it, it runs as it is written. It
+    borrows arrays: counting who holds them was a tenth of a job. One that makes or returns some asks for ``_nrt=True``.
     """
-    return njit(function, cache=False, no_cpython_wrapper=True, **options)
+    return njit(function, **{"cache": False, "no_cpython_wrapper": True, "_nrt": False, **options})
 
 
 def _numba() -> Any:

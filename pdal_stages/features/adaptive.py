@@ -268,27 +268,46 @@ def adaptive_block(
         Out: the curvature where `curved`.
     """
     order, starts = make_groups(qx, qy, qz)
-    need = ks[-1] + 1 if len(ks) else 0
-    need = min(need, len(tree.perm))
-    near = make_near(CROWD * need + ROOM)
-    shells, count = len(radii), len(radii) + len(ks)
-    s, ends = make_sums(count), np.zeros(count, np.int64)
-    own, around, single = np.empty((1, SURFACE), np.float32), 0, np.empty((ROWS, 1))
-    none, columns = (
-        np.zeros(1, np.int64),
-        COLUMNS.copy(),
-    )  # a constant's type would have all compiled once more
+    need = min(ks[-1] + 1 if len(ks) else 0, len(tree.perm))
+    near, s = make_near(CROWD * need + ROOM), make_sums(len(radii) + len(ks))
+    ends, record = np.zeros(len(radii) + len(ks), np.int64), np.empty((0, 4), np.float32)
+    # What finish takes for one query (a constant's type would have it compiled once more).
+    alone = np.empty((1, SURFACE), np.float32), np.empty((ROWS, 1)), np.zeros(1, np.int64), COLUMNS.copy()
+    done = 0
+    while True:
+        if shapes is not None:
+            record = np.empty((len(near.x), 4), np.float32)
+        done = _adaptive(
+            tree, qx, qy, qz, numbers, radii, ks, within2, cap2, choices, curved, least, threshold, surfaces,
+            surface_columns, shapes, table, curvature, out,
+            order, starts, done, need, near, s, ends, record, alone,
+        )  # fmt: skip
+        if done == len(qx):
+            return
+        near = make_near(4 * len(near.x))
+
+
+@device
+def _adaptive(
+    tree, qx, qy, qz, numbers, radii, ks, within2, cap2, choices, curved, least, threshold, surfaces,
+    surface_columns, shapes, table, curvature, out,
+    order, starts, done, need, near, s, ends, record, alone,
+):  # fmt: skip
+    """:func:`adaptive_block` from the query order[done] on, and up to where `near` has no room for the candidates."""
+    shells, count, around = len(radii), len(ends), 0
+    own, single, none, columns = alone
     for e in range(len(ks)):
         around = e if ks[e] == AROUND else around
-    record = np.empty((0, 4), np.float32)
     guess = FIRST2
-    for group in range(len(starts) - 1):
-        lo, end = starts[group], starts[group + 1]
+    for group in range(np.searchsorted(starts, done, "right") - 1, len(starts) - 1):
+        lo, end = max(starts[group], done), starts[group + 1]
         reach2, farthest2 = min(max(guess, within2), cap2), 0.0
         while lo < end:
-            hi, there, reach2, near = gather_near(
+            hi, there, reach2 = gather_near(
                 tree, qx, qy, qz, order, lo, end, need, within2, cap2, reach2, near
             )
+            if there < 0:
+                return lo
             while lo < hi:
                 q = order[lo]
                 x, y, z = qx[q], qy[q], qz[q]
@@ -314,7 +333,8 @@ def adaptive_block(
                     curvature[q] = curvature_of(s, at, least)
                 if len(surfaces):
                     if near.sorted[0] == 0.0:
-                        own[0] = surfaces[near.at[near.pos[0]]]
+                        for f in range(SURFACE):
+                            own[0, f] = surfaces[near.at[near.pos[0]], f]
                     else:  # no point of the cloud
                         write_moments(s, shells + around, single, 0)
                         finish(single, 1.0, qz[q : q + 1], none, none, columns, own)
@@ -333,13 +353,11 @@ def adaptive_block(
                         table[j, RADIUS, q] = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
                         k = ks[last - 1 - shells]
                         reach = math.sqrt(near.sorted[k]) if k < found else math.inf
-                    if len(surfaces) and surface_columns[numbers[j]].max() >= 0:
+                    if len(surfaces):
                         beyond = agreement(surfaces, near, n, own[0], surface_columns[numbers[j]], out[q])
                         reach = max(reach, beyond)
                     table[j, REACH, q] = 0.0 if curved else reach
                     if shapes is not None and shapes.shaped[numbers[j]]:
-                        if n > len(record):
-                            record = np.empty((2 * n, 4), np.float32)
                         for i in range(n):
                             p = near.pos[i]
                             record[i, 0], record[i, 1] = near.x[p] - x, near.y[p] - y
@@ -352,6 +370,7 @@ def adaptive_block(
                         )
                         write_shapes(shapes, numbers[j], q, record, n, gx, gy, gz, out)
         guess = max(MORE * farthest2, LEAST2)
+    return len(qx)
 
 
 @device

@@ -44,7 +44,7 @@ class Sums(NamedTuple):
     entropy: np.ndarray
 
 
-@device
+@device(_nrt=True)
 def make_sums(count):
     return Sums(
         np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),

@@ -156,9 +156,9 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
                 while count % LANES:
                     px[count], py[count], pz[count], keys[count] = FAR, FAR, FAR, 0
                     count += 1
-            r2 = radii[k] * radii[k]
+            r2, sums = radii[k] * radii[k], table[k]
             for q in range(a, b):
-                sums_within(px, py, pz, keys, count, qx[q], qy[q], qz[q], spherical[k], r2, table[k], q)
+                sums_within(px, py, pz, keys, count, qx[q], qy[q], qz[q], spherical[k], r2, sums, q)
                 if shapes is not None and shapes.shaped[k]:
                     if count >= len(record):
                         record = np.empty((2 * count + 1, 4), np.float32)
@@ -193,7 +193,7 @@ def fill_window(cell_ix, cell_start, row_iy, row_start, iy, ix, reach, on, place
         row += 1
 
 
-@device(forceinline=True)  # a call would count who holds the arrays, for all threads
+@device(forceinline=True)
 def copy_points(x, y, z, first, last, px, py, pz, keys, at):
     """Append the points first..last - 1."""
     for i in range(last - first):

@@ -49,7 +49,7 @@ class Near(NamedTuple):
     stack: np.ndarray
 
 
-@device
+@device(_nrt=True)
 def make_near(room):
     f, u = np.float64, np.uint32
     return Near(
@@ -59,7 +59,7 @@ def make_near(room):
     )  # fmt: skip
 
 
-@device
+@device(_nrt=True)
 def make_groups(qx, qy, qz):
     """Order of queries, (m,) uint32, and where groups of at most GROUP that lie together start, (groups + 1,)."""
     m = len(qx)
@@ -95,10 +95,9 @@ def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, ne
     hi : int
         Up to where queries are served.
     count : int
+        Of the candidates in `near`; -1 where these are too many for it.
     reach2 : float
         Squared distance within which no point of the cloud is missing.
-    near : Near
-        With the candidates; it grows where it must.
     """
     room = len(near.x)
     limit = room if within2 > 0.0 else min(room, CROWD * need + ROOM)
@@ -111,7 +110,7 @@ def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, ne
             continue
         count = gather(tree, box, reach2, copies, limit, near.stack, near.x, near.y, near.z, near.at)
         if count >= need or (count >= 0 and reach2 >= cap2):
-            return hi, count, reach2, near
+            return hi, count, reach2
         if count >= 0:
             reach2 = min(2.0 * reach2, cap2)
             continue
@@ -124,8 +123,7 @@ def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, ne
         elif limit < room:
             limit = room
         else:
-            room = limit = 4 * room
-            near = make_near(room)
+            return hi, -1, reach2
 
 
 @device

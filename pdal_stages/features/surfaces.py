@@ -40,6 +40,8 @@ def agreement(surfaces, near, count, own, columns, out):
 
     How far from the query points lie on which these depend, meters.
     """
+    if max(columns[0], columns[1], columns[2], columns[3]) < 0:
+        return 0.0
     nx, ny, nz = np.float64(own[NX]), np.float64(own[NY]), np.float64(own[NZ])
     first = np.float64(surfaces[near.at[near.pos[0]], VARIATION])
     agree = total = squares = far = 0.0

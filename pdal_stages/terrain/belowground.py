@@ -38,7 +38,7 @@ def reach(side: float) -> int:
     return math.ceil(max(OTHERS / side, AROUND) + max(FAR / side + 2, NEAR))
 
 
-@device
+@device(_nrt=True)
 def _plane_under(base, j, i, radius, inner=0):
     """Plane (height at the column, per column across, along; scatter below it) under the columns round one, between two
     radii, and how many these are."""

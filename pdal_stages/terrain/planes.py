@@ -67,7 +67,7 @@ def blend(planes, i, j, s, t, size):
     return height / total, across / total, along / total
 
 
-@device(forceinline=True)  # a call would count who holds the arrays
+@device
 def from_parents(parents, parents_left, parents_bottom, column, row, size):
     """What the planes of blocks of twice the `size` say at the center of a block of `size`."""
     # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond its parent.

@@ -105,7 +105,7 @@ def _near(column: NDArray[np.int64], row: NDArray[np.int64], wires: NDArray[np.i
     return np.isin(key, np.unique(key[wires])[:, None] + steps)
 
 
-@device
+@device(_nrt=True)
 def _around(cloud, j, i, reach):
     """Numbers of the points in the cells up to `reach` away."""
     low, high = max(i - reach, 0), min(i + reach, cloud.w - 1) + 1
@@ -154,7 +154,7 @@ def _axes(cloud):
     return out[:n].copy()
 
 
-@device
+@device(_nrt=True)
 def _half_width(cloud, j, i, high):
     """How many cells a tower's body reaches from its axis, below its arms; 0 where it stands among other things."""
     rings = np.zeros((BODY[1] + CLEAR + 1, 3), np.int64)
@@ -182,7 +182,7 @@ def _half_width(cloud, j, i, high):
     return BODY[0] if slim > 0 and around <= CROWDED * slim else 0
 
 
-@device
+@device(_nrt=True)
 def _upright(cloud, j, i, tall, half, high):
     """How well the points round a cell fill a narrow column up to the wires, 0 where they do not; and its middle (x, y)."""
     filled, sums = np.zeros(_HIGHEST, np.bool_), np.zeros(4, np.int64)
@@ -216,7 +216,7 @@ def _upright(cloud, j, i, tall, half, high):
     return share if slim and count >= LEAST and share >= POLE_FILLED else 0.0, x, y
 
 
-@device
+@device(_nrt=True)
 def _rise(cloud, j, i, x, y):
     """How wires rise towards an axis, from both sides together, and their direction there.
 
