@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import json
 import re
 import runpy
@@ -28,6 +29,11 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(
         rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )
+
+
+def test_names_of_the_api_page_are_there():
+    names = re.findall(r"^\.\. auto\w+:: (\S+)\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert names and all(hasattr(importlib.import_module(module), name) for module, name in names)
 
 
 def test_json_in_the_docs_is_valid(tmp_path, monkeypatch):
