@@ -158,9 +158,39 @@ def levee(seed=0, turn=0.5):
     return Scene(terrain, [], [], turn, 240.0, 130.0)
 
 
+def _flat(s, t):
+    return 0.05 * np.sin(s / 17), np.full(len(s), GROUND)
+
+
+def _profile(reach, rise, grade):
+    return lambda s: np.clip(rise - grade * np.clip(np.abs(s) - reach, 0, None), 0, None)
+
+
+def _massive(slabs, start, end, half, top, rise, step=0.35):
+    """Layers, so that beams hit upright faces where they meet them."""
+    for down in np.arange(0.0, rise, step):
+        slabs.append(Slab(start, end, -half, half, lambda s, d=down: top(s) - d, step, GROUND))
+
+
+def walled_ramps(seed=0, half=6.0, reach=60.0, rise=7.0, grade=0.05, turn=0.4):
+    """A bridge of 120 m whose ramps rise between upright walls on both sides."""
+    rng = np.random.default_rng(seed)
+    top, far = _profile(reach, rise, grade), reach + rise / grade
+    slabs: list[Slab] = []
+    _deck(slabs, -reach, reach, -half, half, top, 1.6)
+    for start, end in ((-far, -reach), (reach, far)):
+        _massive(slabs, start, end, half, top, rise)
+        for low, high in ((-half, -half + 0.3), (half - 0.3, half)):
+            slabs.append(Slab(start, end, low, high, lambda s: top(s) + 1.0, 1.0, OTHER))
+    _cars(slabs, rng, -reach - 90, reach + 90, (-2.5, 2.5), top, 22.0)
+    _piers(slabs, top, reach, half, 25.0, 0.0)
+    return Scene(_flat, slabs, [], turn, 2 * far + 90.0, 120.0)
+
+
 MORE_SCENES = {
     "deep valley, bent": deep_valley,
     "skewed": skewed,
+    "walled ramps": walled_ramps,
 }
 #: As simple simulators make them: points and classes.
 UPRIGHT_SCENES = {

@@ -219,7 +219,7 @@ def f1(deck, true, known):
 
 @pytest.mark.parametrize("name", [*SCENES, *MORE_SCENES])
 def test_decks_of_scenes_are_found_whole(name):
-    xyz, codes = seen(name)
+    xyz, codes = seen(name, 8.0 if name == "walled ramps" else 4.0)  # walls show their faces in dense clouds
     deck = found(xyz) > 0
     assert f1(deck, codes == DECK, codes != OTHER) > (0.86 if name in ("skewed", "overpass") else 0.9)
     wrong = deck & ~np.isin(codes, (DECK, OTHER, LEAF))

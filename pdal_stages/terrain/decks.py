@@ -3,11 +3,12 @@
 To both sides, at most `WIDEST` meters apart, the way (:mod:`.walkable`) ends at a drop, or at water. Such cells that hang
 together are a deck if their rim is drops for the most part, and if at two ends, opposite each other, one walks on to land
 whose own rim is no drop, as a roof's is, or the cloud ends at one of them. Of what is longer than `LONGEST`, such as a
-viaduct, each block is judged by the rim around it, and land at one end is enough. The rule of Sithole and Vosselman [S06],
+viaduct, each block is judged by the rim around it, and land at one end is enough. Near walls (:mod:`.deckwalls`) is none.
+The rule of Sithole and Vosselman [S06],
 raised in a profile across and level with the ground in the profile along, is applied to the surface instead of to profiles.
 
-Limits: a deck that the cloud cuts at both ends is none, nor is one hardly wider than 3 m of few points; a road raised
-between upright walls is taken for one, as are parts of roofs as high as a deck that touch it, or that crowns link to it.
+Limits: a deck that the cloud cuts at both ends is none, nor is one hardly wider than 3 m of few points; parts of roofs as
+high as a deck that touch it, or that crowns link to it, may be taken for one.
 
 The grid is anchored to absolute coordinates, all reaches are bounded (:data:`REACH`) and counts are whole numbers: the order
 of points does not matter, and a tile with its surroundings finds the decks of the whole cloud.
@@ -33,6 +34,8 @@ from .cells import (
     places_among,
     sums_around,
 )
+from .deckwalls import REACH as WALLS_REACH
+from .deckwalls import without_walls
 from .walkable import (
     ACROSS,
     AHEAD,
@@ -71,7 +74,7 @@ CUT = 8
 #: Blocks in which long decks are judged, cells, and how many blocks away land must be seen.
 BLOCK, FAR_ENDS = 64, 3
 #: How far away cells matter: blocks of a deck, its rim and the land at its ends, how far one walks and sees from there.
-RIMS_REACH = BLOCK * (FAR_ENDS + 1) + LINK + 2 * WIDEST + AHEAD + FAR + 8 + 2 * _FILLS + LINK
+RIMS_REACH = BLOCK * (FAR_ENDS + 1) + LINK + 2 * WIDEST + AHEAD + FAR + 8 + 2 * _FILLS + LINK + WALLS_REACH
 #: Side of the cells, meters: what is said of cells below is said of meters.
 CELL = 1.0
 #: How far from the deck's surface its points lie, meters: on it, and in cells beside it, where leaves are; parapets and cars
@@ -107,7 +110,7 @@ def deck_levels(z, start, h, w, left, bottom):
     for some, over_nothing in ((deck, False), (deck | above, True)):
         if some.any() and (not over_nothing or (above & ~deck).any()):
             found |= _judged(z, start, h, w, left, bottom, kind, goes_on, end, some, over_nothing)
-    return kind, found
+    return kind, without_walls(z, start, h, w, kind, end, found)
 
 
 def _judged(z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing) -> NDArray[np.bool_]:
