@@ -124,16 +124,13 @@ def longest_sides(
 
 def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
     """Sums of whole numbers (h, w, ...) over the square that goes `reach` cells to every side of each cell."""
-    sums = np.asarray(values, np.int64)
+    sums = np.asarray(values)
     for axis in (0, 1):
-        size = sums.shape[axis]
-        total = np.cumsum(sums, axis)
-        last = np.minimum(np.arange(size) + reach, size - 1)
-        before = np.arange(size) - reach - 1
-        sums = np.take(total, last, axis)
-        inside: list = [slice(None)] * sums.ndim
-        inside[axis] = before >= 0
-        sums[tuple(inside)] -= np.take(total, before[before >= 0], axis)
+        total = np.moveaxis(np.cumsum(sums, axis, np.int64), axis, 0)
+        sums = np.empty(sums.shape, np.int64)
+        lines, ahead = np.moveaxis(sums, axis, 0), max(len(total) - reach, 0)
+        lines[:ahead], lines[ahead:] = total[reach:], total[-1:]
+        lines[reach + 1 :] -= total[: max(ahead - 1, 0)]
     return sums
 
 

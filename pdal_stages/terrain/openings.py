@@ -93,6 +93,7 @@ def objects_of(
     only windows beyond `WIDE` show.
     """
     measured = raster != HOLE
+    most = np.where(measured, HOLE, -HOLE)  # np.minimum with it is many times faster than np.where each time
     objects, wide = np.zeros((2, *raster.shape), bool)
     floor, openings = raster.copy(), {}
     radii = opening_radii(window)
@@ -101,7 +102,7 @@ def objects_of(
         squares, diamonds = _steps(min(radius, sum(raster.shape)))
         eroded = _highest(eroded, squares - taken[0], diamonds - taken[1])
         taken = squares, diamonds
-        after = _highest(np.where(measured, -eroded, -HOLE), squares, diamonds)
+        after = _highest(np.minimum(-eroded, most), squares, diamonds)
         if radius in keep:
             openings[radius] = after
         if radius in radii:
@@ -109,7 +110,7 @@ def objects_of(
             with np.errstate(invalid="ignore"):  # where no window is
                 lowered = (before - after > drop) & measured & ~objects
             objects |= lowered
-            floor[lowered] = after[lowered]
+            np.copyto(floor, after, where=lowered)
             if radius * cell > WIDE:
                 wide |= lowered
             before = after
