@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.base.errors import OptionError
 
 DOCS = Path(__file__).parents[1] / "docs" / "features.md"
 #: Ours -> (PDAL's name, modes of PDAL's under which both are equal, PDAL's value for ours of n points)
@@ -84,23 +83,6 @@ def test_the_optimal_neighborhood_of_pdal(cloud):
     assert np.mean(same) > 0.999  # the entropies of two sizes may tie
     assert np.allclose(radius[same], array["OptimalRadius"][same], rtol=1e-5)
     assert {11, 41} <= set(number.tolist())
-
-
-@pytest.mark.parametrize(
-    ("word", "says"),
-    [
-        ("Dimensionality", "Linearity,Planarity,Scattering"),
-        ("DemantkeVerticality", "Verticality"),
-        ("OptimalKNN", "filters.optimalneighborhood"),
-        ("OptimalRadius", "Radius"),
-    ],
-)
-def test_words_of_pdal_are_explained(word, says):
-    with pytest.raises(OptionError, match=f"'{word}' is PDAL's") as caught:
-        ps.Pipeline(
-            ["in.las", {"type": "filters.multiscalefeatures", "feature_set": f"Linearity,{word.lower()}"}]
-        )
-    assert says in str(caught.value)
 
 
 def test_the_table_of_the_docs_is_this_one():

@@ -86,9 +86,8 @@ class Search:
     ks: np.ndarray  # neighbors besides the point itself, ascending
     within2: float  # all points within this squared distance are wanted
     cap2: float  # and of those within this one as many as the last of `ks` says
-    choices: (
-        np.ndarray
-    )  # (numbers, 3) int64: first and end of the candidates among radii and ks; members they need
+    # (numbers, 3) int64: first and end of the candidates among radii and ks; members they need
+    choices: np.ndarray
     curved: bool = False  # copt: radii where it is regular
 
 
@@ -363,12 +362,9 @@ def _adaptive(
                             record[i, 0], record[i, 1] = near.x[p] - x, near.y[p] - y
                             record[i, 2], record[i, 3] = near.z[p] - z, 0.0
                         w = 1.0 / s.n[best]
-                        gx, gy, gz = (
-                            np.float32(s.x[best] * w),
-                            np.float32(s.y[best] * w),
-                            np.float32(s.z[best] * w),
-                        )
-                        write_shapes(shapes, numbers[j], q, record, n, gx, gy, gz, out)
+                        gx, gy, gz = s.x[best] * w, s.y[best] * w, s.z[best] * w
+                        center = np.float32(gx), np.float32(gy), np.float32(gz)
+                        write_shapes(shapes, numbers[j], q, record, n, *center, out)
         guess = max(MORE * farthest2, LEAST2)
     return len(qx)
 

@@ -212,9 +212,8 @@ class KdTree(NamedTuple):
     y: np.ndarray
     z: np.ndarray
     perm: np.ndarray  # (n,) uint32: positions in the cloud, leaf by leaf
-    boxes: (
-        np.ndarray
-    )  # (nodes, 6): xmin, ymin, zmin, xmax, ymax, zmax; node i has the children 2i + 1 and 2i + 2
+    # (nodes, 6): xmin, ymin, zmin, xmax, ymax, zmax; node i has the children 2i + 1 and 2i + 2
+    boxes: np.ndarray
     depth: int  # levels below the root; all leaves lie on the last
 
 

@@ -75,18 +75,6 @@ GROUPS: dict[str, tuple[str, ...]] = {
 #: Groups that bring a preset's own dimensions (HeightAboveGround, Z) along.
 WITH_DIMENSIONS = ("all", "geometric")
 
-#: Words of PDAL's own filters that mean something else here, in small letters: (PDAL's spelling, what to write).
-OF_PDAL = {
-    "dimensionality": (
-        "Dimensionality",
-        "Write Linearity,Planarity,Scattering; PDAL's fourth, its own Verticality, is not computed here (Verticality is "
-        "1 - |nz|, PDAL's DemantkeVerticality)",
-    ),
-    "demantkeverticality": ("DemantkeVerticality", "It is Verticality here, 1 - |nz|"),
-    "optimalknn": ("OptimalKNN", "PDAL's filters.optimalneighborhood writes it"),
-    "optimalradius": ("OptimalRadius", "Write Radius, with kopt among the neighborhoods"),
-}
-
 
 def describe(feature: str) -> str:
     """One line of what a feature is, for docs and schemas."""
@@ -121,9 +109,6 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
         name = known.get(word.lower())
         if name is None:  # a feature of one neighborhood keeps its suffix
             head = _longest_feature(word)
-            if word.lower() in OF_PDAL:
-                theirs, cure = OF_PDAL[word.lower()]
-                raise OptionError(f"'{theirs}' is PDAL's word, not a feature", cure=cure)
             if head is None:
                 cure = suggest(word, (*GROUPS, *ALL_FEATURES))
                 single = (*COVARIANCE, *GEOMETRIC, *RELATIVE, *SURFACES)

@@ -70,9 +70,8 @@ class Shapes(NamedTuple):
     columns: np.ndarray  # (k, 50) int64: columns of the output, or -1
     thresholds: np.ndarray  # (k, 5, 9) float32: of the bins, comparable
     seeds: np.ndarray  # (k, m) uint64: ``point_seeds`` of the queries, used where `shaped`
-    values: (
-        np.ndarray
-    )  # (k, m, 5, 255) float32: gets the pulls' metrics in place of the output; m = 0 for none
+    # (k, m, 5, 255) float32: gets the pulls' metrics in place of the output; m = 0 for none
+    values: np.ndarray
     counts: np.ndarray  # (50,) float32: scratch
     work: Work
 
