@@ -21,9 +21,9 @@ import numpy as np
 from ..base.jit import device, njit
 from ..base.resources import map_blocks
 from .bins import ShapeBins
-from .entropy import add_up, eigenvalues_of, lowest_entropy, make_sums, write_moments
+from .entropy import add_up, eigenvalues_of, lowest_entropy, write_moments
 from .index import CellGrid, build_tree
-from .moments import COINCIDENT, RADIUS, REACH, ROWS, finish
+from .moments import COINCIDENT, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
 from .neighborhoods import AROUND, COPT_REACH
 from .plan import MOMENT_FEATURES, SURFACES, Columns, FeaturePlan, columns_of
 from .search import CROWD, FIRST2, LEAST2, MORE, ROOM, gather_near, make_groups, make_near, sort_near
@@ -268,7 +268,7 @@ def adaptive_block(
     """
     order, starts = make_groups(qx, qy, qz)
     need = min(ks[-1] + 1 if len(ks) else 0, len(tree.perm))
-    near, s = make_near(CROWD * need + ROOM), make_sums(len(radii) + len(ks))
+    near, s = make_near(CROWD * need + ROOM), np.empty((MOMENTS + 1, len(radii) + len(ks)))
     ends, record = np.zeros(len(radii) + len(ks), np.int64), np.empty((0, 4), np.float32)
     # What finish takes for one query (a constant's type would have it compiled once more).
     alone = np.empty((1, SURFACE), np.float32), np.empty((ROWS, 1)), np.zeros(1, np.int64), COLUMNS.copy()
@@ -361,8 +361,8 @@ def _adaptive(
                             p = near.pos[i]
                             record[i, 0], record[i, 1] = near.x[p] - x, near.y[p] - y
                             record[i, 2], record[i, 3] = near.z[p] - z, 0.0
-                        w = 1.0 / s.n[best]
-                        gx, gy, gz = s.x[best] * w, s.y[best] * w, s.z[best] * w
+                        w = 1.0 / s[N, best]
+                        gx, gy, gz = s[SX, best] * w, s[SY, best] * w, s[SZ, best] * w
                         center = np.float32(gx), np.float32(gy), np.float32(gz)
                         write_shapes(shapes, numbers[j], q, record, n, *center, out)
         guess = max(MORE * farthest2, LEAST2)
@@ -372,7 +372,7 @@ def _adaptive(
 @device
 def curvature_of(s, j, least):
     """Surface variation of the sums `j`; 1/3 for fewer than `least` or coinciding points."""
-    if s.n[j] < least:
+    if s[N, j] < least:
         return SCATTERED
     l1, l2, l3, spread = eigenvalues_of(s, j)
     total = l1 + l2 + l3

@@ -8,13 +8,12 @@ the smallest neighborhood wins: in a perfect plane or line rounding noise would 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from ..base.jit import FAST, device
 from .eigen import eigen3, eigenentropy, log_fast
-from .moments import COINCIDENT, HIGH, LOW, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
+from .moments import COINCIDENT, HIGH, LOW, MOMENTS, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
 
 #: Estimated entropies are off by less than half of this.
 MARGIN = 2e-6
@@ -26,36 +25,9 @@ TIE = 1e-9
 NEVER = 9.0
 
 
-class Sums(NamedTuple):
-    """Moments about the query of nested neighborhoods: element j belongs to the j-th of them."""
-
-    n: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    z: np.ndarray
-    xx: np.ndarray
-    xy: np.ndarray
-    xz: np.ndarray
-    yy: np.ndarray
-    yz: np.ndarray
-    zz: np.ndarray
-    low: np.ndarray  # heights
-    high: np.ndarray
-    entropy: np.ndarray
-
-
-@device(_nrt=True)
-def make_sums(count):
-    return Sums(
-        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
-        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
-        np.empty(count),
-    )  # fmt: skip
-
-
 @device
 def add_up(near, qx, qy, qz, ends, first, last, s):
-    """Moments of the first ends[j] neighbors, for j from `first` to `last`, for which ends ascend."""
+    """Moments s[:MOMENTS, j] of the first ends[j] neighbors, for j from `first` to `last`, for which ends ascend."""
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
     low, high = np.inf, -np.inf
     i = 0
@@ -76,21 +48,17 @@ def add_up(near, qx, qy, qz, ends, first, last, s):
             low = height if height < low else low
             high = height if height > high else high
             i += 1
-        s.n[j] = i
-        s.x[j], s.y[j], s.z[j] = sx, sy, sz
-        s.xx[j], s.xy[j], s.xz[j] = sxx, sxy, sxz
-        s.yy[j], s.yz[j], s.zz[j] = syy, syz, szz
-        s.low[j], s.high[j] = low, high
+        s[N, j], s[SX, j], s[SY, j], s[SZ, j] = i, sx, sy, sz
+        s[SXX, j], s[SXY, j], s[SXZ, j] = sxx, sxy, sxz
+        s[SYY, j], s[SYZ, j], s[SZZ, j] = syy, syz, szz
+        s[LOW, j], s[HIGH, j] = low, high
 
 
 @device
 def write_moments(s, j, table, column):
     """The sums `j` as a column of a table of moments."""
-    table[N, column] = s.n[j]
-    table[SX, column], table[SY, column], table[SZ, column] = s.x[j], s.y[j], s.z[j]
-    table[SXX, column], table[SXY, column], table[SXZ, column] = s.xx[j], s.xy[j], s.xz[j]
-    table[SYY, column], table[SYZ, column], table[SZZ, column] = s.yy[j], s.yz[j], s.zz[j]
-    table[LOW, column], table[HIGH, column] = s.low[j], s.high[j]
+    for m in range(MOMENTS):
+        table[m, column] = s[m, j]
 
 
 @device(fastmath=set(FAST), forceinline=True)
@@ -141,12 +109,11 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
 @device
 def eigenvalues_of(s, j):
     """Eigenvalues of the covariance matrix of the sums `j`, and the mean squared distance to the query."""
-    w = 1.0 / s.n[j]
-    x, y, z = s.x[j] * w, s.y[j] * w, s.z[j] * w
-    xx, yy, zz = s.xx[j] * w, s.yy[j] * w, s.zz[j] * w
-    l1, l2, l3, _, _, _ = eigen3(
-        xx - x * x, s.xy[j] * w - x * y, s.xz[j] * w - x * z, yy - y * y, s.yz[j] * w - y * z, zz - z * z
-    )
+    w = 1.0 / s[N, j]
+    x, y, z = s[SX, j] * w, s[SY, j] * w, s[SZ, j] * w
+    xx, yy, zz = s[SXX, j] * w, s[SYY, j] * w, s[SZZ, j] * w
+    xy, xz, yz = s[SXY, j] * w, s[SXZ, j] * w, s[SYZ, j] * w
+    l1, l2, l3, _, _, _ = eigen3(xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z)
     return l1, l2, l3, xx + yy + zz
 
 
@@ -169,16 +136,29 @@ def lowest_entropy(s, first, last, least_members):
 
     Parameters
     ----------
-    s : Sums
-        Moments of the candidates, in ascending size; n > 0.
+    s : (MOMENTS + 1, candidates) float64 array
+        Moments of the candidates about the query, in ascending size; n > 0. The last row is scratch.
     least_members : int
         Members a candidate needs.
     """
     if last - first <= 1:
         return last - 1
-    entropy = s.entropy
+    entropy = s[MOMENTS]
     estimate_entropies(
-        s.n, s.x, s.y, s.z, s.xx, s.xy, s.xz, s.yy, s.yz, s.zz, entropy, first, last, least_members
+        s[N],
+        s[SX],
+        s[SY],
+        s[SZ],
+        s[SXX],
+        s[SXY],
+        s[SXZ],
+        s[SYY],
+        s[SYZ],
+        s[SZZ],
+        entropy,
+        first,
+        last,
+        least_members,
     )
     least = NEVER
     for j in range(first, last):

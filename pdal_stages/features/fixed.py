@@ -70,16 +70,8 @@ class FixedRadius:
         """Moments (neighborhoods, ROWS, m); shapes go where `shapes` says."""
         table = np.empty((len(self), ROWS, len(points[0])))
         fixed_block(
-            self.grid.tables(),
-            self.grid.cell,
-            *points,
-            self.radii,
-            self.spherical,
-            self.widths,
-            shapes,
-            table,
-            out,
-        )
+            self.grid.tables(), self.grid.cell, *points, self.radii, self.spherical, self.widths, shapes, table, out
+        )  # fmt: skip
         return table
 
 
@@ -140,12 +132,8 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
                     room += window[row, reach + w + 1] - window[row, reach - w] if w >= 0 else 0
                 if room + LANES > len(px):
                     size = 2 * room + LANES
-                    px, py, pz, keys = (
-                        np.empty(size),
-                        np.empty(size),
-                        np.empty(size),
-                        np.empty(size, np.int64),
-                    )
+                    px, py, pz = np.empty(size), np.empty(size), np.empty(size)
+                    keys = np.empty(size, np.int64)
                 count = 0
                 for row in range(2 * reach + 1):
                     w = widths[k, row]
