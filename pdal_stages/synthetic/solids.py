@@ -68,7 +68,7 @@ class Site:
         self.w, self.d, self.axis = PITCH_U - 2 * MARGIN, PITCH_V - low - self.high, -low
         self.things: list[tuple] = []  # rows of Scene's arrays
         self.planes: list[tuple] = []
-        self.built: list[tuple] = []  # what it was, for :mod:`.truth`: its kind, then its measures
+        self.built: list[tuple] = []  # what it was, for who asks what is true: its kind, then its measures
 
     def z(self, a: float, b: float) -> float:
         """Ground height."""
