@@ -1,7 +1,7 @@
 """Where one can walk: levels that are part of smooth surfaces, the way from one to the next, and where it ends.
 
-All is of a raster of levels (:func:`.cells.levels`) in cells of a meter. The way ends at a drop (something lies much lower right
-ahead, or across emptiness such as water), at nothing (the rim of the cloud) or at whatever else is there (a wall, leaves).
+All is of a raster of levels (:func:`.cells.levels`) in cells of a meter. The way ends at a drop (something lies much lower
+right ahead, or across emptiness such as water), at nothing (the rim of the cloud) or at whatever else is there.
 """
 
 from __future__ import annotations
