@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from . import Parser, takes_options
-
-if TYPE_CHECKING:
-    pass
 
 
 def add_commands(parser: Parser) -> None:

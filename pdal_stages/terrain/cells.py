@@ -210,8 +210,10 @@ def lowest_of_cells(
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     x, y, z = x[mine], y[mine], z[mine]
     key = keys_of(cell_numbers(x, cell), cell_numbers(y, cell))
-    low, high = lowest_points(x, y, z, key), lowest_points(x, y, -z, key)
-    return mine[low], z[high]
+    low = lowest_points(x, y, z, key)
+    highest = np.full(len(low), -np.inf)
+    np.maximum.at(highest, np.searchsorted(key[low], key), z)
+    return mine[low], highest
 
 
 def levels(z: NDArray[np.float64], cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

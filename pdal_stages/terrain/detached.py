@@ -266,11 +266,11 @@ def _covered(place, number, counts, spacing, width, columns, most):
     top = np.full(columns, -1)
     top[place] = np.arange(len(place))  # the last of a column is its highest
     asked = np.flatnonzero(number >= 0)
-    place, number_of, spacings = place[asked], number[asked], spacing[asked] * SPACINGS / SIDE - 0.5
+    place, number_of, within = place[asked], number[asked], spacing[asked] * SPACINGS / SIDE + 0.5
     above = np.zeros(len(asked), bool)
     for dj, di in product(range(-2, 3), repeat=2):
         other = top[np.clip(place + dj * width + di, 0, columns - 1)]
-        near = max(abs(dj), abs(di)) < spacings + 1
+        near = max(abs(dj), abs(di)) < within
         above |= near & (other >= 0) & (number[other] != number_of)
     size = np.bincount(number_of, counts[asked])
     mostly = (size > most) & (np.bincount(number_of, above) >= COVERED * np.bincount(number_of))
