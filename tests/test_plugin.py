@@ -14,7 +14,6 @@ import sys
 import time
 from pathlib import Path
 
-import laspy
 import pytest
 
 import pdal_stages as ps
@@ -99,14 +98,7 @@ def with_words(name, *words):
 
 
 def assert_same(one, other):
-    """The same bytes; of LAS files the same points and dimensions, since ours keeps records that PDAL writes anew."""
-    if one.suffix not in (".las", ".laz"):
-        assert one.read_bytes() == other.read_bytes(), one.name
-        return
-    points, others = laspy.read(one).points, laspy.read(other).points
-    assert points.array.dtype == others.array.dtype
-    assert points.array.tobytes() == others.array.tobytes()
-    assert [*points.scales, *points.offsets] == [*others.scales, *others.offsets]
+    assert one.read_bytes() == other.read_bytes(), one.name
 
 
 def las(stages, output):
@@ -127,7 +119,7 @@ def test_every_stage_is_listed_with_its_options(stock):
             assert f"\n  {option.name}" in described, (name, option.name)
 
 
-# ---- the same bytes ----------------------------------------------------------------------------------------
+# ---- the same bytes: uncompressed, since LAZ of LAS 1.4 is compressed by laspy before PDAL 2.3 ---------------
 
 EVERY = [
     {"type": "filters.detachednoise"},
@@ -151,9 +143,9 @@ def test_all_stages_give_the_same_bytes(pipeline, town, tmp_path):
     ready = {stage["type"] for path in PIPELINES for stage in json.loads(path.read_text())}
     tested = {stage["type"] for stage in EVERY} | ready | {"writers.objects", "filters.polygons"}
     assert set(stage_types()) <= tested
-    pipeline(las([str(town), *EVERY], tmp_path / "stock.laz"))
-    ps.Pipeline(las([str(town), *EVERY], tmp_path / "ours.laz")).execute()
-    assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
+    pipeline(las([str(town), *EVERY], tmp_path / "stock.las"))
+    ps.Pipeline(las([str(town), *EVERY], tmp_path / "ours.las")).execute()
+    assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
 
 
 def test_objects_are_written(pipeline, town, tmp_path):
@@ -172,9 +164,9 @@ def test_objects_are_written(pipeline, town, tmp_path):
 
 READY = {
     "train": ["--stage.model.filename=m.model"],
-    "evaluate": ["--stage.classifier.model=MODEL", "--stage.output.filename=o.laz", "--stage.accuracy.json=a.json",
+    "evaluate": ["--stage.classifier.model=MODEL", "--stage.output.filename=o.las", "--stage.accuracy.json=a.json",
                  "--stage.accuracy.html=a.html"],
-    "tiles-to-tiles": ["--stage.classifier.model=MODEL", "--stage.output.filename=o_#.laz", "--stage.tiles.length=40"],
+    "tiles-to-tiles": ["--stage.classifier.model=MODEL", "--stage.output.filename=o_#.las", "--stage.tiles.length=40"],
 }  # fmt: skip
 
 
@@ -212,9 +204,9 @@ def test_points_of_several_readers_see_each_other(pipeline, ready_halves, tmp_pa
             {"type": "filters.hag_minima", "inputs": ["a", "b"]},
         ],
     ):
-        pipeline(las(stages, tmp_path / "stock.laz"))
-        ps.Pipeline(las(stages, tmp_path / "ours.laz")).execute()
-        assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
+        pipeline(las(stages, tmp_path / "stock.las"))
+        ps.Pipeline(las(stages, tmp_path / "ours.las")).execute()
+        assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
 
 
 # ---- options, metadata, log --------------------------------------------------------------------------------
@@ -224,9 +216,9 @@ def test_options_of_every_pdal_stage(pipeline, town, tmp_path):
     log = tmp_path / "log.txt"
     stage = {"type": "filters.hag_minima", "cell": 10, "where": "X > 500030"}
     stage |= {"user_data": {"a": [1]}, "log": str(log)}
-    pipeline(las([str(town), stage], tmp_path / "stock.laz"), "--verbose=4")
-    ps.Pipeline(las([str(town), {**stage}], tmp_path / "ours.laz")).execute()
-    assert_same(tmp_path / "stock.laz", tmp_path / "ours.laz")
+    pipeline(las([str(town), stage], tmp_path / "stock.las"), "--verbose=4")
+    ps.Pipeline(las([str(town), {**stage}], tmp_path / "ours.las")).execute()
+    assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
     assert log.exists()
 
 
