@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 
 import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.cli import main, parsed
+from pdal_stages.cli import _COMMANDS, main, parsed
 from pdal_stages.stages.base import stage_types
 
 pytestmark = pytest.mark.pdal
@@ -167,3 +168,18 @@ def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
 def test_names_may_stand_behind_flags(words, inputs, output):
     seen = parsed(words.split(), is_program=False)
     assert seen.inputs == inputs and getattr(seen, "output", None) == output
+
+
+@pytest.mark.parametrize("command", [None, *(name for names in _COMMANDS.values() for name in names)])
+def test_help_fits_a_screen(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([*filter(None, [command]), "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 40 and max(map(len, lines)) <= 80
+    with pytest.raises(SystemExit):
+        main([*filter(None, [command]), "--help-all"])
+    flags = set(re.findall(r"--[^ ]*\w+", capsys.readouterr().out)) - set(
+        re.findall(r"--[^ ]*\w+", "\n".join(lines))
+    )
+    assert bool(flags) == ("--help-all" in lines[-1])

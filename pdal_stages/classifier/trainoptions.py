@@ -65,8 +65,8 @@ class TrainingOptions:
     classes: Any = setting(
         None,
         "mapping",
-        'Labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}, or a list of codes; '
-        "default: every label met except 0, 1, 7, 12 and 18",
+        'Codes, e.g. 2,5,6, or labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: '
+        "every label but 0, 1, 7, 12 and 18",
     )
     strategy: str = setting(
         "multiclass",
@@ -132,8 +132,7 @@ class TrainingOptions:
     passes: Any = setting(
         None,
         "integer",
-        "Forests one after the other, each reading what the one before says of a point's surroundings; default 2, on top of "
-        "a base 1, for few labels: a labeled survey gains by 2",
+        "Forests one after the other, each reading what the one before says of the surroundings; default 2, on a base 1",
         *(1, MOST_PASSES),
     )
     context: Any = setting(
@@ -145,8 +144,7 @@ class TrainingOptions:
     base: Any = setting(
         None,
         "model",
-        "A model to build on: what it says all around a point is read by a forest on top, which few labels train; classes "
-        "that the labels lack keep its answer",
+        "A model to build on, which takes few labels; classes that the labels lack keep its answer",
     )
     algorithm: str = setting(
         "random_forest",

@@ -20,17 +20,14 @@ from ..base.version import __version__
 
 #: Modules and their commands, which are imported for these alone; for ``commands`` all are.
 _COMMANDS = {
-    "pipelines": ("pipeline", "expand", "validate"),
     "tiles": ("classify",),
     "files": ("objects", "review", "corrections"),
     "models": ("models", "train", "adapt", "accuracy", "model"),
+    "pipelines": ("pipeline", "expand", "validate"),
     "machine": ("drivers", "options", "doctor", "plugin", "demo", "warmup"),
 }
-OVERRIDES = (
-    "Options of stages are set as in PDAL: --stage.TAG.option=VALUE for stages with a tag, "
-    "--filters.name.option=VALUE for all stages of a type."
-)
-INPUTS = "Files that PDAL reads, folders, patterns, tile indexes, EPT sources"
+OVERRIDES = "Stages take options as in PDAL: --stage.TAG.option=V, --filters.name.option=V"
+INPUTS = "Files, folders, patterns, tile indexes, EPT sources"
 _NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 
 
@@ -91,14 +88,18 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     overrides, rest = parse_overrides(arguments)
     parser = Parser(
         prog="pdal-stages",
-        description="PDAL pipelines with stages that classify airborne laser scans.",
-        epilog=OVERRIDES + " --debug shows tracebacks.",
+        description="Classify airborne laser scans, alone or in PDAL pipelines.",
+        epilog="Help on a command: pdal-stages COMMAND --help. With --debug errors show tracebacks.",
     )
     parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
     of_command = {name: module for module, names in _COMMANDS.items() for name in names}
     asked = of_command.get(rest[0]) if rest else None
     for module in [asked] if asked else _COMMANDS:
         importlib.import_module(f".{module}", __name__).add_commands(parser)
+    if "--help-all" in rest:
+        rest = ["--help" if word == "--help-all" else word for word in rest]
+        for one in parser.commands.values():
+            one.rare = ()
     if not rest or rest[0] not in parser.commands:
         parser.parse_args(rest)  # which shows help or the version, or says what is wrong, and leaves
     command, *rest = rest
@@ -132,8 +133,37 @@ def _unforeseen(error: Exception) -> StageError:
     )
 
 
+class _OneScreen(argparse.HelpFormatter):
+    """Usage shows only what must be given, and ``--[no-]flag`` stands for both ways of a switch."""
+
+    def _format_usage(self, usage, actions, groups, prefix):
+        needed = [one for one in actions if one.required or not one.option_strings]
+        return super()._format_usage(usage, needed, [], prefix)
+
+    def _format_action_invocation(self, action):
+        if isinstance(action, argparse.BooleanOptionalAction):
+            return f"--[no-]{action.option_strings[0][2:]}"
+        return super()._format_action_invocation(action)
+
+
 class Parser(argparse.ArgumentParser):
-    """Says which of the choices may have been meant, and adds commands."""
+    """Says which of the choices may have been meant, adds commands, and keeps their help to one screen."""
+
+    #: Arguments that only ``--help-all`` shows.
+    rare: Sequence[str] = ()
+
+    def _get_formatter(self) -> _OneScreen:
+        return _OneScreen(f"{self.prog} [options]", max_help_position=24)
+
+    def format_help(self) -> str:
+        """What ``--help`` prints."""
+        hidden = {one: one.help for one in self._actions if one.dest in self.rare}
+        for one in hidden:
+            one.help = argparse.SUPPRESS
+        text = super().format_help() + "\n--help-all shows all options.\n" * bool(hidden)
+        for one, told in hidden.items():
+            one.help = told
+        return text
 
     def error(self, message: str) -> NoReturn:
         if chosen := _NO_CHOICE.search(message):
@@ -141,10 +171,10 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
     @property
-    def commands(self) -> dict[str, argparse.ArgumentParser]:
+    def commands(self) -> dict[str, Parser]:
         """The commands that are there."""
         if self._subparsers is None:
-            self.add_subparsers(dest="command", required=True, metavar="COMMAND")
+            self.add_subparsers(prog=self.prog, dest="command", required=True, metavar="COMMAND")
         return self._subparsers._group_actions[0].choices  # type: ignore
 
     def command(
@@ -154,31 +184,25 @@ class Parser(argparse.ArgumentParser):
         help: str,
         overrides: bool = False,
         logged: bool = False,
-        **more: Any,
+        rare: Sequence[str] = (),
     ) -> Callable:
         """Add a command; returns what adds its arguments. `logged`: it works long enough for a log and progress."""
         assert self.commands is not None
-        more.setdefault("epilog", OVERRIDES if overrides else None)
         made = self._subparsers._group_actions[0].add_parser(  # type: ignore
-            name, help=help, description=f"{help}.", **more
+            name, help=help, description=f"{help}.", epilog=OVERRIDES if overrides else None
         )
         made.set_defaults(run=run, takes_overrides=overrides)
+        made.rare = [*rare, *(("log", "progress") if logged else ())]
         takes = made.add_argument
         if logged:
-            takes("--log", metavar="FILE", help="Add all that the run and its workers print to a log file")
+            takes("--log", metavar="FILE", help="Append everything that is printed to a log file")
             takes("--progress", action=argparse.BooleanOptionalAction, help="Show progress")
         return takes
 
     def refuse(self, command: str, unknown: Sequence[str]) -> NoReturn:
         """Leave the program: a command's words are unknown."""
-        flags = re.findall(r"(?<!\S)--[\w-]+(?![\w.-])", self.commands[command].format_help())
-        near = suggest(unknown[0].partition("=")[0], flags)
+        near = suggest(unknown[0].partition("=")[0], self.commands[command]._option_string_actions)
         self.commands[command].error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
-
-
-def switch(takes: Callable, flag: str, default: bool, help: str) -> None:
-    """Add ``--flag`` and ``--no-flag``."""
-    takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
 
 
 def takes_options(takes: Callable, stage: str, *names: str) -> None:
@@ -189,5 +213,6 @@ def takes_options(takes: Callable, stage: str, *names: str) -> None:
     for option in stage_type(stage).all_options():
         if option.name in names:
             what, choices = option.help.replace("%", "%%"), option.choices or None
-            how = {"type": kinds.get(option.kind), "choices": choices, "help": what}
+            value = None if choices else option.name.split("_")[-1].upper()
+            how = {"type": kinds.get(option.kind), "choices": choices, "help": what, "metavar": value}
             takes(f"--{option.name.replace('_', '-')}", **how)

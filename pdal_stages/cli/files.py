@@ -10,33 +10,35 @@ from . import Parser, takes_options
 
 def add_commands(parser: Parser) -> None:
     """``objects``, ``review`` and ``corrections``."""
-    what = "Write buildings, trees, spans and decks of classified files to a vector file"
+    what = "Write buildings, trees, wires and bridge decks to a vector file"
     takes = parser.command("objects", _objects, what, overrides=True, logged=True)
-    takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
+    takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes_options(takes, "writers.objects", "outlines", "cell")
-    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
+    takes("--workers", type=int, default=1, metavar="N", help="Files to read at the same time (default: 1)")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
-    what = "List where a person should look in classified files, worst first"
+    what = "List the places that a person should check, worst first"
     takes = parser.command("review", _review, what, logged=True)
-    takes("inputs", nargs="+", metavar="input", help="Classified files PDAL can read, folders, patterns")
+    takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    takes("--html", metavar="FILE", help="A page; default: beside the vector file, under its name")
+    takes("--html", metavar="FILE", help="Web page to write (default: beside the vector file)")
     takes("--json", metavar="FILE", help="Write figures to a JSON file")
-    takes("--share", type=float, default=0.95, metavar="SHARE", help="Expected errors that are listed (0.95)")
-    takes("--cell", type=float, default=0.0, metavar="METERS", help="Side of the cells (by the density)")
-    takes("--workers", type=int, default=1, metavar="N", help="Files read at the same time (1)")
-    takes("--model", default="standard", help="What says how reliable classes are, where files do not")
+    takes(
+        "--share", type=float, default=0.95, metavar="SHARE", help="Share of expected errors to list (0.95)"
+    )
+    takes("--cell", type=float, default=0.0, metavar="METERS", help="Side of the cells (default: by density)")
+    takes("--workers", type=int, default=1, metavar="N", help="Files to read at the same time (default: 1)")
+    takes("--model", default="standard", help="Model to ask where files have no Reliability")
 
-    what = "Mark what a person has corrected, or looked at and found right, for train"
+    what = "Mark what a person corrected or confirmed, for train"
     takes = parser.command("corrections", _corrections, what)
     takes("before", help="The file as it was classified (LAS or LAZ)")
     takes("after", nargs="?", help="The same points, in any order, as the person left them")
-    takes("--out", required=True, metavar="FILE", help="The points with the new classes, and Checked")
-    area = "Polygons in which all was looked at (of review: where 'done' is 1); may be repeated"
+    takes("--out", required=True, metavar="FILE", help="File to write: the new classes, and Checked")
+    area = "Polygons in which everything was checked (from review: where 'done' is 1)"
     takes("--area", action="append", default=[], metavar="FILE", help=area)
-    takes("--around", type=float, default=1.0, metavar="METERS", help="Around changes all was looked at (1)")
+    takes("--around", type=float, default=1.0, metavar="METERS", help="Radius checked around changes (1)")
 
 
 def _objects(options: argparse.Namespace) -> None:

@@ -31,34 +31,28 @@ def add_commands(parser: Parser) -> None:
     takes("--showjson", action="store_true", help="As JSON Schema")
 
     takes = parser.command("commands", partial(_commands, parser), "List commands with their arguments")
-    told = "With stages, models and classes, as JSON: dialogs are made of it"
+    told = "As JSON, with stages, models and classes, to build dialogs from"
     takes("--showjson", action="store_true", help=told)
 
-    parser.command("doctor", _doctor, "Tell what is there on this machine, and the cure for what is not")
+    parser.command("doctor", _doctor, "Check what is installed, and say how to get what is missing")
 
-    parser.command(
-        "plugin", _plugin, "Build our stages into PDAL itself, so that all that runs PDAL has them"
-    )
+    parser.command("plugin", _plugin, "Build our stages into PDAL itself, for all programs that use it")
     command = parser.commands["plugin"]
     what = command.add_mutually_exclusive_group(required=True)
     what.add_argument("--install", action="store_true", help="Compile it and put it beside filters.python")
-    what.add_argument("--check", action="store_true", help="Tell what is there and what is missing")
-    what.add_argument("--uninstall", action="store_true", help="Take it away")
-    folder = "Another folder, which must then be in PDAL_DRIVER_PATH, together with that of filters.python"
+    what.add_argument("--check", action="store_true", help="Say what is there and what is missing")
+    what.add_argument("--uninstall", action="store_true", help="Remove it")
+    folder = "Another folder; PDAL_DRIVER_PATH must name it and that of filters.python"
     command.add_argument("--folder", type=Path, metavar="DIR", help=folder)
 
-    takes = parser.command(
-        "demo", _demo, "Generate a town, train on one half, classify the other", logged=True
-    )
+    takes = parser.command("demo", _demo, "Make a town, train on one half, classify the other", logged=True)
     takes("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
     takes("--size", type=float, default=200.0, help="Side of the town in meters")
     takes("--density", type=float, default=7.0, help="Points per square meter")
-    takes("--seed", type=int, default=1)
+    takes("--seed", type=int, default=1, help="Another number makes another town")
 
-    takes = parser.command(
-        "warmup", _warmup, "Compile the kernels for this machine once, so that later runs start without delay"
-    )
-    takes("--all", action="store_true", help="Those of kopt, ropt, copt and shape distributions too")
+    takes = parser.command("warmup", _warmup, "Compile the kernels once, so that later runs start at once")
+    takes("--all", action="store_true", help="Also those for kopt, ropt, copt and shape distributions")
 
 
 def _drivers(options: argparse.Namespace) -> None:

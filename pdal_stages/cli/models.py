@@ -9,7 +9,7 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs
 from ..base.messages import print_messages
-from . import INPUTS, OVERRIDES, Parser, takes_options, tiles
+from . import INPUTS, Parser, takes_options, tiles
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
 _OF_TRAINING = ("base", "passes", "classes", "neighborhoods", "feature_set", "count", "trees")
@@ -19,42 +19,38 @@ def add_commands(parser: Parser) -> None:
     """``models``, ``train``, ``adapt``, ``accuracy`` and ``model``."""
     parser.command("models", _models, "List the models that come with the package")
 
-    takes = parser.command("train", _train, "Train a model on labeled clouds", overrides=True, logged=True)
-    takes("inputs", nargs="+", metavar="input", help=f"Labeled: {INPUTS[0].lower()}{INPUTS[1:]}")
-    takes("--model", required=True, help="The model file to write")
+    rare = ("neighborhoods", "feature_set", "count", "trees", "passes")
+    what = "Train a model on labeled point clouds"
+    takes = parser.command("train", _train, what, overrides=True, logged=True, rare=rare)
+    takes("inputs", nargs="+", metavar="input", help=INPUTS)
+    takes("--model", required=True, help="Model file to write")
     takes_options(takes, "writers.classifiermodel", *_OF_TRAINING)
-    surveys = "Files of one survey, e.g. north=north/*.laz; each other file is one of its own. They do not see each other"
+    surveys = "Files that are one survey, e.g. north=north/*.laz; any other file is one by itself"
     takes("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
 
     tiles.add_sizes(parser.commands["train"])
-    parser.commands["train"].epilog = (
-        "Of several files the score is by file. Of one file, --writers.classifiermodel.groups=PointSourceId makes it one by "
-        "flight line (any dimension with a number for each group), and --writers.classifiermodel.survey=UserData says that "
-        "points of another number there are of another survey. " + OVERRIDES
-    )
-
-    what = "Make a model for a survey without labels, of what another is sure of there"
+    what = "Fit a model to a survey without labels"
     takes = parser.command("adapt", _adapt, what, logged=True)
-    takes("inputs", nargs="+", metavar="input", help=f"One survey's: {INPUTS[0].lower()}{INPUTS[1:]}")
-    takes("--model", required=True, help="The model file to write, for classify --model")
-    takes("--teacher", default="standard", metavar="MODEL", help="The model that is asked; default standard")
-    takes("--sure", type=float, default=0.7, metavar="SHARE", help="Least Reliability to be believed (0.7)")
+    takes("inputs", nargs="+", metavar="input", help=INPUTS)
+    takes("--model", required=True, help="Model file to write, for classify --model")
+    takes("--teacher", default="standard", metavar="MODEL", help="Model to learn from (default: standard)")
+    takes("--sure", type=float, default=0.7, metavar="SHARE", help="Least Reliability to trust (0.7)")
     tiles.add_sizes(parser.commands["adapt"])
 
-    what = "Compare two class dimensions, or two files"
+    what = "Compare classes with a reference, points or objects"
     takes = parser.command("accuracy", _accuracy, what, overrides=True, logged=True)
-    takes("inputs", nargs="+", metavar="input", help=f"Classified: {INPUTS[0].lower()}{INPUTS[1:]}")
-    takes("--reference", action="append", metavar="FILE", help="True classes of the same points, in order")
-    takes("--model", help="Score this model on labeled files: a model file, or a shipped model's name")
-    takes("--dimension", default="Classification", help="Classes to judge")
-    takes("--reference-dimension", help="Dimension with the true classes")
-    takes("--objects", metavar="FILE", help="Compare objects: true buildings (polygons) or trees (points)")
-    takes("--area", metavar="FILE", help="With --objects: polygons inside of which objects count")
-    takes("--json", help="Write figures to this file")
-    takes("--html", help="Write a report to this file")
+    takes("inputs", nargs="+", metavar="input", help=INPUTS)
+    takes("--reference", action="append", metavar="FILE", help="True classes: the same points in their order")
+    takes("--model", help="Score this model, a file or a shipped one, on labeled files")
+    takes("--dimension", default="Classification", metavar="NAME", help="Dimension to judge (Classification)")
+    takes("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
+    takes("--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)")
+    takes("--area", metavar="FILE", help="With --objects: count only objects inside these polygons")
+    takes("--json", metavar="FILE", help="Write the figures to a JSON file")
+    takes("--html", metavar="FILE", help="Write a report to a web page")
 
     takes = parser.command("model", _model, "Describe a model file")
-    takes("file")
+    takes("file", help="A model file or a shipped model")
     takes("--showjson", action="store_true", help="Everything, as JSON")
 
 

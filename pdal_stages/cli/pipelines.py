@@ -26,18 +26,18 @@ _LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
 
 def add_commands(parser: Parser) -> None:
     """``pipeline``, ``expand`` and ``validate``."""
-    help = "Run a pipeline that may contain our stages"
-    takes = parser.command("pipeline", _pipeline, help, overrides=True, logged=True)
+    help = "Run a PDAL pipeline that may have our stages"
+    rare = ("file_option", "nostream", "verbose", "scheduler", "per", "buffer")
+    takes = parser.command("pipeline", _pipeline, help, overrides=True, logged=True, rare=rare)
     _input(takes)
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
-    takes("--validate", action="store_true", help="Check the pipeline without reading points, then stop")
-    never = "Accepted for compatibility with PDAL; our stages never stream"
-    takes("--nostream", action="store_true", help=never)
-    levels = "Print more of PDAL's log: 1 warnings (default), 2 what it does, 3 and more everything"
+    takes("--validate", action="store_true", help="Check without reading points, then stop")
+    takes("--nostream", action="store_true", help="Accepted, as by PDAL; our stages never stream")
+    levels = "PDAL's log: 1 warnings (default), 2 what it does, 3 everything"
     takes("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
     tiles.add_arguments(parser.commands["pipeline"])
 
-    help = "Print the plain PDAL JSON, which stock 'pdal pipeline' runs"
+    help = "Print a pipeline as plain PDAL JSON, for stock 'pdal pipeline'"
     takes = parser.command("expand", _expand, help, overrides=True)
     _input(takes)
     takes("-o", "--output", metavar="FILE", help="Write it to a file instead")

@@ -23,7 +23,7 @@ from ..base.resources import parse_size
 from ..pipeline.run import LEFT_ALONE
 from ..tiling.report import InterruptedRun, TiledRun
 from ..tiling.settings import PER, TilingOptions
-from . import INPUTS, Parser, switch, takes_options
+from . import INPUTS, Parser, takes_options
 
 if TYPE_CHECKING:
     from ..tiling.classify import ClassifyTask
@@ -40,34 +40,36 @@ _DEFAULTS: dict[str, Any] = {
 
 def add_commands(parser: Parser) -> None:
     """``classify``."""
-    takes = parser.command("classify", _classify, "Classify clouds with a model", overrides=True, logged=True)
+    what = "Classify point clouds: ground, vegetation, buildings and more"
+    rare = ("dimensions", "bridges", "consistency", "metadata", "scheduler", "per")
+    takes = parser.command("classify", _classify, what, overrides=True, logged=True, rare=rare)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
-    takes("output", help="A file; of several inputs a folder, or a name with # where the input's goes")
-    takes("--model", default="standard", help="A model file, or one of pdal-stages models; default standard")
+    takes("output", help="A file, a folder, or a name with # for the input's")
+    takes("--model", default="standard", help="A model file or a shipped model (default: standard)")
     takes(
         "--dimensions",
         metavar="LIST",
-        help="Extra dimensions to write beside the input's own: e.g. Reliability,Margin,Probability_6, all, or none; "
+        help="Extra dimensions to write besides the input's own, e.g. Reliability,Margin,Probability_6, or all, or none; "
         "default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 (1.6 %%), which keeps files small",
     )
-    switch(takes, "--noise", True, "Mark low and high noise first (filters.detachednoise)")
+    for flag, default, help in (
+        ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
+        ("--bridges", True, "Find bridge decks, class 17 (default: on)"),
+        ("--wires", False, "Find wires, class 14"),
+        ("--towers", False, "Find wires, and towers and poles, class 15"),
+        ("--consistency", True, "Correct classes that contradict their surroundings (default: on)"),
+    ):
+        takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
     takes(
         "--polygons",
         action="append",
         default=[],
         metavar="FILE=CODE",
-        help="Class of ground inside the polygons of an OGR file, e.g. lakes.gpkg=9; of other classes too: "
-        "bridges.gpkg=17:2,6; may be repeated (filters.polygons)",
+        help="Class of ground inside polygons, e.g. lakes.gpkg=9; of other classes: bridges.gpkg=17:2,6; may be repeated",
     )
-    takes(
-        "--objects", metavar="FILE", help="Then write objects of all outputs to a vector file (see objects)"
-    )
-    switch(takes, "--bridges", True, "Find bridge decks (17), with heights of filters.hag_morphological")
-    switch(takes, "--wires", False, "Find wires (14); tiles take 85 m more around them")
-    switch(takes, "--towers", False, "Find wires, and towers and poles (15) with them; tiles take 145 m more")
-    switch(takes, "--consistency", True, "Mend classes that contradict their surroundings, at the end")
+    takes("--objects", metavar="FILE", help="Also write buildings, trees and more to a vector file")
     takes_options(takes, "filters.modelclassifier", "vegetation_heights", "keep_sure")
-    takes("--where", help="Classify only the points for which this holds; the others serve as neighbors")
+    takes("--where", help="Classify only points for which this holds")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     add_arguments(parser.commands["classify"], survey=True)
 
@@ -167,30 +169,26 @@ def _classify_tiles(
 
 def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> None:
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
-    when = "Several inputs, and files too large for memory, are cut into tiles" if survey else "Run in tiles"
-    takes = add_sizes(command, f"{when}; see docs/large-areas.md.")
+    when = "Several inputs and large files are cut into tiles" if survey else "Run in tiles"
+    takes = add_sizes(command, f"{when} (docs/large-areas.md).")
     takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
-    takes("--per", choices=PER, default="auto", help="One output per input file or per tile (auto: per file)")
-    surroundings = "Surroundings for PDAL filters that look at neighbors"
-    takes("--buffer", type=float, metavar="METERS", help=argparse.SUPPRESS if survey else surroundings)
-    takes("--resume", action="store_true", help="Keep what an earlier run in this folder finished")
-    takes("--dry-run", action="store_true", help="Show the tiles and an estimate, then stop")
-    report = "Write a report, .html or .json; may be repeated"
-    takes("--report", action="append", default=[], metavar="FILE", help=report)
+    takes("--per", choices=PER, default="auto", help="One output per input or per tile (auto: per input)")
+    around = argparse.SUPPRESS if survey else "What PDAL's own filters need around a tile"
+    takes("--buffer", type=float, metavar="METERS", help=around)
+    takes("--resume", action="store_true", help="Continue a run that was stopped or failed")
+    takes("--dry-run", action="store_true", help="Show the tiles and what they will take, then stop")
+    takes("--report", action="append", default=[], metavar="FILE", help="Write a report, .html or .json")
 
 
 def add_sizes(
     command: argparse.ArgumentParser,
-    what: str = "Points that do not fit into the memory are worked on in tiles; the model is the same.",
+    what: str = "Points that do not fit in memory are read in tiles; the model is the same.",
 ) -> Callable:
     """Add the flags of ``train``, whose only output is a model; returns what adds more."""
     takes = command.add_argument_group("large areas", what).add_argument
-    side = "Side of the tiles, in the unit of the coordinates; auto takes what the memory allows"
-    takes("--tile", type=_side, metavar="SIZE", help=side)
-    memory = "What all processes together may hold, e.g. 4GB (default: half of what is free)"
-    takes("--memory", metavar="SIZE", help=memory)
-    workers = "Worker processes; 0 runs everything in this process (default: half the cores)"
-    takes("--workers", type=int, metavar="N", help=workers)
+    takes("--tile", type=_side, metavar="SIZE", help="Side of the tiles in the cloud's unit, or auto")
+    takes("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
+    takes("--workers", type=int, metavar="N", help="Worker processes, 0 for none (default: half the cores)")
     return takes
 
 

@@ -62,8 +62,7 @@ class ModelClassifier(Stage):
     keep_sure: float | None = option(
         "number",
         None,
-        "Only points sure enough keep their class, so that this share of those of each class is right, as it was on ground "
-        "that the model had not seen (0.98); the rest become rejected_code, by default 1",
+        "Keep only classes sure enough for this share to be right, e.g. 0.98; others become rejected_code, by default 1",
         minimum=0.5,
         maximum=0.999,
     )
@@ -75,7 +74,7 @@ class ModelClassifier(Stage):
         "point what a class would overwrite"
     )
     vegetation_heights: tuple[float, float] | None = vegetation_heights_option(
-        "points the model calls vegetation (5) become low (3) below the first and medium (4) below the second"
+        "vegetation (5) below them becomes low (3) and medium (4)"
     )
     compact: bool = option(
         "boolean",

@@ -189,9 +189,7 @@ def keep_option(points: str = "Points that are neighbors but keep their class") 
 
 def vegetation_heights_option(points: str) -> Any:
     """The option `vegetation_heights`; says what becomes of which `points`."""
-    return option(
-        "bands", None, f"Two heights above ground in meters, e.g. 0.5,2: {points}", may_be_empty=True
-    )
+    return option("bands", None, f"Two heights in meters, e.g. 0.5,2: {points}", may_be_empty=True)
 
 
 def split_list(text: str) -> list[str]:
