@@ -9,7 +9,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 try:
     import stage_pages
-    import survey_table
 
     from pdal_stages import __version__
 except ModuleNotFoundError as error:
@@ -19,7 +18,6 @@ except ModuleNotFoundError as error:
     ) from None
 
 stage_pages.write()
-survey_table.write()
 
 project = "pdal_stages"
 author = "the pdal_stages authors"

@@ -57,17 +57,17 @@ def test_json_in_the_docs_is_valid(tmp_path, monkeypatch):
     assert found >= 5
 
 
-def test_readme_numpy_snippet_runs(tmp_path, monkeypatch, write_las, capsys, random_cloud):
+def test_numpy_snippet_runs(tmp_path, monkeypatch, write_las, capsys, random_cloud):
     monkeypatch.chdir(tmp_path)
     xyz = random_cloud(500)
     write_las(tmp_path / "raw.laz", {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2]}, point_format=3)
-    (snippet,) = [b for b in blocks(ROOT / "README.md", "python") if "compute_features" in b]
-    exec(compile(snippet, "README.md", "exec"), {})
+    (snippet,) = blocks(ROOT / "docs" / "api.md", "python")
+    exec(compile(snippet, "api.md", "exec"), {})
     assert "Linearity_c1" in capsys.readouterr().out
 
 
 @pytest.mark.pdal
-def test_readme_pipelines_and_python_objects_run(tmp_path, monkeypatch, write_las, pdal_module):
+def test_pipelines_and_python_objects_run(tmp_path, monkeypatch, write_las, pdal_module):
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 30, (2, 1500))
@@ -76,12 +76,13 @@ def test_readme_pipelines_and_python_objects_run(tmp_path, monkeypatch, write_la
     z = np.where(block, 5.0, np.where(x < 8, rng.uniform(0, 4, 1500), 0.0)) + rng.normal(0, 0.02, 1500)
     for name in ("labeled.laz", "raw.laz"):
         write_las(tmp_path / name, {"X": x, "Y": y, "Z": z, "Classification": labels}, point_format=3)
-    train, classify = blocks(ROOT / "README.md", "json")
+    page = ROOT / "docs" / "pdal-users.md"
+    train, classify = blocks(page, "json")
     ps.run_pipeline(train)
     assert ps.run_pipeline(classify).arrays
     (tmp_path / "classified.laz").unlink()
-    (snippet,) = [b for b in blocks(ROOT / "README.md", "python") if "ps.Filter" in b]
-    exec(compile(snippet, "README.md", "exec"), {})
+    (snippet,) = [b for b in blocks(page, "python") if "ps.Filter" in b]
+    exec(compile(snippet, "pdal-users.md", "exec"), {})
     assert (tmp_path / "classified.laz").stat().st_size > 1000
 
 
