@@ -48,29 +48,8 @@ def _higher(z, a, b):
     return z[a] > z[b] or (z[a] == z[b] and a < b)
 
 
-@device
-def _saddle(s, r, c, i, j):
-    """The lowest height on the line between two cells; the same either way."""
-    steps = max(abs(i - r), abs(j - c))
-    lowest = s[r, c]
-    for k in range(1, steps):
-        # Whole numbers, rounded alike, whichever cell the line begins at.
-        a = (2 * (r * (steps - k) + i * k) + steps) // (2 * steps)
-        b = (2 * (c * (steps - k) + j * k) + steps) // (2 * steps)
-        lowest = min(lowest, s[a, b])
-    return lowest
-
-
 @njit
-def crown_cells(s: NDArray, least: float, base: float, slope: float, depth: float, reach: float) -> NDArray:
-    """Of each cell of a smoothed canopy the number of its tree's top cell, -1 where there is none.
-
-    A cell goes to the highest cell beside it, up to a maximum. Of the higher maxima in a maximum's window, the one over
-    the highest saddle (on the line between) takes it, where the saddle lies no more than `depth` times its height below.
-    A window has a radius of `base` cells and `slope` per meter of height, half of `reach` at most. A cell belongs to a
-    crown where it is at least 0.3 times as high as the top and within `reach` cells of it; tops are nearly as high as
-    the `least` tree, meters.
-    """
+def crown_cells(s: NDArray, least: float, depth: float, share: float, reach: float) -> NDArray:
     rows, columns = s.shape
     z = s.ravel()
     up = np.full(rows * columns, -1, np.int64)  # where a cell goes; a top goes to itself
@@ -83,24 +62,28 @@ def crown_cells(s: NDArray, least: float, base: float, slope: float, depth: floa
                     if _higher(z, i * columns + j, up[n]):
                         up[n] = i * columns + j
     maximum = up == np.arange(rows * columns)
+    seen = np.full(rows * columns, -1, np.int64)
     for n in range(rows * columns):
         if not maximum[n]:
             continue
         r, c = n // columns, n % columns
-        radius = min(base + slope * z[n], reach / 2)
-        k = int(radius)
-        best, best_saddle, best_away = n, -1.0, 0
-        for i in range(max(r - k, 0), min(r + k + 1, rows)):
-            for j in range(max(c - k, 0), min(c + k + 1, columns)):
-                m = i * columns + j
-                away = (i - r) * (i - r) + (j - c) * (j - c)
-                if not maximum[m] or m == n or away > radius * radius or not _higher(z, m, n):
-                    continue
-                saddle = _saddle(s, r, c, i, j)
-                if saddle > best_saddle or (saddle == best_saddle and away < best_away):
-                    best, best_saddle, best_away = m, saddle, away
-        if best_saddle >= z[n] * (1.0 - depth):
-            up[n] = best
+        level = z[n] - depth - share * z[n]
+        best, best_away = n, reach * reach
+        seen[n] = n
+        todo = [n]
+        while todo:
+            at = todo.pop()
+            for i in range(max(at // columns - 1, 0), min(at // columns + 2, rows)):
+                for j in range(max(at % columns - 1, 0), min(at % columns + 2, columns)):
+                    m, away = i * columns + j, (i - r) * (i - r) + (j - c) * (j - c)
+                    if seen[m] == n or z[m] < level or away > 0.25 * reach * reach:
+                        continue
+                    seen[m] = n
+                    if not _higher(z, m, n):
+                        todo.append(m)
+                    elif away < best_away or (away == best_away and _higher(z, m, best)):
+                        best, best_away = m, away
+        up[n] = best
     out = np.full(rows * columns, -1, np.int64)
     for n in range(rows * columns):
         r, c, at = n // columns, n % columns, up[n]

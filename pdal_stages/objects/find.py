@@ -151,9 +151,8 @@ def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
     top = crowns.crown_cells(
         crowns.smoothed(height, chosen.smoothing / size),
         chosen.tree_height,
-        chosen.window / size,
-        chosen.window_slope / size,
         chosen.saddle,
+        chosen.saddle_slope,
         crowns.REACH / size,
     )
     number = np.where(np.isnan(high), -1, top)

@@ -43,17 +43,8 @@ class ObjectSettings:
     )
     tree_height: float = _setting(3.0, "Lower plants are not trees", 0, 100)
     tree_area: float = _setting(1.5, "Trees with smaller crowns are left out", 0, 1000, "m2")
-    window: float = _setting(
-        1.5, "Radius in which a tree has no second top, for a tree of no height", 0.1, 10
-    )
-    window_slope: float = _setting(0.1, "Added to the radius per meter of height", 0, 1, "")
-    saddle: float = _setting(
-        0.1,
-        "Two tops that near are one tree where the saddle is no deeper than this share of the lower",
-        0,
-        1,
-        "",
-    )
+    saddle: float = _setting(0.3, "A", 0, 100)
+    saddle_slope: float = _setting(0.0, "A", 0, 100)
     smoothing: float = _setting(0.35, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
     span_gap: float = _setting(2.0, "Wires with larger gaps are two spans", 0.5, 20)
 
