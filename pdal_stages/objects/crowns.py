@@ -1,10 +1,11 @@
 """Trees of cells: tops of a smoothed canopy, and the crown that goes with each.
 
-The steps are the field's: a canopy height model without pits, smoothed; its maxima in a window that grows with height
-(Popescu, Wynne 2004); a watershed of which only the tops' basins stay (marker-controlled, Chen, Baldocchi, Gong, Kelly
-2006), the others going to the top they belong to. Here every step reaches a bounded way: a cell climbs to its maximum, and a
-maximum goes to a higher one within its window, over the highest saddle; what leads farther than `REACH` is given up. So
-a tile with that much around it has the crowns of the whole forest.
+A canopy height model without pits is smoothed a little. Its tops are its h-maxima (the extended-maxima transform of Kwak,
+Lee, Lee, Biging, Gong 2007): maxima from which every way to higher ground goes down by at least `depth`. That needs no
+size of crowns, which in closed stands hangs more on the neighbors than on the height. A watershed gives the crowns
+(marker-controlled, Chen, Baldocchi, Gong, Kelly 2006): other maxima go to the higher ground beside them. Every step reaches
+a bounded way: higher ground is looked for within half of `REACH`, and a cell that leads farther than `REACH` is given up.
+So a tile with that much around it has the crowns of the whole forest.
 """
 
 from __future__ import annotations
@@ -49,7 +50,14 @@ def _higher(z, a, b):
 
 
 @njit
-def crown_cells(s: NDArray, least: float, depth: float, share: float, reach: float) -> NDArray:
+def crown_cells(s: NDArray, least: float, depth: float, reach: float) -> NDArray:
+    """Of each cell of a smoothed canopy the number of its tree's top cell, -1 where there is none.
+
+    A cell goes to the highest cell beside it, up to a maximum. A maximum goes to the nearest higher cell that a way over
+    cells at most `depth` meters lower leads to, all within half of `reach` cells; where there is none it is a top. A cell
+    belongs to a crown where it is at least 0.3 times as high as the top and within `reach` cells of it; tops are nearly as
+    high as the `least` tree, meters.
+    """
     rows, columns = s.shape
     z = s.ravel()
     up = np.full(rows * columns, -1, np.int64)  # where a cell goes; a top goes to itself
@@ -61,29 +69,22 @@ def crown_cells(s: NDArray, least: float, depth: float, share: float, reach: flo
                 for j in range(max(c - 1, 0), min(c + 2, columns)):
                     if _higher(z, i * columns + j, up[n]):
                         up[n] = i * columns + j
-    maximum = up == np.arange(rows * columns)
-    seen = np.full(rows * columns, -1, np.int64)
-    for n in range(rows * columns):
-        if not maximum[n]:
-            continue
+    seen = np.full(rows * columns, -1, np.int64)  # by the flood of which maximum
+    for n in np.flatnonzero(up == np.arange(rows * columns)):
         r, c = n // columns, n % columns
-        level = z[n] - depth - share * z[n]
-        best, best_away = n, reach * reach
-        seen[n] = n
-        todo = [n]
+        nearest, todo = 0.25 * reach * reach, [n]
         while todo:
             at = todo.pop()
             for i in range(max(at // columns - 1, 0), min(at // columns + 2, rows)):
                 for j in range(max(at % columns - 1, 0), min(at % columns + 2, columns)):
-                    m, away = i * columns + j, (i - r) * (i - r) + (j - c) * (j - c)
-                    if seen[m] == n or z[m] < level or away > 0.25 * reach * reach:
+                    m, away = i * columns + j, (i - r) ** 2 + (j - c) ** 2
+                    if seen[m] == n or z[m] < z[n] - depth or away > 0.25 * reach * reach:
                         continue
                     seen[m] = n
                     if not _higher(z, m, n):
                         todo.append(m)
-                    elif away < best_away or (away == best_away and _higher(z, m, best)):
-                        best, best_away = m, away
-        up[n] = best
+                    elif away < nearest or (away == nearest and (up[n] == n or _higher(z, m, up[n]))):
+                        up[n], nearest = m, away
     out = np.full(rows * columns, -1, np.int64)
     for n in range(rows * columns):
         r, c, at = n // columns, n % columns, up[n]

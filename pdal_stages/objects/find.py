@@ -152,7 +152,6 @@ def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
         crowns.smoothed(height, chosen.smoothing / size),
         chosen.tree_height,
         chosen.saddle,
-        chosen.saddle_slope,
         crowns.REACH / size,
     )
     number = np.where(np.isnan(high), -1, top)
@@ -162,7 +161,7 @@ def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
         if not core.holds(tr, tc) or len(r) * size**2 < chosen.tree_area:
             continue
         body = near.body(kind, r, c, z)
-        record = measure.tree(body, tr, tc, size)
+        record = measure.tree(body, tr, tc, chosen)
         if record["height"] >= chosen.tree_height:
             yield _One(int(object_id(kind, tr, tc)), record, body, cell_keys(kind, body.row, body.column))
 

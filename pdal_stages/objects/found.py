@@ -42,10 +42,18 @@ class ObjectSettings:
         10.0, "Smaller parts of a roof (dormers) go with their neighbor", 0, 10_000, "m2"
     )
     tree_height: float = _setting(3.0, "Lower plants are not trees", 0, 100)
-    tree_area: float = _setting(1.5, "Trees with smaller crowns are left out", 0, 1000, "m2")
-    saddle: float = _setting(0.3, "A", 0, 100)
-    saddle_slope: float = _setting(0.0, "A", 0, 100)
-    smoothing: float = _setting(0.35, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
+    tree_area: float = _setting(1.0, "Trees with smaller crowns are left out", 0, 1000, "m2")
+    saddle: float = _setting(0.3, "Tops are of one tree where the way between them goes down by less", 0, 10)
+    smoothing: float = _setting(0.3, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
+    dbh_factor: float = _setting(
+        0.557,
+        "Of `dbh`, a stem's diameter at breast height: factor times (height times crown's diameter) to the power of "
+        "`dbh_power`, by Jucker and others 2017, who give both for the forests of each region, too",
+        0,
+        10,
+        "",
+    )
+    dbh_power: float = _setting(0.809, "See `dbh_factor`", 0, 2, "")
     span_gap: float = _setting(2.0, "Wires with larger gaps are two spans", 0.5, 20)
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from .cells import MM
+from .found import ObjectSettings
 from .roofs import roof_planes
 
 SURE, CHECK = "sure", "check"
@@ -117,8 +118,9 @@ def _box_like(body: Body, height: float, slope: float, size: float) -> str:
     return ""
 
 
-def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, Any]:
-    """Place, height and crown of a tree, and the verdict."""
+def tree(body: Body, top_row: int, top_column: int, chosen: ObjectSettings) -> dict[str, Any]:
+    """Place, height, crown and likely stem of a tree, and the verdict."""
+    size = chosen.cell
     area = len(body.row) * size * size
     above = body.z - body.ground
     highest = int(np.argmax(np.where(np.isnan(above), -np.inf, above)))
@@ -131,6 +133,7 @@ def tree(body: Body, top_row: int, top_column: int, size: float) -> dict[str, An
             "height": height,
             "area": area,
             "diam": diameter,
+            "dbh": chosen.dbh_factor * max(height * diameter, 0.0) ** chosen.dbh_power,
             "ground": float(body.ground[highest]),
         },
         {

@@ -37,7 +37,7 @@ COLUMNS: dict[Kind, dict[str, type]] = {
     Kind.BUILDING: {
         "area": _F, "h_eave": _F, "h_ridge": _F, "ground": _F, "slope": _F, "planes": _I, "planar": _F, **_JUDGED,
     },
-    Kind.TREE: {"height": _F, "area": _F, "diam": _F, "ground": _F, **_JUDGED},
+    Kind.TREE: {"height": _F, "area": _F, "diam": _F, "dbh": _F, "ground": _F, **_JUDGED},
     Kind.SPAN: {"length": _F, "h_low": _F, "z_high": _F, "sag": _F, **_JUDGED},
     Kind.DECK: {"area": _F, "z": _F, "clear": _F, "ground": _F, **_JUDGED},
 }  # fmt: skip

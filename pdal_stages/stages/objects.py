@@ -117,8 +117,9 @@ class ObjectsFilter(ObjectOptions, Stage):
     type = "filters.objects"
     summary = "Group classified points into buildings, trees, spans of wires and bridge decks"
     source = (
-        "crowns after Popescu, Wynne 2004 (Photogrammetric Engineering and Remote Sensing 70, 589-604) and Chen, "
-        "Baldocchi, Gong, Kelly 2006 (the same journal 72, 923-932)"
+        "crowns after Kwak, Lee, Lee, Biging, Gong 2007 (Journal of Forest Research 12, 425-434) and Chen, Baldocchi, "
+        "Gong, Kelly 2006 (Photogrammetric Engineering and Remote Sensing 72, 923-932); diameters of stems after Jucker and "
+        "others 2017 (Global Change Biology 23, 177-190)"
     )
     where_help = "Points outside form no object, and keep what they have."
     open_ended = True  # a building may be larger than the surroundings of a tile
@@ -135,11 +136,11 @@ the same id in every tile, in any order of points, and in the next run; below 2^
 
 **Buildings** are connected cells with points of a building at least `building_height` above the ground, roofs and facades
 together. Roofs whose heights differ by more than `step` along two thirds of their border are two buildings; small parts
-(dormers, chimneys) go with the roof around them. A roof goes on, up to 3 m, into vegetation in its plane, which a classifier
-took for leaves; those points keep their class. Where nothing at all came back from inside a rim at one height, as of a wet
-roof, the roof is filled, up to 6 m from the rim. **Trees** are crowns: maxima of the smoothed canopy, none of which has a
-higher one within `window` (which grows with height) that only a shallow `saddle` parts from it, and the cells that climb to
-them. **Spans** are wires between towers or poles, **decks** those of bridges.
+(dormers, chimneys) go with the roof around them. A roof goes on, up to 3 m, into vegetation in its plane, which a
+classifier took for leaves; those points keep their class. Where nothing at all came back from inside a rim at one height,
+as of a wet roof, the roof is filled, up to 6 m from the rim. **Trees** are crowns: tops of the smoothed canopy that a
+`saddle` of some depth parts from all higher ground, and the cells that climb to them. **Spans** are wires between towers or
+poles, **decks** those of bridges.
 
 Heights are above the ground that the points of its classes show, so `Classification` is all that is read; a mean
 `Reliability`, where points have one, is part of the verdict. Each object is *sure* or *to be checked*, with the reasons:

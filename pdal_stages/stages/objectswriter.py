@@ -40,7 +40,8 @@ whatever the unit of the coordinates; names fit into shapefiles):
 
 - `buildings`: polygons. `area`; `h_eave`, `h_ridge` above the ground; `ground`, its elevation; `slope` of the roof in
   degrees, its number of `planes` and the share of it in planes, `planar`.
-- `trees`: points at the tops; `crowns`: their polygons. `height`, crown's `area` and `diam`eter, `ground`.
+- `trees`: points at the tops; `crowns`: their polygons. `height`, crown's `area` and `diam`eter, `dbh`: the stem's
+  likely diameter at breast height, cm; `ground`.
 - `spans`: lines along wires. `length`, `h_low` (the lowest point above the ground), `z_high`, `sag`.
 - `decks`: polygons of bridges. `area`, `z`, `clear`ance above what is below, `ground`.
 
