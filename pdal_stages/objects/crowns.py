@@ -70,7 +70,9 @@ def crown_cells(s: NDArray, least: float, depth: float, reach: float) -> NDArray
                     if _higher(z, i * columns + j, up[n]):
                         up[n] = i * columns + j
     seen = np.full(rows * columns, -1, np.int64)  # by the flood of which maximum
-    for n in np.flatnonzero(up == np.arange(rows * columns)):
+    for n in range(rows * columns):
+        if up[n] != n:
+            continue
         r, c = n // columns, n % columns
         nearest, todo = 0.25 * reach * reach, [n]
         while todo:
