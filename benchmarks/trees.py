@@ -30,6 +30,7 @@ import shapely
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
 from pdal_stages.objects.compare import matched_by_place
+from pdal_stages.objects.crowns import canopy
 
 #: Plots by which settings were chosen, and those that were only scored; points/m2 where they are thinned, or None.
 PARTS = {
@@ -197,6 +198,7 @@ def curvature(plot, sigma=1.0, radius=1.5, least=0.1):
     """Maxima of the canopy's smallest curvature (FGI_MCV in Kaartinen and others 2012)."""
     size = plot.cells.size
     high, corner, _ = raster(plot.canopy(0.0), size)
+    high = canopy(high, np.zeros(high.shape))
     xx, yy, xy = (
         scipy.ndimage.gaussian_filter(high, sigma / size, order) for order in ((2, 0), (0, 2), (1, 1))
     )
