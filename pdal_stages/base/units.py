@@ -109,6 +109,18 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
     )
 
 
+def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float) -> None:
+    """Refuse the box of a thousand points and more, without a reference, that can hardly be in meters."""
+    if count >= 1000 and max(-x0, x1) <= 180.0 and max(-y0, y1) <= 90.0 and max(x1 - x0, y1 - y0) < 0.2:
+        code = utm_code(x0, y0) or "CODE"
+        raise StageError(
+            "the coordinates look like degrees, and there is no spatial reference that says otherwise",
+            found=f"x {x0:.6f} to {x1:.6f}, y {y0:.6f} to {y1:.6f}",
+            cure="Reproject the files first: pdal translate IN OUT reprojection --filters.reprojection.in_srs=EPSG:4326 "
+            f"--filters.reprojection.out_srs=EPSG:{code}; of meters, set horizontal_unit",
+        )
+
+
 def reprojection_cure(name: str = "", place: tuple[float, float] | None = None) -> str:
     """What to do about degrees: reproject into the UTM zone of a place, on the datum that a reference's name tells."""
     zone = utm_code(*place, name) if place is not None else None

@@ -334,8 +334,7 @@ def print_dry(run: TiledRun) -> None:
     print(f"about {s['points_read_by_a_tile']:,} points read for a tile")
     print(f"up to {s['memory_mb_of_a_worker']:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
     print(f"about {s['disk_gb']:,.2f} GB of disk beside the outputs")
-    for job in run.tiles[:_MOST_TILES]:
-        print(f"  {job.name}")
+    print(*(f"  {job.name}" for job in run.tiles[:_MOST_TILES]), sep="\n")
     if len(run.tiles) > _MOST_TILES:
         print(f"  and {len(run.tiles) - _MOST_TILES} more")
     print_messages(*run.messages)

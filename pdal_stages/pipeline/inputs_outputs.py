@@ -13,7 +13,7 @@ from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
 from ..base.las import projection, read_header
-from ..base.units import Units, name_of_wkt, parse_wkt, units_of_wkt
+from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from ..classifier.modelfile import find
 from ..stages.base import Stage
 from . import pdal as pdal_env
@@ -240,7 +240,12 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
     wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
     try:
-        units = units_of_wkt(wkt, horizontal=horizontal, place=_place(str(reader["filename"])))
+        count, (x0, y0, x1, y1) = _extent(str(reader["filename"]))
+        units = units_of_wkt(
+            wkt, horizontal=horizontal, place=((x0 + x1) / 2, (y0 + y1) / 2) if count else None
+        )
+        if units.assumed:
+            refuse_likely_degrees(count, x0, y0, x1, y1)
     except StageError as error:
         raise error.at(str(reader["filename"])) from None
     words = str(srs.get("proj4") or "").split()
@@ -257,13 +262,12 @@ def reference_of_file(path: str, horizontal: str = "") -> Reference:
     return reference_of({"filename": path} | ({"type": "readers.las", "count": 1} if las else {}), horizontal)
 
 
-def _place(path: str) -> tuple[float, float] | None:
-    """The middle of a LAS file."""
+def _extent(path: str) -> tuple[int, tuple[float, float, float, float]]:
+    """The number of points of a LAS file, and their box; of none where it is not one."""
     with contextlib.suppress(OSError, ValueError):
         if (header := read_header(path)) is not None:
-            x0, y0, x1, y1 = header.box
-            return (x0 + x1) / 2, (y0 + y1) / 2
-    return None
+            return header.count, header.box
+    return 0, (0.0, 0.0, 0.0, 0.0)
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> list[str]:

@@ -15,7 +15,7 @@ from ..base.errors import DimensionError, OptionError, StageError
 from ..base.las import LEGACY_LIMIT, OVERLAP
 from ..base.messages import Report
 from ..base.resources import give_back
-from ..base.units import Units, reprojection_cure, units_of_wkt
+from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .selection import Expression, Selection
 
 #: Which stage makes a dimension that a user may lack.
@@ -92,10 +92,7 @@ class Points:
         )
         if units.assumed and self.count:
             self.report.notes.append("the points have no spatial reference: meters were assumed")
-            if np.abs(x).max() <= 180.0 and np.abs(y).max() <= 90.0 and max(np.ptp(x), np.ptp(y)) < 0.2:
-                self.report.warnings.append(
-                    f"coordinates look like degrees; if they are: {reprojection_cure(place=place)}"
-                )
+            refuse_likely_degrees(self.count, x.min(), y.min(), x.max(), y.max())
         return units
 
     @cached_property

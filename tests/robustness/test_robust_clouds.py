@@ -257,8 +257,10 @@ def test_degrees(command, tmp_path, write_las):
             tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), point_format=6, wkt=wkt, scale=1e-7
         )
         command.refused(["pipeline", path], says, "filters.reprojection")
+    xyz = random(1000, size=(0.001, 0.001, 5.0)) + [9.0, 50.0, 0.0]
     write_las(tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), scale=1e-7)
-    assert "look like degrees" in command.runs(["pipeline", path]).err
+    for words in (["pipeline", path], ["classify", tmp_path / "in.las", tmp_path / "o.las", "--tile", 100]):
+        command.refused(words, "look like degrees", "in_srs=EPSG:4326")
     for text in ("PROJCS[" * 5000, 'PROJCS["a",' + 'UNIT["m",' * 5000 + "1" + "]" * 5001):
         assert units_of_wkt(text).horizontal == 1.0  # assumed, as where there is none
 
