@@ -149,9 +149,9 @@ class ClassifyTask:
 def one_format(paths: Sequence[str]) -> dict[str, Any]:
     """Options of ``writers.las`` that hold what each of some inputs holds; none where these are alike LAS files.
 
-    The finest scale along each axis, and of the formats from LAS 1.4 the first that has all colors there are: PDAL forwards
-    only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest. What cannot be
-    read is said when it is.
+    The finest scale along each axis with its offset, and of the formats from LAS 1.4 the first that has all colors there
+    are: PDAL forwards only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest.
+    What cannot be read is said when it is.
     """
     formats: set[int] = set()
     places: set[tuple[float, ...]] = set()
@@ -171,6 +171,10 @@ def one_format(paths: Sequence[str]) -> dict[str, Any]:
         colored = 8 if 8 in formats else 7 if formats & {2, 3, 7} else 6
         options = {"minor_version": 4, "dataformat_id": colored}
     for axis, name in enumerate("xyz"):
-        if len({(place[axis], place[3 + axis]) for place in places}) > 1:
-            options |= {f"scale_{name}": min(place[axis] for place in places), f"offset_{name}": "auto"}
+        along = {(place[axis], place[3 + axis]) for place in places}
+        if len(along) > 1:
+            scale, offset = min(along, key=lambda one: (one[0], -abs(one[1])))
+            # Of newer PDAL "auto" is the tile's middle, off the grid of the coordinates: only for what lies too far apart.
+            far = any(abs(one - offset) > 2**30 * scale for _, one in along)
+            options |= {f"scale_{name}": scale, f"offset_{name}": "auto" if far else offset}
     return options

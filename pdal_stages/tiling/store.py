@@ -86,8 +86,10 @@ class Store:
 
     def clear(self) -> None:
         """Forget all that earlier runs finished."""
-        shutil.rmtree(self.kept)
+        old = self.scratch / "before"
+        self.kept.rename(old)  # whole, as a worker of a lost run may still write there
         self.kept.mkdir()
+        shutil.rmtree(old, ignore_errors=True)
 
     def path(self, name: str, ending: str = ".npz") -> str:
         """A file of arrays, or of points, by its name."""
