@@ -526,5 +526,5 @@ def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):
 
     paths = [cloud(n, 0.0, (7, 8, 0)) for n in range(2)]
     assert one_format([*paths, str(tmp_path / "none.laz"), "cloud.ply"]) == {}
-    assert one_format([*paths, cloud("near", 9.0, (9, 8, 0))]) == {"scale_x": 0.01, "offset_x": 9.0}
+    assert one_format([*paths, cloud("near", 9.0, (9, 8, 0))]) == {"scale_x": 0.001, "offset_x": 9.0}
     assert one_format([*paths, cloud("far", 5e8, (5e8, 5e8, 5e8))])["offset_x"] == "auto"
