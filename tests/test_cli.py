@@ -48,15 +48,8 @@ def run(capsys, *words):
 
 def test_pipeline_with_overrides(job, tmp_path, capsys):
     out = tmp_path / "other.las"
-    code, _, err = run(
-        capsys,
-        "pipeline",
-        job,
-        "--stage.height.cell=10",
-        f"--writers.las.filename={out}",
-        "--metadata",
-        tmp_path / "m.json",
-    )
+    words = ["--stage.height.cell=10", f"--writers.las.filename={out}", "--metadata", tmp_path / "m.json"]
+    code, _, err = run(capsys, "pipeline", job, *words)
     assert code == 0, err
     assert len(laspy.read(out)) == 800
     assert json.loads((tmp_path / "m.json").read_text())["metadata"]["filters.hag_minima"]["cells"] == 9

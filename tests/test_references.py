@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import struct
+
+import laspy
 import numpy as np
 import pytest
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.cli import main
+from pdal_stages.pipeline.inputs_outputs import reference_of_file
 from pdal_stages.tiling import run_tiled
 
 pytestmark = pytest.mark.pdal
@@ -107,3 +111,13 @@ def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, ca
     files = [str(tmp_path / f"in{number}.las") for number in range(2)]
     assert main(["objects", *files, str(tmp_path / "town.geojson")]) == 1  # which have no classes
     assert f"{files[1]} has no spatial reference; it is taken to have" in capsys.readouterr().err
+
+
+def test_geotiff_keys_of_las_14_in_old_point_formats(tmp_path, write_las):
+    path, xyz = tmp_path / "in.las", np.random.default_rng(0).uniform(0, 30, (3, 100))
+    for key, value, horizontal in ((3072, 2264, 1200 / 3937), (3072, 32767, 1.0), (4096, 5703, 1.0)):
+        las = laspy.read(write_las(path, dict(zip("XYZ", xyz, strict=True)), 1, 4))
+        data = struct.pack("<8H", 1, 1, 0, 1, key, 0, 1, value)
+        las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", data))
+        las.write(path)
+        assert reference_of_file(str(path)).units.horizontal == pytest.approx(horizontal)

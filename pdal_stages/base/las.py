@@ -218,6 +218,20 @@ def projection(path: str | os.PathLike) -> str:
     return hashlib.sha256(b"".join(found)).hexdigest()[:16] if found else ""
 
 
+def geotiff_code(path: str | os.PathLike) -> str:
+    """EPSG's code, ``EPSG:2154+5720``, in the GeoTIFF keys of LAS 1.4 in point formats 0 to 5; empty of other files."""
+    header = read_header(path)
+    if header is None or header.minor < 4 or header.point_format > 5:
+        return ""
+    held = {record.number: data for record, data in records_of(path, b"LASF_Projection")}
+    data = b"" if 2112 in held else held.get(34735, b"")
+    found = struct.iter_unpack("<4H", data[: len(data) // 8 * 8])
+    keys = {key: code for key, place, _, code in found if not place}
+    across, upward = keys.get(3072) or keys.get(2048, 0), keys.get(4096, 0)
+    height = f"+{upward}" * (0 < upward < 32767)  # which stands for a user's own
+    return f"EPSG:{across}{height}" if 0 < across < 32767 else ""
+
+
 #: Types of extra dimensions by number, 1 to 10, in PDAL's words (LAS 1.4 R15, table 24).
 _TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float", "double")
 

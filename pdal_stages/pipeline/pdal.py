@@ -19,8 +19,9 @@ from types import CodeType, FrameType
 from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
+from ..base.las import geotiff_code
 from ..base.lascheck import DAMAGED, check_readable
-from .read import readers_files
+from .read import reader_files, readers_files
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "
@@ -316,6 +317,10 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
                     cure="Use PDAL 2.4 or later, or filters.crop after the reader",
                 )
             stage = {**{k: v for k, v in stage.items() if k not in _COPC_TUNING}, "type": "readers.las"}
+        elif isinstance(stage, dict) and (kind or stage is not stages[-1]):
+            codes = {geotiff_code(path) for path in reader_files(stage, las=True)}
+            if len(codes) == 1 and "" not in codes:  # which that PDAL does not look at
+                stage = {"default_srs": codes.pop(), **stage}
         out.append(stage)
     return out
 
