@@ -105,7 +105,8 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     command, *rest = rest
     options, unknown = parser.commands[command].parse_known_intermixed_args(rest)
     if unknown:
-        parser.refuse(command, unknown)
+        near = suggest(unknown[0].partition("=")[0], parser.commands[command]._option_string_actions)
+        parser.commands[command].error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
     if overrides and not options.takes_overrides:
         raise StageError(f"'{command}' takes no stage options", found=overrides[0].flag)
     options.command = command
@@ -198,11 +199,6 @@ class Parser(argparse.ArgumentParser):
             takes("--log", metavar="FILE", help="Append everything that is printed to a log file")
             takes("--progress", action=argparse.BooleanOptionalAction, help="Show progress")
         return takes
-
-    def refuse(self, command: str, unknown: Sequence[str]) -> NoReturn:
-        """Leave the program: a command's words are unknown."""
-        near = suggest(unknown[0].partition("=")[0], self.commands[command]._option_string_actions)
-        self.commands[command].error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
 
 
 def takes_options(takes: Callable, stage: str, *names: str) -> None:

@@ -9,7 +9,7 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -232,15 +232,14 @@ def ran(go: Callable[[], TiledRun]) -> tuple[TiledRun, bool]:
 @contextmanager
 def interruptible():
     """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
-    try:
+    before = None
+    with suppress(ValueError):  # not in the main thread
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:  # not in the main thread
-        yield
-        return
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
 
 
 def end_at_once(options: argparse.Namespace) -> None:
