@@ -68,11 +68,10 @@ def _drivers(options: argparse.Namespace) -> None:
         print(json.dumps(listed, indent=2))
         return
     width = max(map(len, ours)) + 2
+    wrap = textwrap.TextWrapper(80, subsequent_indent=" " * width, break_long_words=False)
     print("=" * 80, "pdal_stages", "=" * 80, sep="\n")
     for name, text in ours.items():
-        print(
-            textwrap.fill(f"{name:{width}}{text}", 80, subsequent_indent=" " * width, break_long_words=False)
-        )
+        print(wrap.fill(f"{name:{width}}{text}"))
     print("" if options.ours else f"\n{ask_program('--drivers')}", end="")
 
 

@@ -71,9 +71,8 @@ def _train(options: argparse.Namespace) -> None:
     from ..tiling.training import TrainTask, surveys_of
 
     extra = {name: value for name in _OF_TRAINING if (value := getattr(options, name)) is not None}
-    files, surveys = input_files(options.inputs), {}
-    if options.surveys is not None:
-        surveys = surveys_of(files, options.surveys)
+    files = input_files(options.inputs)
+    surveys = {} if options.surveys is None else surveys_of(files, options.surveys)
     task = TrainTask(files, options.model, options.overrides, extra, tiles.options_of(options), surveys)
     with tiles.interruptible():
         said = task.run()
