@@ -93,6 +93,33 @@ def _turn(c, s, a, b):
 
 
 @device(forceinline=True)
+def _sweep(xx, xy, xz, yy, yz, zz, ax, ay, az, bx, by, bz, cx, cy, cz):
+    """A cyclic sweep of Jacobi's rotations of a matrix and of the vectors a, b and c along with it."""
+    c, s, t = _rotation(xx, yy, xy)
+    xx, yy = xx - t * xy, yy + t * xy
+    xy = 0.0
+    xz, yz = c * xz - s * yz, s * xz + c * yz
+    ax, bx = _turn(c, s, ax, bx)
+    ay, by = _turn(c, s, ay, by)
+    az, bz = _turn(c, s, az, bz)
+    c, s, t = _rotation(xx, zz, xz)
+    xx, zz = xx - t * xz, zz + t * xz
+    xz = 0.0
+    xy, yz = c * xy - s * yz, s * xy + c * yz
+    ax, cx = _turn(c, s, ax, cx)
+    ay, cy = _turn(c, s, ay, cy)
+    az, cz = _turn(c, s, az, cz)
+    c, s, t = _rotation(yy, zz, yz)
+    yy, zz = yy - t * yz, zz + t * yz
+    yz = 0.0
+    xy, xz = c * xy - s * xz, s * xy + c * xz
+    bx, cx = _turn(c, s, bx, cx)
+    by, cy = _turn(c, s, by, cy)
+    bz, cz = _turn(c, s, bz, cz)
+    return xx, xy, xz, yy, yz, zz, ax, ay, az, bx, by, bz, cx, cy, cz
+
+
+@device(forceinline=True)
 def eigen3(xx, xy, xz, yy, yz, zz):
     """Eigenvalues l1 >= l2 >= l3 >= 0 of a symmetric positive semidefinite matrix and the unit eigenvector of l3.
 
@@ -100,31 +127,10 @@ def eigen3(xx, xy, xz, yy, yz, zz):
     either sign; of points on a line (l2 below 1e-12 of l1) it is the steepest perpendicular, so that a horizontal line has
     verticality 0 and a vertical one 1: (1, 0, 0) where the line is vertical.
     """
-    ax, ay, az = 1.0, 0.0, 0.0
-    bx, by, bz = 0.0, 1.0, 0.0
-    cx, cy, cz = 0.0, 0.0, 1.0
-    for _ in range(4):
-        c, s, t = _rotation(xx, yy, xy)
-        xx, yy = xx - t * xy, yy + t * xy
-        xy = 0.0
-        xz, yz = c * xz - s * yz, s * xz + c * yz
-        ax, bx = _turn(c, s, ax, bx)
-        ay, by = _turn(c, s, ay, by)
-        az, bz = _turn(c, s, az, bz)
-        c, s, t = _rotation(xx, zz, xz)
-        xx, zz = xx - t * xz, zz + t * xz
-        xz = 0.0
-        xy, yz = c * xy - s * yz, s * xy + c * yz
-        ax, cx = _turn(c, s, ax, cx)
-        ay, cy = _turn(c, s, ay, cy)
-        az, cz = _turn(c, s, az, cz)
-        c, s, t = _rotation(yy, zz, yz)
-        yy, zz = yy - t * yz, zz + t * yz
-        yz = 0.0
-        xy, xz = c * xy - s * xz, s * xy + c * xz
-        bx, cx = _turn(c, s, bx, cx)
-        by, cy = _turn(c, s, by, cy)
-        bz, cz = _turn(c, s, bz, cz)
+    # No loop: LLVM leaves one of this length rolled up, and then does not vectorize the loop around it.
+    m = _sweep(xx, xy, xz, yy, yz, zz, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    m = _sweep(*_sweep(*_sweep(*m)))
+    xx, _, _, yy, _, zz, ax, ay, az, bx, by, bz, cx, cy, cz = m
     xx, yy, zz = max(xx, 0.0), max(yy, 0.0), max(zz, 0.0)
     # Sort downwards, the vectors with their values.
     swap = xx < yy

@@ -125,14 +125,11 @@ def finish(table, volume, heights, few, copies, columns, out):
             r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
             made[13, j] = moments[RADIUS, j]
             made[8, j] = moments[N, j] / (4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume)
-        if len(columns) > NORMAL[0]:  # in a loop of its own: with all of the eigenvector LLVM vectorizes none
-            for j in range(count):
-                _, _, _, nx, ny, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
-                some = 1.0 if made[9, j] >= 3.0 else 0.0
-                made[14, j], made[15, j], made[16, j] = some * nx, some * ny, some * nz
         for j in range(count):
             n = made[9, j]  # not from the moments, which LLVM must fear to overlap with what is written
-            l1, l2, l3, _, _, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
+            l1, l2, l3, nx, ny, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
+            some = 1.0 if n >= 3.0 else 0.0
+            made[14, j], made[15, j], made[16, j] = some * nx, some * ny, some * nz
             f = covariance_features(n, l1, l2, l3)
             made[0, j] = f[0]
             made[1, j] = f[1]
