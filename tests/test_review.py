@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from pdal_stages import cli
 from pdal_stages.accuracy.expected import BLOCK, ReviewCells, find_patches
+from pdal_stages.pipeline.reviewing import styles
 
 
 def cloud(seed, n=3000, wide=60.0):
@@ -138,6 +139,10 @@ def test_what_cannot_be_is_refused(folder, tmp_path, words, what, capsys):
     assert cli.main(["review", str(folder / "whole.laz"), str(tmp_path / "r.gpkg"), *words]) == 1
     assert what in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_styles_of_patches_alike():
+    assert all("looked at" in styles(np.full(n, 0.2))["patches"] for n in (0, 1, 5))
 
 
 @pytest.mark.pdal

@@ -85,6 +85,9 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         If its folder is missing or read-only, its name is too long, or what is there must not be replaced: a folder, a
         write-protected file, a file that is known to be of another kind.
     """
+    if not os.fspath(path) or "\0" in os.fspath(path):
+        cure = "Give a file name; is a variable not set?"
+        raise StageError(f"the {what} file has no name", found=ascii(os.fspath(path)), cure=cure)
     if is_stream(path):
         mode = os.stat(path).st_mode
         if not os.access(path, os.W_OK) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .errors import StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
@@ -89,6 +92,8 @@ class LasHeader:
 
 def read_header(path: str | os.PathLike) -> LasHeader | None:
     """The header of a LAS or LAZ file; None where the file is too short for one, or is something else."""
+    if stat.S_ISFIFO(os.stat(path).st_mode):  # which would be waited for
+        raise StageError("the input is a pipe", where=str(path), cure="Write it into a file first")
     with open(path, "rb") as file:
         head = file.read(375)
     if len(head) < 227 or head[:4] != b"LASF":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import re
 
 from . import Parser, takes_options
 
@@ -52,7 +52,7 @@ def _objects(options: argparse.Namespace) -> None:
 def _review(options: argparse.Namespace) -> None:
     from ..pipeline.reviewing import lines, write_review
 
-    html = str(Path(options.output).with_suffix(".html")) if options.html is None else options.html
+    html = re.sub(r"\.\w+$", ".html", options.output) if options.html is None else options.html
     how = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
     found = write_review(options.inputs, options.output, html, options.json or "", **how)
     print("\n".join(lines(found.to_dict())))

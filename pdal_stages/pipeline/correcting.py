@@ -17,7 +17,7 @@ from ..classifier.algorithms import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
 from .inputs_outputs import reference_of_file
-from .parts import las_chunks, reads_in_parts
+from .parts import header_of, las_chunks, reads_in_parts
 
 #: Points without a partner beyond this share: the files are of other points.
 _MOST_LOST = 0.1
@@ -93,10 +93,7 @@ def _read(path: str) -> Any:
     """A whole file, as laspy holds it; a COPC file as the LAZ file that it is."""
     import laspy
 
-    with laspy.open(path) as reader:
-        header = reader.header
-    for records in filter(None, (header.vlrs, header.evlrs)):
-        records[:] = [one for one in records if one.user_id != "copc"]
+    header = header_of(path)
     out = laspy.LasData(header)
     if points := [one.array for one in las_chunks(path)]:
         joined = np.concatenate(points)

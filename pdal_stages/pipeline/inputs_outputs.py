@@ -109,6 +109,8 @@ def is_las(name: str) -> bool:
 
 def is_folder(target: str) -> bool:
     """Whether an output is a folder: one that is there, or a name that ends with a slash, or has neither suffix nor '#'."""
+    if not target:  # which for a path is the current folder
+        raise StageError("the name of the output is empty", cure="Name a file; is a variable not set?")
     path = Path(target)
     named = "#" not in path.name and not path.suffix and not path.exists()
     return path.is_dir() or target.endswith(("/", os.sep)) or named

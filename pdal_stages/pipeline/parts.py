@@ -125,6 +125,23 @@ def las_chunks(
         raise StageError("the input is cut short", where=path, found=f"{at:,} of {end:,} points")
 
 
+def header_of(path: str) -> Any:
+    """The header of a file, with its records, but that of an octree: points in another order have none."""
+    import laspy
+
+    try:
+        with laspy.open(path) as reader:
+            header = reader.header
+        header.point_format.dtype()  # of extra bytes that no array can hold
+    except Exception as error:  # laspy raises many types
+        raise StageError(
+            "the input cannot be read", where=path, found=f"{type(error).__name__}: {error}"
+        ) from None
+    for records in filter(None, (header.vlrs, header.evlrs)):
+        records[:] = [record for record in records if record.user_id != "copc"]
+    return header
+
+
 def _part(points: Points) -> Part:
     codes = points.class_codes
     kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)

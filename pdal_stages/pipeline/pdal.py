@@ -19,7 +19,7 @@ from types import CodeType, FrameType
 from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
-from ..base.las import geotiff_code
+from ..base.las import geotiff_code, odd_text
 from ..base.lascheck import DAMAGED, check_readable
 from .read import reader_files, readers_files
 
@@ -121,6 +121,7 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
     try:
         pipeline = pdal.Pipeline(json.dumps(adapted(stages)), loglevel=loglevel)
         count = pipeline.execute()
+        metadata = pipeline.metadata  # text in older python-pdal, a dict in newer
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
         keep(stdout)
         if _CUT_POINTS.search(str(error)) and (read := readers_files(stages, las=True)):
@@ -130,6 +131,14 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
                 found=str(error).strip(),
                 cure=DAMAGED,
             ) from None
+        for path in readers_files(stages, las=True) if _NOT_UTF8.search(str(error)) else ():
+            if (odd := odd_text(path)) is not None:
+                raise PipelineError(
+                    f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
+                    where=path,
+                    found=str(odd[1])[1:],
+                    cure=f"Write the file anew first: pdal translate {path} clean.laz",
+                ) from None
         raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
     except MemoryError:
         cure = "Work in tiles (--tile), or read less, e.g. with filters.crop"
@@ -140,7 +149,6 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
     log = _log(pipeline)
     if failed := _FAILED_WRITER.search(log):  # after which PDAL goes on
         raise PipelineError("an output file could not be written", found=": ".join(failed.groups()))
-    metadata = pipeline.metadata  # text in older python-pdal, a dict in newer
     if isinstance(metadata, str):
         with contextlib.suppress(ValueError):
             metadata = json.loads(metadata)
@@ -149,6 +157,7 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
 
 
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
+_NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
 #: How PDAL begins a line of its log; some stages say their name once more.
 _BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE)

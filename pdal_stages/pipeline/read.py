@@ -287,7 +287,8 @@ def reader_files(stage: dict[str, Any], *, las: bool = False) -> list[str]:
     if not is_las and (las or (kind and not kind.startswith("readers."))):
         return []
     names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
-    return [n for n in names if os.path.isfile(n)]
+    there = os.path.exists if is_las else os.path.isfile  # other readers may read a pipe
+    return [n for n in names if there(n) and not os.path.isdir(n)]
 
 
 def named_files(stages: list[dict[str, Any]]) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any
 
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
-from ..base.las import odd_text, supersede_copc
+from ..base.las import supersede_copc
 from ..base.lascheck import check_complete, check_readable
 from ..base.messages import Report
 from ..stages.base import stage_types
@@ -244,14 +244,6 @@ class Pipeline:
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
         found = str(error.found or "")
-        for path in readers_files(self.expanded.stages, las=True) if _NOT_UTF8.search(found) else ():
-            if (odd := odd_text(path)) is not None:
-                return PipelineError(
-                    f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
-                    where=path,
-                    found=str(odd[1])[1:],
-                    cure=f"Write the file anew first: pdal translate {path} clean.laz",
-                )
         if (named := _STAGE_TYPE.search(found)) is None:
             return error
         given = [stage.get("type") if isinstance(stage, dict) else None for stage in self.source.stages]
@@ -276,7 +268,6 @@ def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override]
 
 _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
 _NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")
-_NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
 
 
 def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[Report]]]) -> dict[str, Any]:

@@ -144,6 +144,9 @@ def read_ept(path: str) -> dict[str, Any]:
                 text = file.read(_LARGEST)
         found = strict_json(text)
         x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
+        left, low, _, right, high, _ = map(float, found["bounds"])
+        if not (left - 1 <= x0 and low - 1 <= y0 and x1 <= right + 1 and y1 <= high + 1):
+            raise ValueError("its points lie beyond its octree")  # where PDAL looks for them without end
         named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
         if int(found["points"]) < 0 or not (x0 <= x1 and y0 <= y1) or not named:
             raise ValueError("a description of nothing")

@@ -21,11 +21,12 @@ from ..base.las import LEGACY_LIMIT
 from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
+from ..pipeline.parts import header_of
 from ..pipeline.read import LAS_WRITERS
 from ..pipeline.runtime import Callbacks
 from ..stages.points import class_counts
 from .inputs import InputSource
-from .pieces import BLOCK, Piece, header_of, record_blocks, write_records
+from .pieces import BLOCK, Piece, record_blocks, write_records
 from .plan import TilePlan
 from .settings import MOST_AT_ONCE
 from .store import load_arrays, written

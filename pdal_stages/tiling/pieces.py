@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import begins_run
-from ..base.errors import StageError
-from ..pipeline.parts import las_chunks
+from ..pipeline.parts import header_of, las_chunks
 from .inputs import CloudIndex, InputSource, fetch_ept
 from .settings import Box, TileGrid, check_number
 
@@ -40,22 +39,6 @@ _CELLS = 4
 def record_blocks(path: str, start: int = 0, end: int | None = None, most: int = BLOCK) -> Iterator[NDArray]:
     """Records of the points from one number to another, in blocks, with laspy's names of their fields."""
     return (points.array for points in las_chunks(path, start, end, most))
-
-
-def header_of(path: str) -> laspy.LasHeader:
-    """The header of a file, with its records, but that of an octree: points in another order have none."""
-    import laspy
-
-    try:
-        with laspy.open(path) as reader:
-            header = reader.header
-    except Exception as error:  # laspy raises many types
-        raise StageError(
-            "the input cannot be read", where=path, found=f"{type(error).__name__}: {error}"
-        ) from None
-    for records in filter(None, (header.vlrs, header.evlrs)):
-        records[:] = [record for record in records if record.user_id != "copc"]
-    return header
 
 
 def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]) -> None:

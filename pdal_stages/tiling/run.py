@@ -226,12 +226,15 @@ class _Run:
             if source.kind != "las" or source.path in survey.unreadable:
                 continue
             name = fingerprint(source.path, survey.stamps[source.path], survey.grid.size)
-            known, copy = store.note(name), store.path(name, ".points")
-            if known and (os.path.exists(copy) or source.path not in (needed or ())):
-                survey.indexes[source.path] = CloudIndex.of(known, copy)
-            else:
-                points = survey.extents[source.path].count
-                waiting.append(Job(name, points, source=source, mark=copy))
+            copy = store.path(name, ".points")
+            with contextlib.suppress(
+                ValueError, TypeError, KeyError, OverflowError
+            ):  # nothing noted, or damaged
+                index = CloudIndex.of(store.note(name), copy)
+                if os.path.exists(copy) or source.path not in (needed or ()):
+                    survey.indexes[source.path] = index
+                    continue
+            waiting.append(Job(name, survey.extents[source.path].count, source=source, mark=copy))
 
         def task_of(job: Job) -> Callable[[], Any]:
             assert job.source is not None

@@ -67,6 +67,7 @@ def files(tmp_path, cloud, model, monkeypatch):
     (tmp_path / "link.las").symlink_to("a.las")
     os.link(tmp_path / "a.las", tmp_path / "hard.las")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    os.mkfifo("pipe.las")
     yield tmp_path
     assert {path: path.read_bytes() for path in tmp_path.iterdir() if path in before} == before
 
@@ -81,6 +82,7 @@ PIPELINES = {
     "overlay.json": ["a.las", {"type": "filters.overlay", "dimension": "Classification", "datasource": "poly.geojson", "column": "c"},
                      {"type": "writers.text", "filename": "poly.geojson"}],
     "split.json": ["t_1.las", {"type": "filters.splitter", "length": 10}, {**WRITE, "filename": "t_#.las"}],
+    "pipe.json": ["pipe.las", HAG],
     "twice.json": ["a.las", {**WRITE, "filename": "o.las"}, {**WRITE, "filename": "./o.las"}],
 }  # fmt: skip
 CLASSIFY, ACCURACY = (
@@ -106,6 +108,12 @@ REPLACING = [
     (["pipeline", "overlay.json"], INPUT),
     (["pipeline", "split.json"], INPUT),
     (["pipeline", "twice.json"], "two output files are one"),
+    *(([*words, "pipe.las"], "the input is a pipe") for words in (["train", "--model", "o.model"], ["accuracy", "a.las", "--reference"])),
+    (["pipeline", "pipe.json"], "the input is a pipe"),
+    ([*CLASSIFY, ""], "the name of the output is empty"),
+    (["review", "a.las", ""], "Give a name that ends in .gpkg"),
+    (["objects", "a.las", "\udce9.gpkg"], "UTF-8"),
+    ([*ACCURACY, "--json", "a\0b"], "has no name"),
 ]  # fmt: skip
 
 
