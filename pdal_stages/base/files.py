@@ -86,8 +86,7 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         write-protected file, a file that is known to be of another kind.
     """
     if not os.fspath(path) or "\0" in os.fspath(path):
-        cure = "Give a file name; is a variable not set?"
-        raise StageError(f"the {what} file has no name", found=ascii(os.fspath(path)), cure=cure)
+        raise StageError(f"the {what} file has no name", found=ascii(path), cure="Is a variable not set?")
     if is_stream(path):
         mode = os.stat(path).st_mode
         if not os.access(path, os.W_OK) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):

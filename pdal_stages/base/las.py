@@ -19,7 +19,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import StageError
+from .errors import PipelineError, StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
@@ -189,25 +189,23 @@ def supersede_copc(path: str | os.PathLike) -> None:
             file.write(b"LASF_Spec".ljust(16, b"\0") + struct.pack("<H", 7))
 
 
-def odd_text(path: str | os.PathLike) -> tuple[str, bytes] | None:
-    """A text of the header or of a record's head that is not UTF-8: (what, bytes)."""
-    try:
-        header = read_header(path)
-        if header is None:
-            return None
-        with open(path, "rb") as file:
-            head = file.read(90)
-            texts = [("system identifier", _text(head[26:58])), ("generating software", _text(head[58:]))]
-            for record in islice(records(file, header), min(header.records, 1000)):
-                texts += [("description of a record", record.title), ("user of a record", record.user)]
-    except (OSError, ValueError):
-        return None
+def check_texts(path: str | os.PathLike) -> None:
+    """Refuse a file with a text in its header or in a record's head that is not UTF-8; PipelineError."""
+    header = read_header(path)
+    if header is None:
+        return
+    with open(path, "rb") as file:
+        head = file.read(90)
+        texts = [("system identifier", _text(head[26:58])), ("generating software", _text(head[58:]))]
+        for record in islice(records(file, header), min(header.records, 1000)):
+            texts += [("description of a record", record.title), ("user of a record", record.user)]
     for what, text in texts:
         try:
             text.decode()
         except UnicodeDecodeError:
-            return what, text
-    return None
+            what = f"the {what} in the LAS file is not UTF-8, which PDAL's filters.python cannot take"
+            cure = f"Write the file anew first: pdal translate {path} clean.laz"
+            raise PipelineError(what, where=str(path), found=str(text)[1:], cure=cure) from None
 
 
 def projection(path: str | os.PathLike) -> str:

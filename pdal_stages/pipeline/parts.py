@@ -134,9 +134,8 @@ def header_of(path: str) -> Any:
             header = reader.header
         header.point_format.dtype()  # of extra bytes that no array can hold
     except Exception as error:  # laspy raises many types
-        raise StageError(
-            "the input cannot be read", where=path, found=f"{type(error).__name__}: {error}"
-        ) from None
+        found = f"{type(error).__name__}: {error}"
+        raise StageError("the input cannot be read", where=path, found=found) from None
     for records in filter(None, (header.vlrs, header.evlrs)):
         records[:] = [record for record in records if record.user_id != "copc"]
     return header

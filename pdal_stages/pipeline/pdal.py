@@ -19,7 +19,7 @@ from types import CodeType, FrameType
 from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
-from ..base.las import geotiff_code, odd_text
+from ..base.las import check_texts, geotiff_code
 from ..base.lascheck import DAMAGED, check_readable
 from .read import reader_files, readers_files
 
@@ -132,13 +132,7 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
                 cure=DAMAGED,
             ) from None
         for path in readers_files(stages, las=True) if _NOT_UTF8.search(str(error)) else ():
-            if (odd := odd_text(path)) is not None:
-                raise PipelineError(
-                    f"the {odd[0]} in the LAS file is not UTF-8, which PDAL's filters.python cannot take",
-                    where=path,
-                    found=str(odd[1])[1:],
-                    cure=f"Write the file anew first: pdal translate {path} clean.laz",
-                ) from None
+            check_texts(path)
         raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
     except MemoryError:
         cure = "Work in tiles (--tile), or read less, e.g. with filters.crop"

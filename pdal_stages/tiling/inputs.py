@@ -133,23 +133,18 @@ def las_extent(path: str) -> Extent:
 
 def read_ept(path: str) -> dict[str, Any]:
     """The description of an EPT source."""
-    try:
-        if "://" in path:
-            import urllib.request
+    import urllib.request
 
-            with urllib.request.urlopen(path, timeout=60) as answer:
-                text = answer.read(_LARGEST)
-        else:
-            with open(path, "rb") as file:
-                text = file.read(_LARGEST)
-        found = strict_json(text)
+    try:
+        with urllib.request.urlopen(path, timeout=60) if "://" in path else open(path, "rb") as file:
+            found = strict_json(file.read(_LARGEST))
         x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
         left, low, _, right, high, _ = map(float, found["bounds"])
-        if not (left - 1 <= x0 and low - 1 <= y0 and x1 <= right + 1 and y1 <= high + 1):
-            raise ValueError("its points lie beyond its octree")  # where PDAL looks for them without end
+        # PDAL looks for points beyond the octree without end.
+        there = left - 1 <= x0 <= x1 <= right + 1 and low - 1 <= y0 <= y1 <= high + 1
         named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
-        if int(found["points"]) < 0 or not (x0 <= x1 and y0 <= y1) or not named:
-            raise ValueError("a description of nothing")
+        if int(found["points"]) < 0 or not there or not named:
+            raise ValueError("it describes nothing, or points beyond its octree")
         return found
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None

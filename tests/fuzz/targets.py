@@ -131,7 +131,8 @@ def cloud(data: bytes) -> str:
     path = put("cloud.laz", data)
     lascheck.check_readable(path)
     las.projection(path)
-    las.odd_text(path)
+    with contextlib.suppress(StageError):
+        las.check_texts(path)
     las.extra_dimensions(path)
     found = inputs.las_extent(str(path))
     assert sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"] == found.count
