@@ -157,12 +157,9 @@ def test_other_points_are_refused(town, tmp_path, capsys):
     )
     assert "do not hold the same points" in capsys.readouterr().err
     las.add_extra_dims([laspy.ExtraBytesParams(name, "uint8") for name in ("one", "two")])
-    las.write(tmp_path / "twice.las")
-    data = (tmp_path / "twice.las").read_bytes().replace(b"two" + bytes(29), b"one" + bytes(29))
-    (tmp_path / "twice.las").write_bytes(data)
-    assert (
-        cli.main(["corrections", str(town), str(tmp_path / "twice.las"), "--out", str(tmp_path / "o")]) == 1
-    )
+    las.write(twice := tmp_path / "twice.las")
+    twice.write_bytes(twice.read_bytes().replace(b"two" + bytes(29), b"one" + bytes(29)))
+    assert cli.main(["corrections", str(town), str(twice), "--out", str(tmp_path / "o.las")]) == 1
     assert "occurs more than once" in capsys.readouterr().err
     assert cli.main(["corrections", str(town), "--out", str(tmp_path / "o.laz")]) == 1
     assert "nothing to mark" in capsys.readouterr().err

@@ -54,6 +54,7 @@ def test_cells_are_what_they_say():
 
 
 def test_patches_hold_each_cell_once_and_come_best_first():
+    assert all("looked at" in styles(np.full(n, 0.2))["patches"] for n in (0, 1, 5))
     cells = ReviewCells.of(*cloud(9, 6000, 150.0), 2.0)
     found = find_patches(cells)
     assert np.array_equal(np.unique(found.of_cell), np.arange(len(found)))
@@ -139,10 +140,6 @@ def test_what_cannot_be_is_refused(folder, tmp_path, words, what, capsys):
     assert cli.main(["review", str(folder / "whole.laz"), str(tmp_path / "r.gpkg"), *words]) == 1
     assert what in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_styles_of_patches_alike():
-    assert all("looked at" in styles(np.full(n, 0.2))["patches"] for n in (0, 1, 5))
 
 
 @pytest.mark.pdal

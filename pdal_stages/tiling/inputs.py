@@ -144,7 +144,7 @@ def read_ept(path: str) -> dict[str, Any]:
         there = left - 1 <= x0 <= x1 <= right + 1 and low - 1 <= y0 <= y1 <= high + 1
         named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
         if int(found["points"]) < 0 or not there or not named:
-            raise ValueError("it describes nothing, or points beyond its octree")
+            raise ValueError("a description of nothing, or of points beyond its octree")
         return found
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None

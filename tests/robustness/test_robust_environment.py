@@ -150,16 +150,6 @@ def test_locale_c(command, tmp_path, cloud):
     command.refused(command.process("expand", bad, env=plain), "\\u6e2c")
 
 
-def test_file_name_that_is_not_utf8(command, tmp_path, cloud, model):
-    name = os.fsdecode(b"gr\xfcn.las")
-    try:
-        shutil.copy(cloud, tmp_path / name)
-    except OSError:
-        pytest.skip("this file system has UTF-8 names only")
-    words = ["classify", tmp_path / name, tmp_path / "out.las", "--model", model]
-    command.refused(command.process(*words), "not valid UTF-8", "rename the file")
-
-
 # ---- signals -------------------------------------------------------------------------------------------------------
 
 

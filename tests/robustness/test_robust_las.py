@@ -228,19 +228,12 @@ def test_damaged(command, tmp_path, write_las, model, case):
     suffix, point_format = kind.split()
     source = damaged(write_las(tmp_path / f"in{suffix}", scene(), point_format=int(point_format)), edit)
     command.refused(pipeline(tmp_path, source, model), f"in{suffix}", says)
-
-
-@pytest.mark.parametrize("case", ["cut in the points", "a text file", "LAZ: another count in the header"])
-def test_damaged_in_tiles(command, tmp_path, write_las, case):
-    kind, edit, says = DAMAGED[case]
-    suffix, point_format = kind.split()
-    source = damaged(write_las(tmp_path / f"in{suffix}", scene(), point_format=int(point_format)), edit)
-    done = command(
-        "pipeline", job(tmp_path, source, HAG, tmp_path / "out.las"), "--tile", "20", "--workers", 0
-    )
-    command.before = command.files()  # the marks of the run stay, for --resume
-    command.refused(done, f"in{suffix}", "not a LAS or LAZ file" if "text" in case else says)
-    assert not (tmp_path / "out.las").exists()
+    if case in ("cut in the points", "a text file", "LAZ: another count in the header"):
+        path = job(tmp_path, source, HAG, tmp_path / "out.las")
+        done = command("pipeline", path, "--tile", "20", "--workers", 0)
+        command.before = command.files()  # the marks of the run stay, for --resume
+        command.refused(done, f"in{suffix}", "not a LAS or LAZ file" if "text" in case else says)
+        assert not (tmp_path / "out.las").exists()
 
 
 @pytest.mark.parametrize(("version", "at", "end"), [(2, 179, 227), (4, 255, 375)])

@@ -110,6 +110,7 @@ REPLACING = [
     (["pipeline", "twice.json"], "two output files are one"),
     *(([*words, "pipe.las"], "the input is a pipe") for words in (["train", "--model", "o.model"], ["accuracy", "a.las", "--reference"])),
     (["pipeline", "pipe.json"], "the input is a pipe"),
+    ([*CLASSIFY, "\udce9.las"], "rename the file"),
     ([*CLASSIFY, ""], "the name of the output is empty"),
     (["review", "a.las", ""], "Give a name that ends in .gpkg"),
     (["objects", "a.las", "\udce9.gpkg"], "UTF-8"),
