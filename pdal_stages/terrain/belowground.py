@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import device, njit
+from ..base.jit import FAST, device, njit
 from .cells import HOLE, linked_cells, sums_around
 
 #: Columns within which a plane is fitted through the ground; how many it needs.
@@ -38,7 +38,7 @@ def reach(side: float) -> int:
     return math.ceil(max(OTHERS / side, AROUND) + max(FAR / side + 2, NEAR))
 
 
-@device(_nrt=True)
+@device(_nrt=True, fastmath=set(FAST))
 def _plane_under(base, j, i, radius, inner=0):
     """Plane (height at the column, per column across, along; scatter below it) under the columns round one, between two
     radii, and how many these are."""
@@ -86,13 +86,11 @@ def _plane_under(base, j, i, radius, inner=0):
         below, number = 0.0, 0.0
         for k in range(n):
             off = zs[k] - lowest - p0 - p1 * u[k] - p2 * v[k]
-            weight[k] = 1.0 / (1.0 + off * off)
-            if off < 0.0:
-                weight[k] *= weight[k]
-                below += weight[k] * off * off
-                number += weight[k]
-            else:
-                weight[k] *= 0.1
+            g = 1.0 / (1.0 + off * off)
+            weight[k] = g * g if off < 0.0 else 0.1 * g
+            g = weight[k] if off < 0.0 else 0.0
+            below += g * off * off
+            number += g
         scatter = np.sqrt(below / number) if number > 0.0 else 0.0
     return n, p0 + lowest, p1, p2, scatter
 

@@ -28,16 +28,7 @@ from ..base.jit import device, njit
 from ..base.las import NOISE
 from .belowground import AROUND, ENOUGH, below_ground
 from .belowground import reach as below_reach
-from .cells import (
-    HIGHEST,
-    cell_numbers,
-    columns,
-    longest_sides,
-    number_sets,
-    patches,
-    places_among,
-    sums_around,
-)
+from .cells import HIGHEST, cell_numbers, columns, longest_sides, number_sets, patches, sums_around
 
 LOW, HIGH = NOISE
 #: Side of a voxel, meters.
@@ -216,10 +207,16 @@ def _small(
     number, weak ones joined as well, -1 where it is wider than `extent`, in voxels."""
     keys, number = voxels.keys, len(voxels.keys)
     strong = voxels.counts > (WEAK * usual).astype(np.int64)
-    pairs = []
-    for dj, di, dl in list(product((-1, 0, 1), repeat=3))[14:]:  # those ahead
-        at, touching = places_among(keys, keys + ((dj * voxels.width + di) << BITS) + dl)
-        pairs.append([np.flatnonzero(touching), at[touching]])
+    above = np.flatnonzero(np.diff(keys) == 1)
+    pairs = [[above, above + 1]]
+    for dj, di in ((0, 1), (1, -1), (1, 0), (1, 1)):  # columns ahead
+        wanted = keys + ((dj * voxels.width + di) << BITS) - 1
+        at = np.searchsorted(keys, wanted)
+        for _level in range(3):  # the next one's place is the same, or one farther
+            at = np.minimum(at, number - 1)
+            touching = keys[at] == wanted
+            pairs.append([np.flatnonzero(touching), at[touching]])
+            at, wanted = at + touching, wanted + 1
     one, other = np.concatenate(pairs, axis=1)
     both = strong[one] & strong[other]
     label = np.empty(number, np.int64)
