@@ -21,7 +21,7 @@ from .belowground import pits, pits_reach
 from .cells import HOLE, SIDE, cell_numbers, keys_of, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
-from .openings import objects_of, opening_radius, plateau_reach, remove_plateaus
+from .openings import JUMP, LINK, WALL, objects_of, opening_radius, plateau_reach, remove_plateaus
 from .planes import from_parents, planes_of_blocks, surface
 from .planes import reach as planes_reach
 
@@ -263,7 +263,8 @@ def ground_raster(
         """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
         blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, options.levels(block))
         found = np.zeros(len(cells), bool)
-        _near(cells, place, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
+        rest = np.isfinite(raster) & ~ground
+        _near(cells, place, rest, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
         return found
 
     def within(cells: NDArray[np.int64], by: int) -> NDArray[np.int64]:
@@ -290,15 +291,27 @@ def ground_raster(
 
 
 @njit
-def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar, out):
-    """Which of the cells (n,), numbered row by row, lie near the surface of the ground found so far (see :mod:`.planes`)."""
-    w = place.shape[1]
+def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar, out):
+    """Which of the cells (n,), numbered row by row, lie near the surface of the ground found so far (see :mod:`.planes`).
+
+    None is that has others of the `rest` (h, w), no ground yet either, a jump below on all four sides: a treetop.
+    """
+    h, w = rest.shape
     for k in range(len(cells)):
         j, i = cells[k] // w, cells[k] % w
         height, across, along = from_parents(blocks, blocks_left, blocks_bottom, i + left, j + bottom, 1.0)
         x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
         gradient = np.sqrt(across * across + along * along) / cell
-        out[k] = abs(z - height - x * across - y * along) <= threshold + scalar * gradient
+        if abs(z - height - x * across - y * along) > threshold + scalar * gradient:
+            continue
+        sides = 0
+        for b in range(max(j - LINK, 0), min(j + LINK + 1, h)):
+            for a in range(max(i - LINK, 0), min(i + LINK + 1, w)):
+                if rest[b, a]:
+                    drop = z - place[b, a, 2] - (i - a) * across - (j - b) * along
+                    if drop > max(JUMP, WALL * cell * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))):
+                        sides |= 1 << (2 * (b > j) + (a > i))
+        out[k] = sides != 15
 
 
 def surface_of(
