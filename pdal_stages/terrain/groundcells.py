@@ -276,8 +276,6 @@ def ground_raster(
     for number in range(1, ROUNDS + 1):
         asked = np.flatnonzero(np.isfinite(raster) & ~ground)
         asked = within(asked, plateaus + (ROUNDS - number) * step)
-        if not asked.size:
-            break
         ground.ravel()[asked[near(asked, NEAR)]] = True
     # What lies above a scarp may be cut off uphill by the rim of the cloud. It looks no farther than plateaus do.
     cut = within(np.flatnonzero(wide & ~ground), 0)
@@ -292,10 +290,7 @@ def ground_raster(
 
 @njit
 def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar, out):
-    """Which of the cells (n,), numbered row by row, lie near the surface of the ground found so far (see :mod:`.planes`).
-
-    None is that has others of the `rest` (h, w), no ground yet either, a jump below on all four sides: a treetop.
-    """
+    """Which of the cells (n,), numbered row by row, lie near the surface of the ground found so far (see :mod:`.planes`)."""
     h, w = rest.shape
     for k in range(len(cells)):
         j, i = cells[k] // w, cells[k] % w
@@ -311,6 +306,7 @@ def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, 
                     drop = z - place[b, a, 2] - (i - a) * across - (j - b) * along
                     if drop > max(JUMP, WALL * cell * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))):
                         sides |= 1 << (2 * (b > j) + (a > i))
+        # A jump above others of the rest, which is no ground yet, on all four sides: a treetop.
         out[k] = sides != 15
 
 

@@ -190,14 +190,10 @@ def _measured(
 
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
 
-    def each(function):
-        for _ in map_blocks(function, spans, threads):
-            pass
-
     def above(span):
         heights_above(x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span])
 
-    each(above)
+    list(map_blocks(above, spans, threads))
     is_ground = options.is_ground(use, deck, height, gradient)
     if means is None:
         sums = np.zeros((*raster.shape, 4), np.int64)
@@ -206,7 +202,7 @@ def _measured(
     else:
         raster = raster._replace(ground=means[0], place=means[1])
     surface_of(raster, options, FAR, needed, planes)
-    each(above)
+    list(map_blocks(above, spans, threads))
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
     height[nowhere] = gradient[nowhere] = 0.0
@@ -220,5 +216,5 @@ def _measured(
         def over(span, opening=opening, values=values):
             above_opening(x[span], y[span], z[span], cell, left, bottom, opening, height[span], values[span])
 
-        each(over)
+        list(map_blocks(over, spans, threads))
     return found

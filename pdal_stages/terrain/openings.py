@@ -111,8 +111,7 @@ def objects_of(
                 lowered = (before - after > drop) & measured & ~objects
             objects |= lowered
             np.copyto(floor, after, where=lowered)
-            if radius * cell > WIDE:
-                wide |= lowered
+            wide |= lowered & (radius * cell > WIDE)
             before = after
     return objects, floor, openings, wide
 
