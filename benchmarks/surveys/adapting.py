@@ -18,7 +18,8 @@ from typing import Any
 
 import laspy
 import numpy as np
-from clouds import SURVEYS, slug, true_classes
+from clouds import slug, true_classes
+from surveys import SURVEYS
 
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.tiling.adapting import SURE, AdaptTask

@@ -10,8 +10,9 @@ import hashlib
 import time
 from pathlib import Path
 
-from clouds import SURVEYS
 from recipe import train_on
+from sources import check
+from surveys import SURVEYS
 
 
 def main() -> None:
@@ -20,6 +21,7 @@ def main() -> None:
     options.add_argument("--out", type=Path, required=True, help="the model file")
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     args = options.parse_args()
+    check(args.data, [file for name in args.surveys for file in SURVEYS[name].files])
     started = time.process_time()
     model = train_on(args.data, args.surveys)
     model.save(args.out)

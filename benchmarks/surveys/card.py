@@ -13,10 +13,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-from clouds import SURVEYS
 from leave_one_out import tables
 from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
 from rules import table
+from surveys import SURVEYS
 
 from pdal_stages import load_model
 from pdal_stages.stages.preparation import PREPARATION, as_json

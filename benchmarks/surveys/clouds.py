@@ -1,161 +1,20 @@
-"""The open, labeled surveys that the shipped models are trained on, and copies of them that are thinner, steeper, without
-return numbers, or have one return of each pulse.
-
-Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring. Low vegetation (3) is
-left out: in these surveys most of it lies on the ground, and where it begins is a matter of taste.
-"""
+"""The labeled surveys as they are trained on and scored, and copies of them that are thinner, steeper, without return
+numbers, or have one return of each pulse."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import laspy
 import numpy as np
+from surveys import GROUND, SURVEYS, VEGETATION, LabeledSurvey
 
 from pdal_stages.base.arrays import hash_of
 from pdal_stages.terrain import filtered_ground
 
-GROUND, VEGETATION, BUILDING = 2, 5, 6
-
-
-@dataclass(frozen=True)
-class LabeledSurvey:
-    """One flight.
-
-    Attributes
-    ----------
-    files : tuple of str
-        Under the data folder.
-    labels : mapping
-        The survey's codes -> ours; the others are neighbors only.
-    dropped : tuple of int
-        Codes that do not even serve as neighbors: noise, points added by computer.
-    tall : mapping
-        Codes of everything else: vegetation from a height in meters on.
-    tall_scored : bool
-        Whether that is true enough to score by, or to train on only.
-    returns : bool
-        Whether it records return numbers.
-    samples : int
-        Of each class from each copy, at most: fewer from what is alike all over, or has one building.
-    mislabeled : tuple of boxes
-        West, south, east, north of where the labels were looked at and are wrong: nothing is learned from them, and
-        errors are not counted.
-    what, license : str
-        For the card.
-    """
-
-    files: tuple[str, ...]
-    labels: Mapping[int, int]
-    what: str
-    license: str
-    dropped: tuple[int, ...] = (7, 18)
-    tall: Mapping[int, float] = field(default_factory=dict)
-    tall_scored: bool = False
-    returns: bool = True
-    samples: int = 1500
-    mislabeled: tuple[tuple[float, float, float, float], ...] = ()
-
-
-_LIDARHD = "IGN, LiDAR HD, Licence Ouverte Etalab 2.0"
-_ARRANGED = ", as arranged for IGNF's open tools"
-_AHN = "AHN, open data of the Dutch government"
-CLASSES = {2: GROUND, 4: VEGETATION, 5: VEGETATION, 6: BUILDING}
-SURVEYS = {
-    "Montpellier": LabeledSurvey(
-        (
-            "montpellier/train_77050_627755.laz",
-            "montpellier/train_77050_627760.laz",
-            "montpellier/train_77055_627755.laz",
-            "montpellier/train_77055_627760.laz",
-        ),
-        CLASSES,
-        "French city, campus with trees",
-        _LIDARHD,
-    ),
-    "Delft": LabeledSurvey(
-        ("delft/train.laz",),
-        {2: GROUND, 6: BUILDING, 9: GROUND},
-        "Dutch old town with canals (AHN3)",
-        _AHN,
-        dropped=(7, 18, 26),
-        tall={1: 2.0},
-    ),
-    "Seville": LabeledSurvey(
-        ("seville/plazanueva.laz",),
-        CLASSES,
-        "Spanish old town, closed blocks (PNOA)",
-        "Instituto Geografico Nacional de Espana, PNOA, CC BY 4.0",
-        returns=False,
-    ),
-    "hamlet": LabeledSurvey(("rural/lidarhd_57ppm2.laz",), CLASSES, "French hamlet on a slope", _LIDARHD),
-    "farm": LabeledSurvey(
-        ("rural/lidarhd_11ppm2.laz",),
-        {2: GROUND, 6: BUILDING},
-        "French farm",
-        _LIDARHD,
-        dropped=(7, 18, 208, 214),
-        tall={1: 0.5},
-        tall_scored=True,
-        mislabeled=(
-            (870201.0, 6617082.0, 870240.0, 6617108.0),
-        ),  # nothing has a label there, nor has the house
-    ),
-    "power line": LabeledSurvey(
-        ("rural/ahn4_powerline.laz",),
-        {2: GROUND, 5: VEGETATION, 9: GROUND},
-        "Dutch meadows and woods under a power line (AHN4)",
-        _AHN + ", arranged by github hankersyan/AHN_transmission_corridor",
-        dropped=(7, 18, 26, 1),
-        returns=False,
-        samples=300,
-    ),
-    "bank": LabeledSurvey(
-        ("rural/lidarhd_bank.laz",),
-        CLASSES,
-        "French steep wooded bank and a house",
-        _LIDARHD,
-        dropped=(7, 18, 65),
-        samples=150,
-    ),
-    "town's edge": LabeledSurvey(
-        ("rural/ign_0p3ppm2.laz",),
-        CLASSES,
-        "French town's edge with large halls, at 0.3 points/m²",
-        _LIDARHD + _ARRANGED,
-        dropped=(7, 18, 64, 65, 66, 67),
-        samples=200,
-        mislabeled=(
-            (292450.0, 6832080.0, 292645.0, 6832260.0),
-        ),  # a roof 11 m above all around is called ground
-    ),
-    "bridges": LabeledSurvey(
-        ("bridge/ign_0299_6802.laz",),
-        CLASSES,
-        "French river, fields and bridges, at 0.3 points/m²",
-        _LIDARHD + _ARRANGED,
-        dropped=(7, 18, 66, 67),
-        samples=200,
-    ),
-    "meadows": LabeledSurvey(
-        ("rural/ahn3_achterhoek.laz",),
-        {2: GROUND, 6: BUILDING, 9: GROUND},
-        "Dutch meadows, rows of trees and farms (AHN3)",
-        _AHN + ", arranged by eEcoLiDAR/Laserfarm",
-        tall={1: 2.0},
-        tall_scored=True,
-        samples=150,
-    ),
-    "pines": LabeledSurvey(
-        ("forest/neon_osbs.laz",),
-        {2: GROUND, 5: VEGETATION},
-        "Open pine forest in Florida (NEON)",
-        "NEON open data, arranged by brycefrank/pyfor",
-        samples=150,
-    ),
-}
+#: Meters from the middle of a survey beyond which a point is a mistake.
+FAR = 5000.0
 
 
 def slug(name: str) -> str:
@@ -171,6 +30,8 @@ def true_classes(
     for given, least in survey.tall.items():
         # Else vegetation would be judged only where it is none.
         truth[(codes == given) & (height >= least)] = VEGETATION
+    for given, most in survey.low.items():
+        truth[(codes == given) & (height < most)] = GROUND
     truth[mislabeled(survey, x, y)] = 0
     return truth
 
@@ -248,12 +109,14 @@ def published(data: Path, known: LabeledSurvey) -> tuple[np.ndarray, np.ndarray,
     """All of a survey's points: (n, 3) coordinates, (n,) the survey's own codes, and the return numbers."""
     parts = [laspy.read(data / name) for name in known.files]
     xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
-    codes = np.concatenate([np.asarray(p.classification) for p in parts]).astype(np.uint8)
+    codes = np.concatenate([np.asarray(p[known.dimension]) for p in parts]).astype(np.uint8)
     dimensions = {
         name: np.concatenate([np.asarray(p[word]) for p in parts]).astype(np.uint8)
         for name, word in (("ReturnNumber", "return_number"), ("NumberOfReturns", "number_of_returns"))
     }
-    return xyz, codes, dimensions
+    # Hamburg has a point that is hundreds of kilometers away.
+    near = (np.abs(xyz - np.median(xyz, axis=0)) < FAR).all(axis=1)
+    return xyz[near], codes[near], {name: values[near] for name, values in dimensions.items()}
 
 
 def load(data: Path, survey: str) -> Cloud:
@@ -270,6 +133,9 @@ def load(data: Path, survey: str) -> Cloud:
         cloud.labels[tall] = VEGETATION
         if known.tall_scored:
             cloud.truth[tall] = VEGETATION
+    for given, height in known.low.items():
+        low = (code == given) & (cloud.dimensions["HeightAboveGround"] < height)
+        cloud.labels[low] = cloud.truth[low] = GROUND
     wrong = mislabeled(known, *xyz[:, :2].T)
     cloud.labels[wrong] = cloud.truth[wrong] = 0
     return cloud

@@ -20,7 +20,8 @@ from typing import Any
 import laspy
 import numpy as np
 import shapely
-from clouds import SURVEYS, slug, true_classes
+from clouds import slug, true_classes
+from surveys import SURVEYS
 
 from pdal_stages import cli
 from pdal_stages.objects.overlay import points_inside

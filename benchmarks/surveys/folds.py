@@ -1,7 +1,7 @@
-"""Models that miss one survey each, at little more than the cost of one.
+"""Models that miss one fold of the surveys each, at little more than the cost of one.
 
 What is computed of the points does not depend on who is left out, so it is computed once, for every point of every copy, and
-kept in a folder. The surroundings that a later pass reads of survey B where A is left out come from forests grown
+kept in a folder. The surroundings that a later pass reads of fold B where A is left out come from forests grown
 without both; that of the first pass serves where B is left out and A is read, too.
 """
 
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from recipe import OPTIONS, training_clouds
+from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud
 from pdal_stages.classifier.algorithms import PredictRequest
@@ -45,14 +46,15 @@ def features_of(cloud: TrainingCloud) -> npt.NDArray[np.float32]:
 
 
 class LeaveOneOut:
-    """The copies of all surveys, and models of so many trees a pass without one of these."""
+    """The copies of all surveys, and models of so many trees a pass without one fold of these."""
 
     def __init__(self, data: Path, surveys: Iterable[str], folder: Path, trees: int = TREES) -> None:
         self.trees = trees
-        self.names = sorted(surveys)
+        names = sorted(surveys)
+        self.folds = sorted({SURVEYS[name].fold for name in names})
         self.clouds: list[TrainingCloud] = []
         self.tables: list[npt.NDArray[np.float32]] = []
-        for name in self.names:
+        for name in names:
             for cloud in training_clouds(data, name):
                 path = folder / f"{len(self.clouds)}.npy"
                 np.save(path, features_of(cloud))
@@ -62,9 +64,11 @@ class LeaveOneOut:
         self.classes = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
         of = [cloud.flight for cloud in self.clouds]
         self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
-        self.survey = np.array([self.names.index(name) for name in of])[self.samples.cloud]
+        self.fold_of = np.array([SURVEYS[name].fold for name in of])
+        self.fold = self.fold_of[self.samples.cloud]
         self.values = self.samples.take(self.tables.__getitem__)
         self._pair = cache(self._grown_without)
+        self.without_fold = cache(self._without_fold)
 
     def _grow(self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int) -> Forest:
         names = ("seed", "min_samples_leaf", "max_samples", "max_features")
@@ -74,7 +78,7 @@ class LeaveOneOut:
         return grow_forest(values, self.samples.label, weight, trees, **setting)[0]
 
     def _grown_without(self, one: int, other: int) -> Forest:
-        kept = (self.survey != one) & (self.survey != other)
+        kept = (self.fold != one) & (self.fold != other)
         return self._grow(self.values, kept, self._few)
 
     @property
@@ -83,9 +87,11 @@ class LeaveOneOut:
         return max(1, round(FOLD_TREES * self.trees))
 
     def without(self, name: str) -> Model:
-        """The model of all surveys but this one."""
-        left = self.names.index(name)
-        kept = self.survey != left
+        """The model of all surveys but those of this one's fold."""
+        return self.without_fold(SURVEYS[name].fold)
+
+    def _without_fold(self, left: int) -> Model:
+        kept = self.fold != left
         passes, values = [], self.values
         votes: Votes = {}
         for number in range(OPTIONS.passes):
@@ -95,25 +101,25 @@ class LeaveOneOut:
             forest = self._grow(values, kept, self.trees)
             passes.append(FeatureForest(FEATURES, forest, CONTEXT if number else None))
         # What is known of the shipped model, which is of the same make, but for what is known of its samples.
-        info = {**copy.deepcopy(load_model("standard").info), "training": self._training(name)}
+        info = {**copy.deepcopy(load_model("standard").info), "training": self._training(left)}
         info["passes"] = [{"importances": None}] * len(passes)
         return Model(tuple(passes), self.classes, {**info, "voxel": OPTIONS.voxel})
 
     def _votes(self, left: int, values: npt.NDArray[np.float32], before: Votes) -> Votes:
-        """What a pass says of all points of the clouds that are trained on where a survey is left out, by forests that have
+        """What a pass says of all points of the clouds that are trained on where a fold is left out, by forests that have
         seen neither that nor the cloud's own: `values` is what the pass reads of the samples, `before` what the pass before
         said, nothing of the first pass."""
         found = {}
-        for other in range(len(self.names)):
+        for other in self.folds:
             if other == left:
                 continue
             if before:
-                kept = (self.survey != left) & (self.survey != other)
+                kept = (self.fold != left) & (self.fold != other)
                 forest = self._grow(values, kept, self._few)
             else:
                 forest = self._pair(*sorted((left, other)))
             for number, (cloud, table) in enumerate(zip(self.clouds, self.tables, strict=True)):
-                if cloud.flight != self.names[other] or not len(self.samples.of_cloud(number)[0]):
+                if self.fold_of[number] != other or not len(self.samples.of_cloud(number)[0]):
                     continue
                 read = np.ascontiguousarray(table)
                 if before:
@@ -136,8 +142,9 @@ class LeaveOneOut:
         """(m, columns) of some of a cloud's points."""
         return CONTEXT.columns_of(cloud.xyz, shares)(rows)
 
-    def _training(self, without: str) -> dict[str, Any]:
+    def _training(self, without: int) -> dict[str, Any]:
         """What a model file says of its training."""
-        clouds = [{"name": c.name, "points": len(c.xyz)} for c in self.clouds if c.flight != without]
-        samples = int(np.count_nonzero(self.survey != self.names.index(without)))
+        used = [cloud for cloud, fold in zip(self.clouds, self.fold_of, strict=True) if fold != without]
+        clouds = [{"name": cloud.name, "points": len(cloud.xyz)} for cloud in used]
+        samples = int(np.count_nonzero(self.fold != without))
         return {"clouds": clouds, "count": OPTIONS.count, "seed": OPTIONS.seed, "samples": samples}

@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from clouds import SURVEYS, Cloud, load, on_slopes, one_return, thinned, without_returns
+from clouds import Cloud, load, on_slopes, one_return, thinned, without_returns
+from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.base.arrays import hash_of

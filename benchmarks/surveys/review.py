@@ -20,8 +20,9 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from clouds import SURVEYS, slug, true_classes
+from clouds import slug, true_classes
 from folds import TREES, LeaveOneOut
+from surveys import SURVEYS
 
 import pdal_stages
 from pdal_stages import cli

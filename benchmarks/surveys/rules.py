@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from clouds import SURVEYS, published, slug, true_classes
+from clouds import published, slug, true_classes
+from surveys import SURVEYS
 
 from pdal_stages import Model, detached_noise, filtered_ground, load_model
 from pdal_stages.base.las import BRIDGE
