@@ -137,6 +137,7 @@ def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it(monkeypatch
     measured = ROOT / "benchmarks" / "results"
     words = ["--model", ROOT / "pdal_stages" / "models" / "standard.model"]
     words += ["--scores", measured / "surveys.json", "--rules", measured / "surveys-rules.json"]
+    words += ["--places", measured / "surveys-places.json"]
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "surveys"))
     monkeypatch.delitem(sys.modules, "clouds", raising=False)  # that of benchmarks/papers has the same name
     monkeypatch.setattr(sys, "argv", ["card.py", *map(str, words)])

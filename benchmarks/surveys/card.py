@@ -1,8 +1,9 @@
 """The card of a shipped model: what it was trained on, how it does survey by survey, where it fails.
 
-    python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE --rules RULES > docs/models.md
+    python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE --rules RULES \\
+        --places PLACES > docs/models.md
 
-FILE is what leave_one_out.py wrote, RULES what rules.py wrote.
+FILE is what leave_one_out.py wrote, RULES what rules.py wrote, PLACES what places.py wrote.
 """
 
 from __future__ import annotations
@@ -11,15 +12,63 @@ import argparse
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from leave_one_out import tables
+from leave_one_out import NAMES, THINNED, tables
 from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
 from rules import table
+from sources import SOURCES
 from surveys import SURVEYS
 
 from pdal_stages import load_model
 from pdal_stages.stages.preparation import PREPARATION, as_json
+
+
+def at(runs: list[dict[str, Any]], density: float | None) -> list[dict[str, Any]]:
+    """The runs of surveys as flown (None), or thinned to a density."""
+    end = "" if density is None else f", {density:g} points per m2"
+    return [run for run in runs if run["cloud"] == run["cloud"].split(",")[0] + end]
+
+
+def by_landscape(runs: list[dict[str, Any]]) -> str:
+    """Precision and recall of each class, by landscape and density, as Markdown: all surveys weigh alike."""
+    heads = [f"{name} {kind}" for name in NAMES.values() for kind in ("precision", "recall")]
+    lines = [
+        f"| landscape | points/m2 | surveys | {' | '.join(heads)} |",
+        f"|---|---|---:|{'---:|' * len(heads)}",
+    ]
+    for landscape in sorted({survey.landscape for survey in SURVEYS.values()}):
+        for density in (None, *THINNED):
+            shares = [
+                np.array(run["matrix"]) / run["points"]
+                for run in at(runs, density)
+                if SURVEYS[run["cloud"].split(",")[0]].landscape == landscape
+            ]
+            if shares:
+                mean = np.mean(shares, axis=0)
+                right = np.diag(mean)
+                both = (_percent(right, mean.sum(axis=axis)) for axis in (0, 1))
+                cells = " | ".join(cell for pair in zip(*both, strict=True) for cell in pair)
+                where = "as flown" if density is None else f"{density:g}"
+                lines.append(f"| {landscape} | {where} | {len(shares)} | {cells} |")
+    return "\n".join(lines)
+
+
+def _percent(part: np.ndarray, whole: np.ndarray) -> list[str]:
+    return [f"{100 * a / b:.1f}" if b > 0 else "-" for a, b in zip(part, whole, strict=True)]
+
+
+def means(runs: list[dict[str, Any]]) -> str:
+    """Mean, median and worst of all surveys, as flown and at each density, as Markdown."""
+    lines = ["| points/m2 | surveys | mean OA | median | worst |", "|---|---:|---:|---:|---|"]
+    for density in (None, *THINNED):
+        some = at(runs, density)
+        oa, worst = [run["oa"] for run in some], min(some, key=lambda run: run["oa"])
+        where = "as flown" if density is None else f"{density:g}"
+        told = f"{np.mean(oa):.1f} | {np.median(oa):.1f} | {worst['cloud'].split(',')[0]}, {worst['oa']:.1f}"
+        lines.append(f"| {where} | {len(some)} | {told} |")
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -27,19 +76,21 @@ def main() -> None:
     options.add_argument("--model", type=Path, required=True)
     options.add_argument("--scores", type=Path, required=True)
     options.add_argument("--rules", type=Path, required=True)
+    options.add_argument("--places", type=Path, required=True)
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
     surveys = [
-        "| survey | what | labeled points | left out | samples per copy | license |",
-        "|---|---|---:|---:|---:|---|",
+        "| survey | what | points/m2 | labeled points | left out | samples per copy | license | from |",
+        "|---|---|---:|---:|---:|---:|---|---|",
     ]
     runs = {run["cloud"]: run for run in scores["surveys"]}
     for name, survey in SURVEYS.items():
         run = runs.get(name)  # none of a survey that was not left out
-        numbers = f"{run['points']:,} | {run['contradicted']:,}" if run else "- | -"
-        surveys.append(f"| {name} | {survey.what} | {numbers} | {survey.samples:,} | (c) {survey.license} |")
-    worst = min(scores["surveys"], key=lambda run: run["oa"])
-    own = [run["oa"] for run in scores["surveys"] if run["cloud"] in SURVEYS]
+        numbers = f"{run['density']} | {run['points']:,} | {run['contradicted']:,}" if run else "- | - | -"
+        origin = ", ".join(sorted({SOURCES[file]["repository"] for file in survey.files}))
+        surveys.append(
+            f"| {name} | {survey.what} | {numbers} | {survey.samples:,} | (c) {survey.license} | {origin} |"
+        )
     print(
         Path(__file__)
         .with_suffix(".md")
@@ -52,11 +103,13 @@ def main() -> None:
             voxel=OPTIONS.voxel,
             size=args.model.stat().st_size / 1e6,
             digest=hashlib.sha256(args.model.read_bytes()).hexdigest()[:16],
-            scored=len(own),
+            scored=len(at(scores["surveys"], None)),
             known=len(SURVEYS),
             scores=tables(scores["surveys"], scores["isprs"]),
-            read=f"At their own densities the mean is {np.mean(own):.1f}; the worst of all is {worst['cloud']}, "
-            f"{worst['oa']:.1f}.",
+            places="; ".join(json.loads(args.places.read_text())),
+            means=means(scores["surveys"]),
+            landscapes=by_landscape(scores["surveys"]),
+            folds=len({survey.fold for survey in SURVEYS.values()}),
             surveys="\n".join(surveys),
             rules=table(json.loads(args.rules.read_text())),
             count=OPTIONS.count,

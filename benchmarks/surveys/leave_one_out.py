@@ -43,25 +43,27 @@ def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str,
     known = cloud.truth > 0
     codes = sorted(set(cloud.truth[known].tolist()) | {2, 5, 6})
     result = Accuracy.from_labels(cloud.truth[known], found[known], classes=codes)
-    matrix = {
-        f"{NAMES[a]} as {NAMES[b]}": int(np.count_nonzero((cloud.truth == a) & (found == b)))
-        for a in codes
-        for b in codes
+    matrix = [[int(np.count_nonzero((cloud.truth == a) & (found == b))) for b in NAMES] for a in NAMES]
+    wrong = {
+        f"{NAMES[a]} as {NAMES[b]}": matrix[i][j]
+        for i, a in enumerate(NAMES)
+        for j, b in enumerate(NAMES)
         if a != b
     }
     whole = TrainingCloud(cloud.xyz, cloud.truth, cloud.dimensions)
     gone = contradicted(whole)
-    worst = max(matrix, key=lambda key: matrix[key])
+    worst = max(wrong, key=lambda key: wrong[key])
     return {
         "cloud": cloud.name,
         "points": int(known.sum()),
         "density": round(cloud.density, 2),
         "oa": 100 * float(np.mean(found[known] == cloud.truth[known])),
         "f1": {NAMES[c]: 100 * f for c, f in result.f1.items() if f is not None and (cloud.truth == c).any()},
-        "ground_as_building": 100 * matrix["ground as building"] / int(known.sum()),
+        "ground_as_building": 100 * wrong["ground as building"] / int(known.sum()),
         "contradicted": int(np.count_nonzero(gone)),
         "worst": worst,
-        "share": 100 * matrix[worst] / int(known.sum()),
+        "share": 100 * wrong[worst] / int(known.sum()),
+        "matrix": matrix,
     }
 
 
