@@ -23,7 +23,7 @@ def table() -> str:
         "|---|---:|",
         f"| **mean** ({of}) | **{mean(row['oa'] for row in own):.1f} %** |",
     ]
-    for density in ("4", "1"):
+    for density in ("2", "0.5"):
         thinned = [row["oa"] for row in rows if row["cloud"].endswith(f", {density} points per m2")]
         lines.append(f"| mean of {len(thinned)} thinned to {density} points/m² | {mean(thinned):.1f} % |")
     return "\n".join([*lines, ""])

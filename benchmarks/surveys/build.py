@@ -12,14 +12,14 @@ from pathlib import Path
 
 from recipe import train_on
 from sources import check
-from surveys import SURVEYS
+from surveys import SHIPPED, SURVEYS
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--out", type=Path, required=True, help="the model file")
-    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
     args = options.parse_args()
     check(args.data, [file for name in args.surveys for file in SURVEYS[name].files])
     started = time.process_time()

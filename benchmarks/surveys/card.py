@@ -1,9 +1,9 @@
 """The card of a shipped model: what it was trained on, how it does survey by survey, where it fails.
 
     python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE --rules RULES \\
-        --places PLACES > docs/models.md
+        --unseen UNSEEN > docs/models.md
 
-FILE is what leave_one_out.py wrote, RULES what rules.py wrote, PLACES what places.py wrote.
+FILE is what leave_one_out.py wrote, RULES what rules.py wrote, UNSEEN what unseen.py wrote.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from leave_one_out import NAMES, THINNED, tables
+from leave_one_out import NAMES, tables
 from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
 from rules import table
 from sources import SOURCES
-from surveys import SURVEYS
+from surveys import SHIPPED, SURVEYS
+from unseen import THINNED
 
 from pdal_stages import load_model
 from pdal_stages.stages.preparation import PREPARATION, as_json
@@ -76,17 +77,20 @@ def main() -> None:
     options.add_argument("--model", type=Path, required=True)
     options.add_argument("--scores", type=Path, required=True)
     options.add_argument("--rules", type=Path, required=True)
-    options.add_argument("--places", type=Path, required=True)
+    options.add_argument("--unseen", type=Path, required=True)
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
+    unseen = json.loads(args.unseen.read_text())
     surveys = [
         "| survey | what | points/m2 | labeled points | left out | samples per copy | license | from |",
         "|---|---|---:|---:|---:|---:|---|---|",
     ]
-    runs = {run["cloud"]: run for run in scores["surveys"]}
+    own = [run["oa"] for run in at(scores["surveys"], None)]
+    worst = min(scores["surveys"], key=lambda run: run["oa"])
+    runs = {run["cloud"]: run for run in [*scores["surveys"], *unseen["surveys"]]}
     for name, survey in SURVEYS.items():
-        run = runs.get(name)  # none of a survey that was not left out
-        numbers = f"{run['density']} | {run['points']:,} | {run['contradicted']:,}" if run else "- | - | -"
+        run = runs[name]
+        numbers = f"{run['density']} | {run['points']:,} | {run['contradicted']:,}"
         origin = ", ".join(sorted({SOURCES[file]["repository"] for file in survey.files}))
         surveys.append(
             f"| {name} | {survey.what} | {numbers} | {survey.samples:,} | (c) {survey.license} | {origin} |"
@@ -103,13 +107,17 @@ def main() -> None:
             voxel=OPTIONS.voxel,
             size=args.model.stat().st_size / 1e6,
             digest=hashlib.sha256(args.model.read_bytes()).hexdigest()[:16],
-            scored=len(at(scores["surveys"], None)),
-            known=len(SURVEYS),
+            scored=len(own),
+            known=len(SHIPPED),
             scores=tables(scores["surveys"], scores["isprs"]),
-            places="; ".join(json.loads(args.places.read_text())),
-            means=means(scores["surveys"]),
-            landscapes=by_landscape(scores["surveys"]),
-            folds=len({survey.fold for survey in SURVEYS.values()}),
+            read=f"At their own densities the mean is {np.mean(own):.1f}; the worst of all is {worst['cloud']}, "
+            f"{worst['oa']:.1f}.",
+            places="; ".join(unseen["places"]),
+            means=means(unseen["surveys"]),
+            landscapes=by_landscape(unseen["surveys"]),
+            unseen=tables(unseen["surveys"], []),
+            others=len(at(unseen["surveys"], None)),
+            shipped=len(SHIPPED),
             surveys="\n".join(surveys),
             rules=table(json.loads(args.rules.read_text())),
             count=OPTIONS.count,

@@ -22,7 +22,7 @@ import laspy
 import numpy as np
 from clouds import slug, true_classes
 from folds import TREES, LeaveOneOut
-from surveys import SURVEYS
+from surveys import SHIPPED, SURVEYS
 
 import pdal_stages
 from pdal_stages import cli
@@ -109,7 +109,7 @@ def make_models(data: Path, folder: Path, surveys: Sequence[str], trees: int) ->
     missing = [name for name in surveys if not (folder / f"{slug(name)}.model").exists()]
     if missing:
         with tempfile.TemporaryDirectory() as features:
-            left_out = LeaveOneOut(data, SURVEYS, Path(features), trees)
+            left_out = LeaveOneOut(data, SHIPPED, Path(features), trees)
             for name in missing:
                 left_out.without(name).save(folder / f"{slug(name)}.model")
                 print(f"a model without {name}", flush=True)
@@ -145,7 +145,7 @@ def main() -> None:
         "--models", type=Path, required=True, help="folder of the models that miss a survey each"
     )
     options.add_argument("--trees", type=int, default=TREES, help="of a forest of a model that is made")
-    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
     options.add_argument("--ship", action="store_true", help="write the counts beside the shipped model")
     args = options.parse_args()
     make_models(args.data, args.models, args.surveys, args.trees)

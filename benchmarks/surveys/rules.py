@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from clouds import published, slug, true_classes
-from surveys import SURVEYS
+from surveys import SHIPPED, SURVEYS
 
 from pdal_stages import Model, detached_noise, filtered_ground, load_model
 from pdal_stages.base.las import BRIDGE
@@ -95,7 +95,7 @@ def main() -> None:
         "--models", type=Path, required=True, help="folder of the models, each without one survey"
     )
     options.add_argument("--json", type=Path, required=True, help="where the figures go")
-    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
     args = options.parse_args()
     runs = []
     for survey in args.surveys:
