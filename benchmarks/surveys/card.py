@@ -49,7 +49,8 @@ def by_landscape(runs: list[dict[str, Any]]) -> str:
             if shares:
                 mean = np.mean(shares, axis=0)
                 right = np.diag(mean)
-                both = (_percent(right, mean.sum(axis=axis)) for axis in (0, 1))
+                labeled = mean.sum(axis=1)
+                both = (_percent(right, np.where(labeled > 0, mean.sum(axis=axis), 0)) for axis in (0, 1))
                 cells = " | ".join(cell for pair in zip(*both, strict=True) for cell in pair)
                 where = "as flown" if density is None else f"{density:g}"
                 lines.append(f"| {landscape} | {where} | {len(shares)} | {cells} |")
@@ -115,7 +116,7 @@ def main() -> None:
             places="; ".join(unseen["places"]),
             means=means(unseen["surveys"]),
             landscapes=by_landscape(unseen["surveys"]),
-            unseen=tables(unseen["surveys"], []),
+            unseen=tables(unseen["surveys"], []).replace("survey left out", "survey"),
             others=len(at(unseen["surveys"], None)),
             shipped=len(SHIPPED),
             surveys="\n".join(surveys),

@@ -19,7 +19,7 @@ from sources import check
 from surveys import SURVEYS
 
 from pdal_stages import Model, load_model
-from pdal_stages.reports.views import BACKGROUND, triptych, write_png
+from pdal_stages.reports.views import BACKGROUND, png, triptych
 
 #: Points per square meter that the surveys are thinned to.
 THINNED = (4.0, 1.0)
@@ -49,13 +49,15 @@ def place(model: Model, cloud: Cloud, random: np.random.Generator) -> tuple[str,
 
 def sheet(pictures: list[np.ndarray], gap: int = 16) -> np.ndarray:
     """Pictures in rows, left to right."""
-    tall, wide = (max(picture.shape[axis] for picture in pictures) + gap for axis in (0, 1))
-    rows = -(-len(pictures) // COLUMNS)
-    out = np.full((rows * tall, COLUMNS * wide, 3), BACKGROUND, np.uint8)
-    for number, picture in enumerate(pictures):
-        top, left = number // COLUMNS * tall, number % COLUMNS * wide
-        out[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
-    return out
+    wide = max(picture.shape[1] for picture in pictures) + gap
+    rows = []
+    for first in range(0, len(pictures), COLUMNS):
+        row = pictures[first : first + COLUMNS]
+        tall = max(picture.shape[0] for picture in row) + gap
+        rows.append(np.full((tall, COLUMNS * wide, 3), BACKGROUND, np.uint8))
+        for number, picture in enumerate(row):
+            rows[-1][: picture.shape[0], number * wide :][:, : picture.shape[1]] = picture
+    return np.concatenate(rows)
 
 
 def main() -> None:
@@ -79,7 +81,7 @@ def main() -> None:
             places.append(found)
     order = {name: number for number, name in enumerate(SURVEYS)}
     runs.sort(key=lambda run: order[run["cloud"].split(",")[0]])
-    write_png(args.picture, sheet([drawn for _, drawn in places]))
+    args.picture.write_bytes(png(sheet([drawn for _, drawn in places])))
     told = {"surveys": runs, "places": [words for words, _ in places]}
     args.json.write_text(json.dumps(told, indent=1) + "\n")
 
