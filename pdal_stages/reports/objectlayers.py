@@ -167,8 +167,10 @@ def check_target(path: str | Path, layers: Sequence[str] = LAYERS) -> None:
             found=str(path),
             cure=f"Give a name that ends in {', '.join(DRIVERS)}",
         )
-    if any("\ud800" <= one <= "\udfff" for one in str(path)):
-        raise StageError("GDAL takes names in UTF-8 alone", found=ascii(str(path)), cure="Give another name")
+    if any(one == "!" or "\ud800" <= one <= "\udfff" for one in str(Path(path).absolute())):
+        raise StageError(
+            "GDAL takes names in UTF-8, without '!'", found=ascii(str(path)), cure="Give another"
+        )
     vector("pyogrio")
     vector("shapely")
     for name in target_files(path, layers):

@@ -113,7 +113,7 @@ REPLACING = [
     ([*CLASSIFY, "\udce9.las"], "rename the file"),
     ([*CLASSIFY, ""], "the name of the output is empty"),
     (["review", "a.las", ""], "Give a name that ends in .gpkg"),
-    (["objects", "a.las", "\udce9.gpkg"], "UTF-8"),
+    *((["objects", "a.las", name], "UTF-8, without '!'") for name in ("\udce9.gpkg", "!b.gpkg")),
     ([*ACCURACY, "--json", "a\0b"], "has no name"),
 ]  # fmt: skip
 
