@@ -3,18 +3,21 @@
 python benchmarks/noise.py --data FOLDER
 python benchmarks/noise.py --data FOLDER --classify
 python benchmarks/noise.py --data FOLDER --terrain
+python benchmarks/noise.py --places
 
 Noise as the field knows it is put into each cloud: points and clusters of 2 to 30 within a meter, half of them 1 to 30 m
 below the ground (the lowest of what is labeled ground, and of all points, near by), half 3 to 300 m above the highest point
 near by. `good` are labeled points other than noise; speed is in points per CPU second of one thread. With --classify and
 --terrain, clusters of all sizes are put below the ground: what the shipped model then calls right of the labeled points, and
 how far off the ground filter's heights are, with noise marked first and without.
+With --places, generated land that holds no noise: how much of its ground is marked.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
+import sys
 import time
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -165,14 +168,71 @@ def terrain(folder: Path) -> None:
             print(f"| {name} | {cells} |", flush=True)
 
 
+def closed_wood(slope: float, density: float, seen: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """300 x 300 m of woods and meadows on a slope: coordinates, and which are ground in the woods, of whose points that is a
+    share `seen`."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 300, (2, int(90_000 * density)))
+    ground = slope * x + 2 * np.sin(x / 19 + seed) * np.cos(y / 23) + rng.normal(0, 0.04, len(x))
+    crowns = rng.uniform(12, 26, (50, 50))[(y / 6).astype(int), (x / 6).astype(int)]
+    wood = np.sin(x / 37 + seed) * np.cos(y / 31 + 2 * seed) > -0.3
+    bare = ~wood | (rng.random(len(x)) < seen)
+    share = np.where(rng.random(len(x)) < 0.85, rng.beta(5, 1.3, len(x)), rng.random(len(x)))
+    return np.column_stack([x, y, ground + np.where(bare, 0, crowns * share)]), bare & wood
+
+
+def steep_place(what: str, density: float, seed: int) -> np.ndarray:
+    """All ground: 200 x 200 m with a steep place."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-100, 100, (2, int(40_000 * density)))
+    z = 0.1 * x + rng.normal(0, 0.04, len(x))
+    if what == "cliff":
+        z += 40 * (y + 6 * np.sin(x / 15) > 0)
+    elif what == "overhang":  # the ground goes on 6 m under the edge, seen aslant
+        z += 25 * ((y > 0) & ((y > 6) | (rng.random(len(x)) < 0.9)))
+    elif what == "tunnel mouth":  # a cutting of 8 m that runs 5 m into the hill
+        inside = (abs(x) < 5) & (y < 5) & ((y < 0) | (rng.random(len(x)) < 0.15))
+        z += 12 * (y > 0) - np.where(inside, 8 + 12 * (y > 0), 0)
+    elif what == "quarry":
+        z -= 10 * np.ceil(np.clip(50 - np.hypot(x, y), 0, 29) / 10)
+    elif what == "gorge":
+        z -= 40 * (abs(x - 8 * np.sin(y / 20)) < 5)
+    return np.column_stack([x, y, z])
+
+
+def places() -> None:
+    """Print how much ground is marked as low noise in a closed wood, and of steep places."""
+    densities = (0.3, 0.5, 1.0, 2.0, 5.0)
+    print("| place | " + " | ".join(f"{d:g} points/m²" for d in densities) + " |")
+    print("|---|" + "---:|" * len(densities))
+    for slope in (0.0, 0.46, 0.8):
+        for seen in (0.01, 0.03, 0.1, 0.2):
+            shown = []
+            for density in densities:
+                woods = [closed_wood(slope, density, seen, seed) for seed in range(3)]
+                marked = [(detached_noise(xyz) == 7)[ground].mean() for xyz, ground in woods]
+                shown.append(f"{100 * np.mean(marked):.2f}")
+            print(f"| wood, slope {slope:g}, {seen:.0%} ground | {' | '.join(shown)} |", flush=True)
+    for what in ("cliff", "overhang", "tunnel mouth", "quarry", "gorge"):
+        marked = [
+            np.mean([(detached_noise(steep_place(what, d, seed)) == 7).mean() for seed in range(3)])
+            for d in densities
+        ]
+        print(f"| {what} | {' | '.join(f'{100 * share:.3f}' for share in marked)} |", flush=True)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, required="--places" not in sys.argv)
     parser.add_argument("--classify", action="store_true")
     parser.add_argument("--terrain", action="store_true")
+    parser.add_argument("--places", action="store_true")
     options = parser.parse_args()
     folder = options.data
+    if options.places:
+        places()
+        return
     if options.classify:
         classified(folder)
         return
