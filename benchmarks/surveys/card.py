@@ -1,9 +1,9 @@
 """The card of a shipped model: what it was trained on, how it does survey by survey, where it fails.
 
     python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE --rules RULES \\
-        --unseen UNSEEN > docs/models.md
+        --unseen UNSEEN --places PLACES > docs/models.md
 
-FILE is what leave_one_out.py wrote, RULES what rules.py wrote, UNSEEN what unseen.py wrote.
+FILE is what leave_one_out.py wrote, RULES what rules.py wrote, UNSEEN what unseen.py wrote, PLACES what places.py wrote.
 """
 
 from __future__ import annotations
@@ -32,33 +32,41 @@ def at(runs: list[dict[str, Any]], density: float | None) -> list[dict[str, Any]
     return [run for run in runs if run["cloud"] == run["cloud"].split(",")[0] + end]
 
 
-def by_landscape(runs: list[dict[str, Any]]) -> str:
-    """Precision and recall of each class, by landscape and density, as Markdown: all surveys weigh alike."""
-    heads = [f"{name} {kind}" for name in NAMES.values() for kind in ("precision", "recall")]
-    lines = [
-        f"| landscape | points/m2 | surveys | {' | '.join(heads)} |",
-        f"|---|---|---:|{'---:|' * len(heads)}",
-    ]
-    for landscape in sorted({survey.landscape for survey in SURVEYS.values()}):
-        for density in (None, *THINNED):
-            shares = [
-                np.array(run["matrix"]) / run["points"]
-                for run in at(runs, density)
-                if SURVEYS[run["cloud"].split(",")[0]].landscape == landscape
-            ]
-            if shares:
-                mean = np.mean(shares, axis=0)
-                right = np.diag(mean)
-                labeled = mean.sum(axis=1)
-                both = (_percent(right, np.where(labeled > 0, mean.sum(axis=axis), 0)) for axis in (0, 1))
-                cells = " | ".join(cell for pair in zip(*both, strict=True) for cell in pair)
-                where = "as flown" if density is None else f"{density:g}"
-                lines.append(f"| {landscape} | {where} | {len(shares)} | {cells} |")
-    return "\n".join(lines)
+def by_class(runs: list[dict[str, Any]]) -> str:
+    """A table for each class as Markdown: precision and recall by landscape and density, all surveys weighing alike."""
+    lines, where = [], ("as flown", *(f"{density:g}/m²" for density in THINNED))
+    for number, (code, name) in enumerate(NAMES.items()):
+        heads = [f"{density}: precision | recall" for density in where]
+        lines += [f"| **{name}** in | {' | '.join(heads)} |", f"|---|{'---:|' * 2 * len(heads)}"]
+        for landscape in dict.fromkeys(survey.landscape for survey in SURVEYS.values()):
+            cells, surveys = [], []
+            for density in (None, *THINNED):
+                shares = [
+                    np.array(run["matrix"]) / run["points"]
+                    for run in at(runs, density)
+                    if (survey := SURVEYS[run["cloud"].split(",")[0]]).landscape == landscape
+                    and survey.tells(code)
+                ]
+                surveys.append(str(len(shares)))
+                total = np.sum(shares, axis=0) if shares else np.zeros((len(NAMES), len(NAMES)))
+                right = total[number, number]
+                cells += [_percent(right, total[:, number].sum()), _percent(right, total[number].sum())]
+            lines.append(f"| {landscape} ({', '.join(surveys)}) | {' | '.join(cells)} |")
+        lines.append("")
+    return "\n".join(lines[:-1])
 
 
-def _percent(part: np.ndarray, whole: np.ndarray) -> list[str]:
-    return [f"{100 * a / b:.1f}" if b > 0 else "-" for a, b in zip(part, whole, strict=True)]
+def _percent(part: float, whole: float) -> str:
+    return f"{100 * part / whole:.1f}" if whole > 0 else "-"
+
+
+def seen(places: list[dict[str, Any]]) -> str:
+    """The places of the picture, a line each, as Markdown."""
+    return "\n".join(
+        f"{number}. {one['survey']} ({one['x']}, {one['y']}; {one['points']:,} points): {one['truth']} called "
+        f"{one['given']}. {one['seen']}"
+        for number, one in enumerate(places, 1)
+    )
 
 
 def means(runs: list[dict[str, Any]]) -> str:
@@ -79,6 +87,7 @@ def main() -> None:
     options.add_argument("--scores", type=Path, required=True)
     options.add_argument("--rules", type=Path, required=True)
     options.add_argument("--unseen", type=Path, required=True)
+    options.add_argument("--places", type=Path, required=True)
     args = options.parse_args()
     model, scores = load_model(args.model), json.loads(args.scores.read_text())
     unseen = json.loads(args.unseen.read_text())
@@ -113,9 +122,9 @@ def main() -> None:
             scores=tables(scores["surveys"], scores["isprs"]),
             read=f"At their own densities the mean is {np.mean(own):.1f}; the worst of all is {worst['cloud']}, "
             f"{worst['oa']:.1f}.",
-            places="; ".join(unseen["places"]),
+            places=seen(json.loads(args.places.read_text())),
             means=means(unseen["surveys"]),
-            landscapes=by_landscape(unseen["surveys"]),
+            classes=by_class(unseen["surveys"]),
             unseen=tables(unseen["surveys"], []).replace("survey left out", "survey"),
             others=len(at(unseen["surveys"], None)),
             shipped=len(SHIPPED),
