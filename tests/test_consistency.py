@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from itertools import product
 
 import laspy
@@ -63,12 +63,14 @@ def slow(xyz, codes, height, ground, rules=RULES):
         if rule not in rules:
             continue
         new = kind.copy()
-        stands = {tuple(at) for at in cell[(kind == "b") & (ground == 0) & (height > 2)][:, :2]}
+        built, up = kind == "b", ground == 0
+        low, tall = built & ~up & (height < 0.3), built & up & (height > 2)
+        more = Counter(map(tuple, cell[low, :2]))
+        more.subtract(map(tuple, cell[tall, :2]))
         for p in range(len(xyz)):
-            if rule == "ground" and kind[p] == "b" and ground[p] and height[p] < 0.3:
-                i, j = cell[p, :2]
-                if not any((i + a, j + b) in stands for a in range(-2, 3) for b in range(-2, 3)):
-                    new[p] = "g"
+            if rule == "ground" and low[p]:
+                near_by = sum(more[tuple(cell[p, :2] + d)] for d in product(range(-2, 3), repeat=2))
+                new[p] = "g" if near_by > 0 else "b"
             if rule == "islands" and kind[p] == "g" and not ground[p] and height[p] > 2:
                 around = kind[near(p)]
                 v, b = (around == "v").sum(), (around == "b").sum()
@@ -165,13 +167,10 @@ def test_the_stage_counts_by_rule_and_says_what_it_lacks():
     stage = Consistency({"lone": False})
     points = stage.points(arrays)
     codes = stage.run(points)["Classification"]
-    assert (
-        points.report.figures["ground"] > 100
-        and points.report.figures["islands"] > 10
-        and "lone" not in points.report.figures
-    )
-    assert points.report.figures["changed"] == (codes != arrays["Classification"]).sum()
-    assert points.report.figures["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
+    figures = points.report.figures
+    assert figures["ground"] > 100 and figures["islands"] > 10 and "lone" not in figures
+    assert figures["changed"] == (codes != arrays["Classification"]).sum()
+    assert figures["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
     assert (codes != truth).sum() < (arrays["Classification"] != truth).sum()
     bare = Consistency({}).points({k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")})
     Consistency({}).run(bare)
@@ -190,9 +189,8 @@ def test_overlap_noise_and_where_keep_their_class():
 
 def test_what_becomes_vegetation_has_the_class_of_its_height():
     arrays, _ = arrays_of()
-    arrays["HeightAboveGround"] = np.where(
-        arrays["Z"] < 5, arrays["Z"] / 8, arrays["Z"]
-    )  # leaves below 0.5 m as well
+    # Leaves below 0.5 m as well.
+    arrays["HeightAboveGround"] = np.where(arrays["Z"] < 5, arrays["Z"] / 8, arrays["Z"])
     plain = Consistency({})
     high = plain.run(plain.points(arrays))["Classification"]
     stage = Consistency({"vegetation_heights": "0.5,2"})

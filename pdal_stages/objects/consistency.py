@@ -60,9 +60,9 @@ def consistent(
     mask, change : (n,) bool, optional
         Points that are neighbors, and of these, those that may be changed; by default all.
     rules : sequence of str
-        Some of :data:`RULES`: ``ground``: a building that the filter calls ground, below 0.3 m and away from all
-        that stands, is ground. ``islands``: ground more than 2 m above the terrain is what its neighbors are.
-        ``lone``: one point against all its neighbors is of their class.
+        Some of :data:`RULES`: ``ground``: a building that the filter calls ground, below 0.3 m, is ground where within
+        two columns more is so than stands above 2 m. ``islands``: ground more than 2 m above the terrain is what its
+        neighbors are. ``lone``: one point against all its neighbors is of their class.
     vegetation_heights : pair of float, optional
         Below these heights, meters, what becomes vegetation is low (3) and medium (4), above high (5); needs `height`.
         Without them it is what most vegetation in the voxels around is, high where there is none.
@@ -144,14 +144,17 @@ class _Voxels:
         if self.height is None or self.flat is None:
             return _NONE, _GROUND
         built = self.kind == _BUILDING
-        wrong = np.flatnonzero(built & self.flat & (self.height < LOW))
-        # Feet of walls are labeled building as often as ground, so only what is away from all buildings is changed.
-        stands = built & ~self.flat & (self.height > HIGH)
-        column = self.keys // self.strides[1]
-        step = self.strides[0] // self.strides[1]
-        steps = np.array([i * step + j for i, j in product(range(-2, 3), repeat=2)])
-        near = np.unique(column[self.voxel[stands]])[:, None] + steps
-        return wrong[~np.isin(column[self.voxel[wrong]], near)], _GROUND
+        low, stands = built & self.flat & (self.height < LOW), built & ~self.flat & (self.height > HIGH)
+        # Feet of walls are labeled building as often as ground, so it is changed where more is low than stands.
+        column, at = np.unique((self.keys // self.strides[1])[self.voxel], return_inverse=True)
+        more = np.append(np.bincount(at, 1.0 * low - stands, len(column)), 0.0)  # the last is of no column
+        own, of = np.unique(at[low], return_inverse=True)
+        total = np.zeros(len(own))
+        for i, j in product(range(-2, 3), repeat=2):
+            wanted = column[own] + i * (self.strides[0] // self.strides[1]) + j
+            there = np.minimum(np.searchsorted(column, wanted), len(column) - 1)
+            total += more[np.where(column[there] == wanted, there, -1)]
+        return np.flatnonzero(low)[total[of] > 0], _GROUND
 
     def islands(self) -> tuple[NDArray, Any]:
         if self.height is None or self.flat is None:

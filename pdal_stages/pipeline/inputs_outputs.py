@@ -243,9 +243,8 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
     try:
         count, (x0, y0, x1, y1) = _extent(str(reader["filename"]))
-        units = units_of_wkt(
-            wkt, horizontal=horizontal, place=((x0 + x1) / 2, (y0 + y1) / 2) if count else None
-        )
+        middle = ((x0 + x1) / 2, (y0 + y1) / 2) if count else None
+        units = units_of_wkt(wkt, horizontal=horizontal, place=middle)
         if units.assumed:
             refuse_likely_degrees(count, x0, y0, x1, y1)
     except StageError as error:

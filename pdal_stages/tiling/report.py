@@ -154,9 +154,8 @@ def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> 
                 found[text] += n
             elif n == len(lines):  # that there is nothing to do in some tiles is as it should be
                 found[text] = max(found[text], n)
-    for text in [
-        text for text in found if text.partition(": ")[2] in found
-    ]:  # one stage's, and several stages'
+    # What one stage says and several say, too.
+    for text in [text for text in found if text.partition(": ")[2] in found]:
         del found[text]
     told = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in found.most_common(_MOST_MESSAGES)]
     if len(found) > _MOST_MESSAGES:

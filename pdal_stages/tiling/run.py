@@ -227,9 +227,8 @@ class _Run:
                 continue
             name = fingerprint(source.path, survey.stamps[source.path], survey.grid.size)
             copy = store.path(name, ".points")
-            with contextlib.suppress(
-                ValueError, TypeError, KeyError, OverflowError
-            ):  # nothing noted, or damaged
+            # Where nothing was noted, or that is damaged, it is read again.
+            with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
                 index = CloudIndex.of(store.note(name), copy)
                 if os.path.exists(copy) or source.path not in (needed or ()):
                     survey.indexes[source.path] = index
