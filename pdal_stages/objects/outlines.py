@@ -238,5 +238,5 @@ def crown_outlines(raw: list[Any]) -> list[Any]:
     if not raw:
         return []
     fine = [shapely.segmentize(shape, 1.0) for shape in raw]
-    made = shapely.coverage_simplify(fine, 3.0)
+    made = shapely.coverage_simplify(fine, 1.5)
     return [m if m.is_valid and not m.is_empty else r for m, r in zip(made, raw, strict=True)]
