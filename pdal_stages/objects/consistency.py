@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.las import NOISE, by_height
+from ..terrain.cells import places_among
 
 #: Rules in the order in which they are applied, and how many voxels to each side they look.
 RULES = {"ground": 2, "islands": 1, "lone": 1}
@@ -125,12 +126,10 @@ class _Voxels:
     def around(self, points: NDArray, kind: NDArray) -> NDArray[np.int64]:
         """Points of each kind in the cubes of voxels around those of these points, (points, 4)."""
         voxels, at = np.unique(self.voxel[points], return_inverse=True)
-        counts = np.vstack([self.counts(kind), np.zeros(4, np.int64)])  # the last is for no voxel
-        total = np.zeros((len(voxels), 4), np.int64)
+        counts, total = self.counts(kind), np.zeros((len(voxels), 4), np.int64)
         for step in product((-1, 0, 1), repeat=3):
-            wanted = self.keys[voxels] + np.dot(step, self.strides)
-            there = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
-            total += counts[np.where(self.keys[there] == wanted, there, -1)]
+            place, there = places_among(self.keys, self.keys[voxels] + np.dot(step, self.strides))
+            total += counts[place] * there[:, None]
         return total[at]
 
     def vegetation_near(self, points: NDArray, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -147,13 +146,13 @@ class _Voxels:
         low, stands = built & self.flat & (self.height < LOW), built & ~self.flat & (self.height > HIGH)
         # Feet of walls are labeled building as often as ground, so it is changed where more is low than stands.
         column, at = np.unique((self.keys // self.strides[1])[self.voxel], return_inverse=True)
-        more = np.append(np.bincount(at, 1.0 * low - stands, len(column)), 0.0)  # the last is of no column
+        more = np.bincount(at, 1.0 * low - stands)
         own, of = np.unique(at[low], return_inverse=True)
         total = np.zeros(len(own))
         for i, j in product(range(-2, 3), repeat=2):
-            wanted = column[own] + i * (self.strides[0] // self.strides[1]) + j
-            there = np.minimum(np.searchsorted(column, wanted), len(column) - 1)
-            total += more[np.where(column[there] == wanted, there, -1)]
+            step = i * (self.strides[0] // self.strides[1]) + j
+            place, there = places_among(column, column[own] + step)
+            total += more[place] * there
         return np.flatnonzero(low)[total[of] > 0], _GROUND
 
     def islands(self) -> tuple[NDArray, Any]:
