@@ -177,7 +177,6 @@ class Compiling:
 def kept_kernels() -> int:
     """How many kernels there is compiled code of, of whatever version, without asking numba."""
     named = os.environ.get("NUMBA_CACHE_DIR")
-    folders = (
-        [Path(named)] if named else [Path(__file__).resolve().parents[1], Path.home() / ".cache" / "numba"]
-    )
+    usual = [Path(__file__).resolve().parents[1], Path.home() / ".cache" / "numba"]
+    folders = [Path(named)] if named else usual
     return sum(1 for folder in folders for _ in folder.rglob("*.nbi"))

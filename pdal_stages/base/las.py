@@ -266,9 +266,7 @@ def number_type(kind: str) -> np.dtype:
 def class_name(code: int) -> str:
     """The class's name: ASPRS's own, ``Reserved`` up to 63, ``User defined`` up to 255."""
     code = int(code)
-    if code in NAMES:
-        return NAMES[code]
-    return f"Reserved {code}" if code < 64 else f"User class {code}"
+    return NAMES.get(code, f"Reserved {code}" if code < 64 else f"User class {code}")
 
 
 def class_color(code: int) -> tuple[int, int, int]:

@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None:
         # Those threads spin while they wait, for next to nothing.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        gc.set_threshold(100_000)  # imports alone make more objects than Python looks through, over and over
+        gc.set_threshold(300_000)  # imports alone make more objects than Python looks through, over and over
         atexit.register(gc.freeze)  # nor need it look for what to free when the process ends
     streams = sys.stdout, sys.stderr
     for stream in streams:  # a locale that lacks a character shows its code, rather than ending the run

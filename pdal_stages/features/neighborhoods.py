@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 from ..base.errors import OptionError, suggest
 
@@ -71,7 +72,7 @@ class Neighborhood:
             return self.kind
         return f"{self.kind}({','.join(values)})"
 
-    @property
+    @cached_property
     def suffix(self) -> str:
         """The token made safe for a dimension name: ``c2_5``, ``kopt``, ``kopt10_50``."""
         return self.token.replace("(", "").replace(")", "").replace(",", "_").replace(".", "_")

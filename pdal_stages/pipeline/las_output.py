@@ -200,9 +200,8 @@ def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]
 def compress(partials: Iterable[Path]) -> dict[str, str]:
     """Compress what was left uncompressed; the names that files had -> those that they have now."""
     names: dict[str, str] = {}
-    for made in [
-        one for folder in {p.parent for p in partials} for one in sorted(folder.glob(f"*{UNCOMPRESSED}"))
-    ]:
+    folders = {partial.parent for partial in partials}
+    for made in [one for folder in folders for one in sorted(folder.glob(f"*{UNCOMPRESSED}"))]:
         target = made.with_name(made.name.removesuffix(UNCOMPRESSED))
         import laspy  # which takes a moment
 

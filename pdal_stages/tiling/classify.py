@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from ..base import las
 from ..base.errors import OptionError, StageError
 from ..base.files import JSON, Output, check_outputs, write_whole
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
-from .inputs import ept_form, read_ept
-from .plan import plan_of_files
 from .report import Job, TiledRun
-from .run import run_plan
 from .settings import TilingOptions, fits_whole
 
 
@@ -85,9 +81,8 @@ class ClassifyTask:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise StageError(
-                    "the output folder cannot be made", found=f"{folder}: {error.strerror}"
-                ) from None
+                found = f"{folder}: {error.strerror}"
+                raise StageError("the output folder cannot be made", found=found) from None
 
     @property
     def _beside(self) -> list[Output]:
@@ -111,6 +106,10 @@ class ClassifyTask:
 
     def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
         """Classify all inputs in tiles; `finished` hears of every output that was written."""
+        from .inputs import one_format
+        from .plan import plan_of_files
+        from .run import run_plan
+
         if odd := [name for name in self.files if not is_las(name) and not is_ept(name)]:
             raise OptionError(
                 "several inputs, and the options of tiles, are for LAS, LAZ, COPC and EPT: others cannot be cut into tiles",
@@ -144,37 +143,3 @@ class ClassifyTask:
             self._make_folders()
         check_outputs(self._beside, self.files)
         return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)
-
-
-def one_format(paths: Sequence[str]) -> dict[str, Any]:
-    """Options of ``writers.las`` that hold what each of some inputs holds; none where these are alike LAS files.
-
-    The finest scale along each axis with its offset, and of the formats from LAS 1.4 the first that has all colors there
-    are: PDAL forwards only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest.
-    What cannot be read is said when it is.
-    """
-    formats: set[int] = set()
-    places: set[tuple[float, ...]] = set()
-    for path in paths:
-        try:
-            if is_ept(path):
-                form = ept_form(read_ept(path))
-                formats.add(form["dataformat_id"])
-                places.add(tuple(form[f"{what}_{axis}"] for what in ("scale", "offset") for axis in "xyz"))
-            elif is_las(path) and (header := las.read_header(path)) and header.count:
-                formats.add(header.point_format)
-                places.add((*header.scales, *header.offsets))
-        except (OSError, StageError, ValueError, TypeError):
-            continue
-    options: dict[str, Any] = {}
-    if len(formats) > 1 or any(map(is_ept, paths)):
-        colored = 8 if 8 in formats else 7 if formats & {2, 3, 7} else 6
-        options = {"minor_version": 4, "dataformat_id": colored}
-    for axis, name in enumerate("xyz"):
-        along = {(place[axis], place[3 + axis]) for place in places}
-        if len(along) > 1:
-            scale, offset = min(along, key=lambda one: (one[0], -abs(one[1])))
-            # Of newer PDAL "auto" is the tile's middle, off the grid of the coordinates: only for what lies too far apart.
-            far = any(abs(one - offset) > 2**30 * scale for _, one in along)
-            options |= {f"scale_{name}": scale, f"offset_{name}": "auto" if far else offset}
-    return options

@@ -7,7 +7,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from ..base.checks import strict_json
 from ..base.errors import OptionError, PipelineError, StageError
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import Reference, check_one_reference, locations, reference_of
+from ..pipeline.inputs_outputs import Reference, check_one_reference, is_ept, is_las, locations, reference_of
 from ..pipeline.read import LAS_READERS, named_files
 from .plan import TilePlan, outputs_for
 from .settings import (
@@ -357,3 +357,37 @@ def stamp(path: str | os.PathLike) -> list[Any]:
     except OSError:
         return [-1, -1, ""]  # not there, or not a file
     return [status.st_size, status.st_mtime_ns, digest.hexdigest()[:16]]
+
+
+def one_format(paths: Sequence[str]) -> dict[str, Any]:
+    """Options of ``writers.las`` that hold what each of some inputs holds; none where these are alike LAS files.
+
+    The finest scale along each axis with its offset, and of the formats from LAS 1.4 the first that has all colors there
+    are: PDAL forwards only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest.
+    What cannot be read is said when it is.
+    """
+    formats: set[int] = set()
+    places: set[tuple[float, ...]] = set()
+    for path in paths:
+        try:
+            if is_ept(path):
+                form = ept_form(read_ept(path))
+                formats.add(form["dataformat_id"])
+                places.add(tuple(form[f"{what}_{axis}"] for what in ("scale", "offset") for axis in "xyz"))
+            elif is_las(path) and (header := las.read_header(path)) and header.count:
+                formats.add(header.point_format)
+                places.add((*header.scales, *header.offsets))
+        except (OSError, StageError, ValueError, TypeError):
+            continue
+    options: dict[str, Any] = {}
+    if len(formats) > 1 or any(map(is_ept, paths)):
+        colored = 8 if 8 in formats else 7 if formats & {2, 3, 7} else 6
+        options = {"minor_version": 4, "dataformat_id": colored}
+    for axis, name in enumerate("xyz"):
+        along = {(place[axis], place[3 + axis]) for place in places}
+        if len(along) > 1:
+            scale, offset = min(along, key=lambda one: (one[0], -abs(one[1])))
+            # Of newer PDAL "auto" is the tile's middle, off the grid of the coordinates: only for what lies too far apart.
+            far = any(abs(one - offset) > 2**30 * scale for _, one in along)
+            options |= {f"scale_{name}": scale, f"offset_{name}": "auto" if far else offset}
+    return options

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..base.version import __version__
 from ..pipeline.run import LEFT_ALONE
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
-from .inputs import InputSource
+
+if TYPE_CHECKING:
+    from .inputs import InputSource
 
 #: Most different warnings of tiles that a run repeats.
 _MOST_MESSAGES = 20
