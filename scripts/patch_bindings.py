@@ -35,15 +35,50 @@ def numpy_2(bindings: Path, plugins: Path) -> None:
     substitute(plugins / "pdal/plang/Invocation.cpp", r"\bdtype->elsize\b", "PyDataType_ELSIZE(dtype)", 2)
 
 
-def one_program(bindings: Path, program: str) -> None:
-    """Let ``import pdal`` of python-pdal 3.1 ask the PDAL it was compiled for, whatever PATH says, and once.
+#: In the place of `class Stage` and of the names of stages that PDAL has.
+_TYPES = """\
+class _Types(type):
+    # PDAL's own stages as attributes (Reader.las), asked for when the first of them is named
+    def __getattr__(cls, name):
+        if name.startswith("_") or "StreamableTypes" in vars(drivers):
+            raise AttributeError(f"type object {cls.__name__!r} has no attribute {name!r}")
+        drivers.inject_pdal_drivers()
+        return getattr(cls, name)
 
-    It learns the drivers by running ``pdal --drivers`` and ``pdal --options``, the second one twice.
+    def __dir__(cls):
+        drivers.StreamableTypes
+        return super().__dir__()
+
+
+class Stage(metaclass=_Types):
+"""
+_STREAMABLE = """\
+
+
+def __getattr__(name: str) -> FrozenSet:
+    if name != "StreamableTypes":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    inject_pdal_drivers()
+    return StreamableTypes
+
+
+def inject_pdal_drivers() -> None:
+"""
+
+
+def one_program(bindings: Path, program: str) -> None:
+    """Let python-pdal 3.1 ask the PDAL it was compiled for, whatever PATH says, once, and only for what needs it.
+
+    It learns the drivers by running ``pdal --drivers`` and ``pdal --options``, the second one twice, whenever it is
+    imported: a tenth of a second, and pipelines given as JSON need none of it.
     """
     drivers = bindings / "pdal/drivers.py"
     second = r"^    command = 'pdal --options all --showjson'\n(?:.*\n)*?    options = dict\(.*\)\n"
     substitute(drivers, second, "", 1)
     substitute(drivers, r'\["pdal", ', f"[{program!r}, ".replace("\\", r"\\"), 2)
+    substitute(drivers, r"\n\ndef inject_pdal_drivers\(\) -> None:\n", _STREAMABLE, 1)
+    substitute(bindings / "pdal/__init__.py", r"^inject_pdal_drivers\(\)\n", "", 1)
+    substitute(bindings / "pdal/pipeline.py", r"^class Stage:\n", _TYPES, 1)
 
 
 def plugin_folder(bindings: Path, source: str, folder: str) -> None:

@@ -123,7 +123,7 @@ def _classify(options: argparse.Namespace) -> int:
         return 0
     end_at_once(options)
     if options.is_program:  # laspy loads them, half of its import, for what it is not asked here
-        sys.modules.update(dict.fromkeys({"requests", "pyproj"} - sys.modules.keys()))
+        sys.modules.update(dict.fromkeys({"requests", "pyproj"} - sys.modules.keys()))  # type: ignore[arg-type]
     written = task.run_whole()
     print_messages(*written.messages)
     print(f"{counted(written.points, 'point')} written to {written.path}")
