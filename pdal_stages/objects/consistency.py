@@ -113,9 +113,8 @@ class _Voxels:
             self.strides[axis] = room
             room *= int(number.max() - low) + 3
             if room > 2**62:
-                raise StageError(
-                    "points lie too far apart for a grid of voxels", cure="Drop stray points first"
-                )
+                cure = "Drop stray points first"
+                raise StageError("points lie too far apart for a grid of voxels", cure=cure)
             key += (number - low).astype(np.int64) * self.strides[axis]
         self.keys, self.voxel = np.unique(key, return_inverse=True)
 
@@ -126,10 +125,12 @@ class _Voxels:
     def around(self, points: NDArray, kind: NDArray) -> NDArray[np.int64]:
         """Points of each kind in the cubes of voxels around those of these points, (points, 4)."""
         voxels, at = np.unique(self.voxel[points], return_inverse=True)
-        counts, total = self.counts(kind), np.zeros((len(voxels), 4), np.int64)
-        for step in product((-1, 0, 1), repeat=3):
-            place, there = places_among(self.keys, self.keys[voxels] + np.dot(step, self.strides))
-            total += counts[place] * there[:, None]
+        before = np.insert(self.counts(kind).cumsum(axis=0), 0, 0, axis=0)
+        total = np.zeros((len(voxels), 4), np.int64)
+        for step in product((-1, 0, 1), repeat=2):  # the three of a column follow each other
+            middle = self.keys[voxels] + np.dot(step, self.strides[:2])
+            total += before[np.searchsorted(self.keys, middle + 1, "right")]
+            total -= before[np.searchsorted(self.keys, middle - 1)]
         return total[at]
 
     def vegetation_near(self, points: NDArray, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -166,9 +167,8 @@ class _Voxels:
     def lone(self) -> tuple[NDArray, Any]:
         # Ground under leaves, and leaves above ground, are alone and right.
         counts = self.counts(self.kind)
-        alone = np.flatnonzero(
-            np.isin(self.kind, (_VEGETATION, _BUILDING)) & (counts[self.voxel, self.kind] == 1)
-        )
+        judged = np.isin(self.kind, (_VEGETATION, _BUILDING))
+        alone = np.flatnonzero(judged & (counts[self.voxel, self.kind] == 1))
         own = self.kind[alone]
         around, other = self.around(alone, self.kind), _VEGETATION + _BUILDING - own
         row, total = np.arange(len(alone)), around.sum(axis=1)
