@@ -279,7 +279,7 @@ def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground():
     """All windows round it reach below the scarp, as there is nothing uphill to center others on."""
     x, y, z, ground = forest_on_a_slope(0.46, 0.5, 12.0)
     found = filtered_ground(x, y, z)
-    assert (found["Ground"][ground] == 0).mean() < 0.003
+    assert (found["Ground"][ground] == 0).mean() < 0.006
     assert np.abs(found["HeightAboveGround"][ground]).max() < 2  # no treetops stand for it
 
 

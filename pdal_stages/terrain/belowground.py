@@ -1,8 +1,8 @@
 """What lies below the ground, as echoes from below do: by a plane under its surroundings.
 
 A low place lies below the plane by more than its surroundings scatter about it. It is ground after all where ground as deep
-is near, as a street is to a courtyard; and under a closed canopy, where hardly a column is
-level with others, if it is not below the plane under the low places there: single points reach the ground.
+is near, as a street is to a courtyard; and under a closed canopy, where few columns are level with others, if it is not
+below the plane under the lowest points of wide blocks around: single points reach the ground, in the wood or beside it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ SCATTERS = 4.0
 FAR, COMPANY, ROOM = 30.0, 4, 0.05
 #: A column of ground has so many others of its level, in meters, in the 5 x 5 round it, and such a share of those.
 SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
-#: A canopy is closed where at most such a share of the columns within so many around is level with others; low places there
-#: are compared within so many meters, but for the nearest, which may be of the same cluster.
-CLOSED, AROUND, OTHERS, APART = 1 / 3, 20, 45.0, 12.0
+#: A canopy is closed where at most such a share of the columns near is level with others; the blocks with which low places
+#: there are compared, along either axis, within so many meters.
+CLOSED, BLOCKS, OTHERS = 0.4, 9, 45.0
 #: Cells of a minimum grid are linked within so many cells, across a step of so many meters, and so many per meter of
 #: distance; an island has at most so many, or such a share of them lies under others, so many meters above at least, or
 #: beside such a cell; and it is no longer, in cells, along either axis.
@@ -35,46 +35,51 @@ LINK, STEP, GRADE, MOST, COVERED, ABOVE, EXTENT = 3, 0.35, 0.15, 30, 0.8, 2.5, 2
 
 def reach(side: float) -> int:
     """How far away columns of a `side` in meters change what lies below the ground, in columns."""
-    return math.ceil(max(OTHERS / side, AROUND) + max(FAR / side + 2, NEAR))
+    return math.ceil(max(OTHERS / side, NEAR) + max(FAR / side + 2, NEAR))
 
 
 @device(_nrt=True, fastmath=set(FAST))
-def _plane_under(base, j, i, radius, inner=0):
-    """Plane (height at the column, per column across, along; scatter below it) under the columns round one, between two
-    radii, and how many these are."""
-    h, w = base.shape
-    size = min(2 * radius + 1, h) * min(2 * radius + 1, w)
-    u, v, zs = np.empty(size), np.empty(size), np.empty(size)
-    n = 0
-    for b in range(max(j - radius, 0), min(j + radius + 1, h)):
-        for a in range(max(i - radius, 0), min(i + radius + 1, w)):
-            if inner * inner < (b - j) ** 2 + (a - i) ** 2 <= radius * radius and base[b, a] < np.inf:
-                u[n], v[n], zs[n] = a - i, b - j, base[b, a]
-                n += 1
+def _plane_under(low, j, i, radius, blocks, inner=-1):
+    """Plane (height at the column, per column across, along; scatter below it) under the lowest columns of the blocks round
+    one, and how many these are: so many along either axis, but for the inner ones."""
+    h, w = low.shape
+    u, v, zs = np.empty((3, blocks * blocks))
+    zs[:] = np.inf
+    side, middle, n = 2 * radius + 1, blocks // 2, 0
+    for b in range(max(-radius, -j), min(radius + 1, h - j)):
+        for a in range(max(-radius, -i), min(radius + 1, w - i)):
+            k = (b + radius) * blocks // side * blocks + (a + radius) * blocks // side
+            if low[j + b, i + a] < zs[k]:
+                u[k], v[k], zs[k] = a, b, low[j + b, i + a]
+    for k in range(blocks * blocks):
+        away = (k // blocks - middle) ** 2 + (k % blocks - middle) ** 2
+        if inner < away <= middle * middle and zs[k] < np.inf:
+            u[n], v[n], zs[n] = u[k], v[k], zs[k]
+            n += 1
     if n < ENOUGH:
         return n, 0.0, 0.0, 0.0, 0.0
-    weight = np.sort(zs[:n])
-    lowest, least, most = weight[0], weight[n // 10], weight[n // 2]
-    for k in range(n):
-        weight[k] = 1.0 if least <= zs[k] <= most else 0.01
-    p0, p1, p2, scatter = 0.0, 0.0, 0.0, 0.0
-    for _turn in range(8):
+    lowest = zs[:n].min()
+    zs = zs[:n] - lowest
+    weight = np.ones(n)
+    p0 = p1 = p2 = scatter = 0.0
+    for turn in range(inner < 0, 9):  # of wide blocks what is low is so from their mean plane
+        if turn == 1:
+            above = zs - p0 - p1 * u[:n] - p2 * v[:n]
+            order = np.sort(above)
+            weight = np.where((above >= order[n // 10]) & (above <= order[n // 2]), 1.0, 0.01)
         s0 = s1 = s2 = s11 = s12 = s22 = t0 = t1 = t2 = 0.0
         for k in range(n):
             g = weight[k]
-            z = zs[k] - lowest
             s0 += g
             s1 += g * u[k]
             s2 += g * v[k]
             s11 += g * u[k] * u[k]
             s12 += g * u[k] * v[k]
             s22 += g * v[k] * v[k]
-            t0 += g * z
-            t1 += g * u[k] * z
-            t2 += g * v[k] * z
-        ridge = 1e-3 * s0
-        s11 += ridge
-        s22 += ridge
+            t0 += g * zs[k]
+            t1 += g * u[k] * zs[k]
+            t2 += g * v[k] * zs[k]
+        s11, s22 = s11 + 1e-3 * s0, s22 + 1e-3 * s0
         # Cramer's rule.
         c0 = s11 * s22 - s12 * s12
         c1 = s12 * s2 - s1 * s22
@@ -85,7 +90,7 @@ def _plane_under(base, j, i, radius, inner=0):
         p2 = (t0 * c2 + t1 * (s1 * s2 - s0 * s12) + t2 * (s0 * s11 - s1 * s1)) / det
         below, number = 0.0, 0.0
         for k in range(n):
-            off = zs[k] - lowest - p0 - p1 * u[k] - p2 * v[k]
+            off = zs[k] - p0 - p1 * u[k] - p2 * v[k]
             g = 1.0 / (1.0 + off * off)
             weight[k] = g * g if off < 0.0 else 0.1 * g
             g = weight[k] if off < 0.0 else 0.0
@@ -132,7 +137,7 @@ def _limits(low, base, supported, side, depth, limit):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:
                 continue
-            n, height, across, along, scatter = _plane_under(base, j, i, NEAR)
+            n, height, across, along, scatter = _plane_under(base, j, i, NEAR, 2 * NEAR + 1)
             lowest = height - depth - SCATTERS * scatter
             if n >= ENOUGH and low[j, i] < lowest:  # noqa: SIM102
                 if not _has_company(base, supported, side, j, i, low[j, i], height, across, along):
@@ -140,14 +145,13 @@ def _limits(low, base, supported, side, depth, limit):
 
 
 @njit
-def _below_others(low, asked, side, depth, out):
-    """Take from `out` the places asked for that are not below the plane under the low places."""
-    radius = int(OTHERS / side)
-    for j in range(low.shape[0]):
-        for i in range(low.shape[1]):
-            if asked[j, i]:
-                n, height, _, _, scatter = _plane_under(low, j, i, radius, int(APART / side))
-                out[j, i] = n < ENOUGH or low[j, i] < height - depth - SCATTERS * scatter
+def _take_level(every, rows, columns, side, depth, limit):
+    """Take the limits of places under a closed canopy that are not below the plane under the lowest of blocks."""
+    radius = max(int(OTHERS / side), BLOCKS // 2)
+    for j, i in zip(rows, columns):  # noqa: B905 - Numba's has no strict
+        n, height, _, _, scatter = _plane_under(every, j, i, radius, BLOCKS, 1)
+        if n >= ENOUGH and every[j, i] >= height - depth - SCATTERS * scatter:
+            limit[j, i] = -np.inf
 
 
 def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -> NDArray[np.float64]:
@@ -161,13 +165,10 @@ def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -
     _limits(low, base, supported, side, depth, limit)
     deep = limit > -np.inf
     if deep.any():
-        rest = np.where(deep, np.inf, np.minimum(low, base))
-        filled = sums_around(deep | np.isfinite(rest), AROUND)
-        _supported(rest, supported)
-        closed = deep & (sums_around(supported, AROUND) <= CLOSED * filled)
-        below = deep.copy()
-        _below_others(np.where(deep, low, np.inf), closed, side, depth, below)
-        limit[~below] = -np.inf
+        every = np.minimum(low, base)
+        _supported(np.where(deep, np.inf, every), supported)
+        closed = deep & (sums_around(supported, NEAR) <= CLOSED * sums_around(every < np.inf, NEAR))
+        _take_level(every, *np.nonzero(closed), side, depth, limit)
     return limit
 
 

@@ -26,7 +26,7 @@ from ..base.arrays import begins_run
 from ..base.errors import StageError
 from ..base.jit import device, njit
 from ..base.las import NOISE
-from .belowground import AROUND, ENOUGH, below_ground
+from .belowground import ENOUGH, below_ground
 from .belowground import reach as below_reach
 from .cells import HIGHEST, cell_numbers, columns, longest_sides, number_sets, patches, sums_around
 
@@ -57,7 +57,7 @@ FAR = 20
 #: by side, as over pylons.
 STRUNG, STRUNG_SHARE = 4, 0.3
 #: More than such a share of the points and of the columns within so many around, so many columns at least, is no noise.
-TOO_MANY, COLUMNS = 0.025, 6
+TOO_MANY, COLUMNS, AROUND = 0.025, 6, 20
 #: Low noise of any size has others above it in such a share of its voxels.
 COVERED = 0.8
 #: How far away, in meters, points can change what a point is: the halo a tile needs.
