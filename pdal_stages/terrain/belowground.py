@@ -57,7 +57,7 @@ def _plane_under(low, j, i, radius, blocks, inner=-1):
             u[n], v[n], zs[n] = u[k], v[k], zs[k]
             n += 1
     if n < ENOUGH:
-        return n, 0.0, 0.0, 0.0, 0.0
+        return n, -np.inf, 0.0, 0.0, 0.0
     lowest = zs[:n].min()
     zs = zs[:n] - lowest
     weight = np.ones(n)
@@ -137,11 +137,10 @@ def _limits(low, base, supported, side, depth, limit):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:
                 continue
-            n, height, across, along, scatter = _plane_under(base, j, i, NEAR, 2 * NEAR + 1)
-            lowest = height - depth - SCATTERS * scatter
-            if n >= ENOUGH and low[j, i] < lowest:  # noqa: SIM102
-                if not _has_company(base, supported, side, j, i, low[j, i], height, across, along):
-                    limit[j, i] = lowest
+            plane = _plane_under(base, j, i, NEAR, 2 * NEAR + 1)
+            lowest = plane[1] - depth - SCATTERS * plane[4]
+            if low[j, i] < lowest and not _has_company(base, supported, side, j, i, low[j, i], *plane[1:4]):
+                limit[j, i] = lowest
 
 
 @njit
