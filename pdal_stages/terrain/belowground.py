@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.jit import FAST, device, njit
 from .cells import HOLE, linked_cells, sums_around
+from .openings import highest_around
 
 #: Columns within which a plane is fitted through the ground; how many it needs.
 NEAR, ENOUGH = 9, 12
@@ -161,7 +162,9 @@ def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -
     """
     limit, supported = np.full(low.shape, -np.inf), np.zeros(low.shape, bool)
     _supported(base, supported)
-    _limits(low, base, supported, side, depth, limit)
+    # Where all around lies lower, no plane through it runs above.
+    highest = highest_around(np.where(np.isfinite(base), base, -np.inf), NEAR, 0)
+    _limits(np.where(low < highest, low, np.inf), base, supported, side, depth, limit)
     deep = limit > -np.inf
     if deep.any():
         every = np.minimum(low, base)

@@ -182,18 +182,24 @@ def places_among(
 
 
 def lowest_points(
-    x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], key: NDArray[np.int64]
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    cell: NDArray[np.int64],
+    count: int,
 ) -> NDArray[np.int64]:
-    """Numbers of the points that are the lowest of the cells whose keys they have, ascending by these.
+    """Numbers of the points that are the lowest of each of `count` cells, by the numbers of these; -1 where there is none.
 
     Of points of one height the first by x, then y, is taken, so that order does not matter.
     """
-    cells, number = np.unique(key, return_inverse=True)
-    lowest = np.full(len(cells), np.inf)
-    np.minimum.at(lowest, number, z)
-    low = np.flatnonzero(z == lowest[number])
-    low = low[np.lexsort((y[low], x[low], number[low]))]
-    return low[begins_run(number[low])]
+    lowest, first = np.full(count, np.inf), np.full(count, -1)
+    np.minimum.at(lowest, cell, z)
+    low = np.flatnonzero(z == lowest[cell])
+    first[cell[low]] = low
+    tied = low[np.bincount(cell[low])[cell[low]] > 1]
+    tied = tied[np.lexsort((y[tied], x[tied]))[::-1]]
+    first[cell[tied]] = tied  # the last of a cell stands
+    return first
 
 
 def lowest_of_cells(
@@ -210,10 +216,10 @@ def lowest_of_cells(
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     x, y, z = x[mine], y[mine], z[mine]
     key = keys_of(cell_numbers(x, cell), cell_numbers(y, cell))
-    low = lowest_points(x, y, z, key)
-    highest = np.full(len(low), -np.inf)
-    np.maximum.at(highest, np.searchsorted(key[low], key), z)
-    return mine[low], highest
+    cells, number = np.unique(key, return_inverse=True)
+    highest = np.full(len(cells), -np.inf)
+    np.maximum.at(highest, number, z)
+    return mine[lowest_points(x, y, z, number, len(cells))], highest
 
 
 def levels(z: NDArray[np.float64], cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -18,7 +18,7 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.jit import njit
 from .belowground import pits, pits_reach
-from .cells import HOLE, SIDE, cell_numbers, keys_of, lowest_points
+from .cells import HOLE, SIDE, cell_numbers, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .openings import JUMP, LINK, WALL, objects_of, opening_radius, plateau_reach, remove_plateaus
@@ -224,14 +224,14 @@ def ground_raster(
     left, bottom, w, h = points.window().grown(margin)
     shape = h, w
     mine = np.flatnonzero(use)
-    low = mine[lowest_points(x[mine], y[mine], z[mine], keys_of(column[mine], row[mine]))]
-    lowest = np.full(shape, -1)
-    lowest[row[low] - bottom, column[low] - left] = low
+    inside = (row[mine] - bottom) * w + column[mine] - left
+    low = lowest_points(x[mine], y[mine], z[mine], inside, h * w).reshape(shape)
+    lowest = np.where(low < 0, low, mine[low])
     cell = options.cell
     raster = np.where(lowest >= 0, z[lowest], HOLE).astype(np.float32)
-    highest = np.full(shape, -np.inf)
-    np.maximum.at(highest, (row[mine] - bottom, column[mine] - left), top[mine])
-    bad = pits(raster, highest, cell)
+    highest = np.full(h * w, -np.inf)
+    np.maximum.at(highest, inside, top[mine])
+    bad = pits(raster, highest.reshape(shape), cell)
     pit_points = lowest[bad]
     raster[bad] = HOLE
     objects, floor, opened, wide = objects_of(

@@ -91,15 +91,17 @@ def _add(total, m, dx, dy, weight):
     total[8] += weight * m[8] + dy * z
 
 
+@njit
 def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
     """Moments of the ground of each block of 2 x 2 cells, about its center."""
-    j, i = np.nonzero(ground)
-    x, y, z = place[j, i].T
-    j, i = j + bottom, i + left
-    x, y = x + (i & 1) - 0.5, y + (j & 1) - 0.5
-    block = ((j >> 1) - out_bottom) * out.shape[1] + (i >> 1) - out_left
-    for k, values in enumerate((None, x, y, x * x, x * y, y * y, z, x * z, y * z)):
-        out[..., k].flat = np.bincount(block, values, out[..., k].size)
+    for j in range(ground.shape[0]):
+        for i in range(ground.shape[1]):
+            if ground[j, i]:
+                x = place[j, i, 0] + ((i + left) & 1) - 0.5
+                y, z = place[j, i, 1] + ((j + bottom) & 1) - 0.5, place[j, i, 2]
+                block = out[((j + bottom) >> 1) - out_bottom, ((i + left) >> 1) - out_left]
+                for k, value in enumerate((1.0, x, y, x * x, x * y, y * y, z, x * z, y * z)):
+                    block[k] += value
 
 
 @njit
