@@ -14,7 +14,7 @@ from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import cells, filtered_ground, groundcells, openings
 from pdal_stages.terrain.groundcells import FilterOptions
 from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii, remove_plateaus
-from pdal_stages.terrain.planes import surface
+from pdal_stages.terrain.planes import GroundRaster, surface
 
 SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
 
@@ -139,7 +139,7 @@ def test_planes_equal_the_slow_reference():
     floor = rng.normal(0, 5, (h, w)).astype(np.float32)
     raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
     raster[ground] = floor[ground]
-    planes = surface(ground, place, floor, raster, left, bottom, 3, np.ones_like(ground))
+    planes = surface(GroundRaster(left, bottom, raster, place, ground, floor, {}), 3, np.ones_like(ground))
     cells = {
         (i + left, j + bottom): (place[j, i, :2], place[j, i, 2])
         for j, i in zip(*np.nonzero(ground), strict=True)

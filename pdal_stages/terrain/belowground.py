@@ -163,7 +163,7 @@ def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -
     limit, supported = np.full(low.shape, -np.inf), np.zeros(low.shape, bool)
     _supported(base, supported)
     # Where all around lies lower, no plane through it runs above.
-    highest = highest_around(np.where(np.isfinite(base), base, -np.inf), NEAR, 0)
+    highest = highest_around(np.where(np.isfinite(base), base, -HOLE).astype(np.float32), NEAR, 0)
     _limits(np.where(low < highest, low, np.inf), base, supported, side, depth, limit)
     deep = limit > -np.inf
     if deep.any():

@@ -18,13 +18,11 @@ from .groundcells import (
     CellWindow,
     FilterOptions,
     GroundPoints,
-    GroundRaster,
     add_ground,
     ground_raster,
     means_of,
-    surface_of,
 )
-from .planes import around, heights_above
+from .planes import GroundRaster, around, heights_above, surface
 from .planes import reach as planes_reach
 
 
@@ -39,7 +37,7 @@ def _beside(options: FilterOptions) -> int:
 
 
 class GroundCells(NamedTuple):
-    """Cells of a :class:`.groundcells.GroundRaster`, one by one: all with a height, an opening, or ground points."""
+    """Cells of a :class:`.planes.GroundRaster`, one by one: all with a height, an opening, or ground points."""
 
     cells: NDArray[np.void]  #: (n,) records, see `_record`
     #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
@@ -91,7 +89,7 @@ class GroundCells(NamedTuple):
 
 
 def _record(openings: int) -> np.dtype:
-    """Of a cell: as in a :class:`.groundcells.GroundRaster`; whether it holds ground points, and their mean place."""
+    """Of a cell: as in a :class:`.planes.GroundRaster`; whether it holds ground points, and their mean place."""
     return np.dtype(
         [
             *((name, np.int32) for name in ("column", "row")),
@@ -168,20 +166,21 @@ def cells_of_block(
     raster, _ = ground_raster(low, options, margin=spill, wanted=own.grown(margin))
     inside = low.some(own.holds(low.column, low.row))
     needed = around(inside.column, inside.row, raster.left, raster.bottom, raster.shape)
-    planes = surface_of(raster, options, NEAR, needed)
+    planes = surface(raster, options.levels(NEAR), needed)
     # With a ring around: points blend the four cells round them.
     part = own.grown(1).on(raster.left, raster.bottom, *raster.shape)
     raster, planes = raster.cut(part), planes[part].copy()
-    sums = np.zeros((*raster.shape, 4), np.int64)
+    count, means = np.zeros(raster.shape, np.int64), np.zeros((*raster.shape, 3))
     for xyz in points:
         x, y, z = np.ascontiguousarray(xyz.T)
         some = given(x, y, z, z)
         height, gradient = np.empty((2, len(xyz)))
         heights_above(*some[:3], cell, raster.left, raster.bottom, planes, height, gradient)
         is_ground = options.is_ground(some.use, some.deck, height, gradient)
-        add_ground(*some[:3], is_ground, some.column, some.row, cell, raster.left, raster.bottom, sums)
-    held, means = np.zeros(raster.shape, bool), np.zeros((*raster.shape, 3))
-    means_of(sums, held, means)
+        add_ground(
+            *some[:3], is_ground, some.column, some.row, cell, raster.left, raster.bottom, count, means
+        )
+    held = means_of(count, means)
     opened = np.empty((*raster.shape, len(openings)), np.float32)
     for k, radius in enumerate(openings):
         opened[..., k] = raster.opened[radius]

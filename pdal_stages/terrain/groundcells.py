@@ -7,7 +7,7 @@ it is done once for each block of a grid of blocks, out of the lowest points of 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from .cells import HOLE, SIDE, cell_numbers, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .openings import JUMP, LINK, WALL, objects_of, opening_radius, plateau_reach, remove_plateaus
-from .planes import from_parents, planes_of_blocks, surface
+from .planes import GroundRaster, from_parents, planes_of_blocks
 from .planes import reach as planes_reach
 
 #: Blocks, in meters, from which the surface is made: that for telling ground, and that of the heights.
@@ -129,7 +129,7 @@ class FilterOptions:
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
 _PARTS = 2.0**20
-#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`GroundRaster.place`.
+#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`.planes.GroundRaster.place`.
 CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
@@ -155,34 +155,6 @@ class CellWindow(NamedTuple):
         i, j = self.left - left, self.bottom - bottom
         (j0, j1), (i0, i1) = np.clip((j, j + self.height), 0, h), np.clip((i, i + self.width), 0, w)
         return slice(int(j0), int(j1)), slice(int(i0), int(i1))
-
-
-class GroundRaster(NamedTuple):
-    """A minimum grid and what was found on it."""
-
-    left: int  #: number of the first column
-    bottom: int  #: of the first row
-    #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
-    lowest: NDArray[np.float32]
-    #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
-    place: NDArray[np.float64]
-    ground: NDArray[np.bool_]  #: (h, w)
-    floor: NDArray[np.float32]  #: (h, w) what lies below objects
-    opened: Mapping[int, NDArray[np.float32]]  #: (h, w) openings by their radius
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.ground.shape
-
-    def cut(self, part: tuple[slice, slice]) -> GroundRaster:
-        """A copy of some rows and columns."""
-        return self._replace(
-            left=self.left + part[1].start,
-            bottom=self.bottom + part[0].start,
-            opened={radius: values[part].copy() for radius, values in self.opened.items()},
-            **{name: getattr(self, name)[part].copy() for name in ("lowest", "place", "ground", "floor")},
-        )
 
 
 class GroundPoints(NamedTuple):
@@ -226,7 +198,7 @@ def ground_raster(
     mine = np.flatnonzero(use)
     inside = (row[mine] - bottom) * w + column[mine] - left
     low = lowest_points(x[mine], y[mine], z[mine], inside, h * w).reshape(shape)
-    lowest = np.where(low < 0, low, mine[low])
+    lowest = np.append(mine, -1)[low]
     cell = options.cell
     raster = np.where(lowest >= 0, z[lowest], HOLE).astype(np.float32)
     highest = np.full(h * w, -np.inf)
@@ -258,10 +230,11 @@ def ground_raster(
     on_deck = (deck != 0)[lowest] & held
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
+    told = GroundRaster(left, bottom, raster, place, ground, floor, opened)
 
     def near(cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
         """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
-        blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, options.levels(block))
+        blocks = planes_of_blocks(told, options.levels(block))
         found = np.zeros(len(cells), bool)
         rest = np.isfinite(raster) & ~ground
         _near(cells, place, rest, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
@@ -285,7 +258,7 @@ def ground_raster(
     # The terrain runs below: no level of a deck stands for it either.
     ground &= ~on_deck
     raster[on_deck] = HOLE
-    return GroundRaster(left, bottom, raster, place, ground, floor, opened), pit_points
+    return told, pit_points
 
 
 @njit
@@ -310,31 +283,19 @@ def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, 
         out[k] = sides != 15
 
 
-def surface_of(
-    raster: GroundRaster, options: FilterOptions, block: float, needed: NDArray[np.bool_], planes=None
-) -> NDArray[np.float64]:
-    """The :func:`.planes.surface` through a raster's ground, from such blocks, in meters."""
-    return surface(
-        raster.ground, raster.place, raster.floor, raster.lowest, raster.left, raster.bottom,
-        options.levels(block), needed, planes,
-    )  # fmt: skip
-
-
 @njit
-def add_ground(x, y, z, is_ground, column, row, cell, left, bottom, sums):
-    """Add points that are ground to the sums (h, w, 4) of their cells: number, place, height; in whole numbers, so order is
-    free."""
+def add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, place):
+    """Add points that are ground to their cells: number (h, w) and places (h, w, 3); in whole numbers, so order is free."""
     for p in range(len(x)):
         if is_ground[p]:
-            total = sums[row[p] - bottom, column[p] - left]
-            total[0] += 1
-            total[1] += int(np.rint((x[p] / cell - column[p] - 0.5) * _PARTS))
-            total[2] += int(np.rint((y[p] / cell - row[p] - 0.5) * _PARTS))
-            total[3] += int(np.rint(z[p] * _PARTS))
+            j, i = row[p] - bottom, column[p] - left
+            count[j, i] += 1
+            place[j, i, 0] += np.rint((x[p] / cell - column[p] - 0.5) * _PARTS)
+            place[j, i, 1] += np.rint((y[p] / cell - row[p] - 0.5) * _PARTS)
+            place[j, i, 2] += np.rint(z[p] * _PARTS)
 
 
-def means_of(sums: NDArray[np.int64], ground: NDArray[np.bool_], place: NDArray[np.float64]) -> None:
-    """Whether cells (h, w) hold ground, and its mean (h, w, 3): from the cell's center, in cells, and its height."""
-    ground[:] = sums[..., 0] > 0
-    held = sums[ground]
-    place[ground] = held[:, 1:] / _PARTS / held[:, :1]
+def means_of(count: NDArray[np.int64], place: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Make such sums means: from the cell's center, in cells, and its height; which cells (h, w) hold ground."""
+    place /= (_PARTS * np.maximum(count, 1))[..., None]
+    return count > 0

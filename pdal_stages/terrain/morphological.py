@@ -36,14 +36,12 @@ from .groundcells import (
     CellMeans,
     FilterOptions,
     GroundPoints,
-    GroundRaster,
     add_ground,
     ground_raster,
     means_of,
-    surface_of,
 )
 from .openings import above_opening, opening_names
-from .planes import around, heights_above
+from .planes import GroundRaster, around, heights_above, surface
 
 #: Points handed to a thread at a time.
 _SPAN = 1 << 17
@@ -185,7 +183,7 @@ def _measured(
     x, y, z, _, use, deck, column, row = points
     cell, left, bottom = options.cell, raster.left, raster.bottom
     needed = around(column, row, left, bottom, raster.shape)
-    planes = surface_of(raster, options, NEAR, needed)
+    planes = surface(raster, options.levels(NEAR), needed)
     height, gradient = np.empty((2, len(x)))
 
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
@@ -196,12 +194,13 @@ def _measured(
     list(map_blocks(above, spans, threads))
     is_ground = options.is_ground(use, deck, height, gradient)
     if means is None:
-        sums = np.zeros((*raster.shape, 4), np.int64)
-        add_ground(x, y, z, is_ground, column, row, cell, left, bottom, sums)
-        means_of(sums, raster.ground, raster.place)
+        count = np.zeros(raster.shape, np.int64)
+        raster.place[:] = 0.0
+        add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, raster.place)
+        raster = raster._replace(ground=means_of(count, raster.place))
     else:
         raster = raster._replace(ground=means[0], place=means[1])
-    surface_of(raster, options, FAR, needed, planes)
+    surface(raster, options.levels(FAR), needed, planes)
     list(map_blocks(above, spans, threads))
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))

@@ -9,6 +9,7 @@ in a fixed tree, so the same ground gives the same bits whatever lies further aw
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,34 @@ from .cells import sums_around
 _STIFFNESS = 0.02
 #: Weight of the coarser height, in ground cells.
 _HOLD = 0.1
+
+
+class GroundRaster(NamedTuple):
+    """A minimum grid and what was found on it."""
+
+    left: int  #: number of the first column
+    bottom: int  #: of the first row
+    #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
+    lowest: NDArray[np.float32]
+    #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
+    place: NDArray[np.float64]
+    ground: NDArray[np.bool_]  #: (h, w)
+    floor: NDArray[np.float32]  #: (h, w) what lies below objects
+    opened: Mapping[int, NDArray[np.float32]]  #: (h, w) openings by their radius
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.ground.shape
+
+    def cut(self, part: tuple[slice, slice]) -> GroundRaster:
+        """A copy of some rows and columns."""
+        return self._replace(
+            left=self.left + part[1].start,
+            bottom=self.bottom + part[0].start,
+            opened={radius: values[part].copy() for radius, values in self.opened.items()},
+            **{name: getattr(self, name)[part].copy() for name in ("lowest", "place", "ground", "floor")},
+        )
 
 
 class Planes(NamedTuple):
@@ -174,32 +203,24 @@ def _fit(moments, size, planes):
             planes[j, i, 2] = along + gy
 
 
-def planes_of_blocks(
-    ground: np.ndarray,
-    place: np.ndarray,
-    floor: np.ndarray,
-    raster: np.ndarray,
-    left: int,
-    bottom: int,
-    levels: int,
-) -> Planes:
-    """Planes of blocks of 2 x 2 cells; arguments as of :func:`surface`."""
-    h, w = ground.shape
+def planes_of_blocks(raster: GroundRaster, levels: int) -> Planes:
+    """Planes of blocks of 2 x 2 cells, through the ground of a raster; there are `levels` coarser levels, at least 1."""
+    h, w = raster.shape
     moments: list[np.ndarray] = []
-    spans = [(left, bottom)]
+    spans = [(raster.left, raster.bottom)]
     for level in range(1, levels + 1):
         a, b = spans[-1]
         low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
         h, w = ((b + h - 1) >> 1) + 2 - low_b, ((a + w - 1) >> 1) + 2 - low_a
         made = np.zeros((h, w, 9))
         if level == 1:
-            _moments_of_cells(ground, place, a, b, made, low_a, low_b)
+            _moments_of_cells(raster.ground, raster.place, a, b, made, low_a, low_b)
         else:
             _moments_of_blocks(moments[-1], 2.0 ** (level - 1), a, b, made, low_a, low_b)
         moments.append(made)
         spans.append((low_a, low_b))
     planes = np.empty((h, w, 3))
-    _coarsest(floor, raster, left, bottom, levels, planes, *spans[levels])
+    _coarsest(raster.floor, raster.lowest, *spans[0], levels, planes, *spans[levels])
     for level in range(levels, 0, -1):
         made = moments.pop()
         if level < levels:
@@ -211,28 +232,18 @@ def planes_of_blocks(
 
 
 def surface(
-    ground: np.ndarray,
-    place: np.ndarray,
-    floor: np.ndarray,
-    raster: np.ndarray,
-    left: int,
-    bottom: int,
-    levels: int,
-    needed: np.ndarray,
-    planes: np.ndarray | None = None,
-) -> np.ndarray:
+    raster: GroundRaster, levels: int, needed: NDArray[np.bool_], planes: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
 
-    `ground` (h, w) says which cells hold ground, `place` (h, w, 3) where it is: from the cell's center, in cells, and its
-    height; `floor` (h, w) is the level to take where no ground is near, `raster` (h, w) is not finite where nothing was
-    measured. `left` and `bottom` number the first column and row from the origin of the coordinates. There are
-    `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are wanted; elsewhere stands none.
-    They are put into `planes` where that is given: those at the same cells, made before.
+    There are `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are wanted; elsewhere stands
+    none. They are put into `planes` where that is given: those at the same cells, made before.
     """
-    blocks = planes_of_blocks(ground, place, floor, raster, left, bottom, levels)
+    ground, place = raster.ground, raster.place
+    blocks = planes_of_blocks(raster, levels)
     if planes is None:
         planes = np.zeros((*ground.shape, 3))
-    _finer(blocks.values, blocks.left, blocks.bottom, 1.0, left, bottom, needed, planes)
+    _finer(blocks.values, blocks.left, blocks.bottom, 1.0, raster.left, raster.bottom, needed, planes)
     # Those of ground cells hold their cell's ground.
     np.copyto(planes[..., 0], place[..., 2], where=ground)
     for axis in (0, 1):
