@@ -46,17 +46,18 @@ def _plane_under(low, j, i, radius, blocks, inner=-1):
     h, w = low.shape
     u, v, zs = np.empty((3, blocks * blocks))
     zs[:] = np.inf
-    side, middle, n = 2 * radius + 1, blocks // 2, 0
+    block, middle, n = np.arange(2 * radius + 1) * blocks // (2 * radius + 1), blocks // 2, 0
     for b in range(max(-radius, -j), min(radius + 1, h - j)):
         for a in range(max(-radius, -i), min(radius + 1, w - i)):
-            k = (b + radius) * blocks // side * blocks + (a + radius) * blocks // side
+            k = block[b + radius] * blocks + block[a + radius]
             if low[j + b, i + a] < zs[k]:
                 u[k], v[k], zs[k] = a, b, low[j + b, i + a]
-    for k in range(blocks * blocks):
-        away = (k // blocks - middle) ** 2 + (k % blocks - middle) ** 2
-        if inner < away <= middle * middle and zs[k] < np.inf:
-            u[n], v[n], zs[n] = u[k], v[k], zs[k]
-            n += 1
+    for b in range(-middle, blocks - middle):
+        for a in range(-middle, blocks - middle):
+            k = (b + middle) * blocks + a + middle
+            if inner < b * b + a * a <= middle * middle and zs[k] < np.inf:
+                u[n], v[n], zs[n] = u[k], v[k], zs[k]
+                n += 1
     if n < ENOUGH:
         return n, -np.inf, 0.0, 0.0, 0.0
     lowest = zs[:n].min()
