@@ -36,7 +36,7 @@ _WHERE = {
     "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline.run",
     "run_stage": "pipeline.runtime",
-    "run_tiled": "tiling",
+    "run_tiled": "tiling.run",
     "TilingOptions": "tiling.settings",
     "train": "classifier.training",
     "write_accuracy_report": "reports.accuracypage",
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from .reports.objectlayers import object_frames, object_layers
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima
-    from .tiling import run_tiled
+    from .tiling.run import run_tiled
     from .tiling.settings import TilingOptions
 
 

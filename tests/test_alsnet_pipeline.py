@@ -64,7 +64,7 @@ def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
 def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
     """Heights above ground included, which neighbors need too."""
     laspy = pytest.importorskip("laspy")
-    from pdal_stages.tiling import run_tiled
+    from pdal_stages import run_tiled
 
     path, model = cloud[0], tmp_path / "heights.model"
     net = dataclasses.replace(

@@ -11,10 +11,14 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     code = "import numpy; from pdal_stages.features.index import build_tree; build_tree(*numpy.eye(3))"
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "lines"}
 
-    def said() -> str:
-        return subprocess.run(
-            [sys.executable, "-c", code], env=env, text=True, capture_output=True, check=True
-        ).stderr
+    def said(code: str = code) -> str:
+        return subprocess.run([sys.executable, "-c", code], env=env, text=True, capture_output=True).stderr
 
     assert "compiling for this processor, once" in said()
-    assert "compiling" not in said()
+    assert not said()
+    for index in (tmp_path / "kernels").rglob("*.nbi"):
+        index.write_bytes(b"damaged")
+    assert "Traceback" not in said("import os; os.environ['PDAL_STAGES_PROGRESS'] = '0'; " + code)
+    assert not said()
+    index.parent.chmod(0o777)
+    assert "other users may put code into" in said()

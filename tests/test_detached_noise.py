@@ -377,11 +377,17 @@ def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
 def test_degenerate_clouds_hold_no_noise():
     for xyz in (np.empty((0, 3)), np.zeros((1, 3)), np.zeros((500, 3)), np.full((3, 3), np.nan)):
         assert not detached_noise(xyz).any()
-    far = np.array([[0.0, 0, 0], [1e9, 0, 0], [0, -1e9, 5]])
-    assert not detached_noise(far).any()  # nothing near to judge by
     assert detached_noise([[0.0, 0, 2e6], [0, 0, -2e6]]).tolist() == [18, 7]
     with pytest.raises(StageError, match="'mask' must have one value per point"):
         detached_noise(np.zeros((3, 3)), mask=[True])
+
+
+def test_points_that_lie_alone_are_no_noise_and_many_are_refused():
+    xyz = np.random.default_rng(0).uniform(0, [2e7, 2e7, 50], (4500, 3))
+    assert not detached_noise(xyz[:500]).any()
+    for find in (detached_noise, ps.filtered_ground):
+        with pytest.raises(StageError, match=r"4,500 points .* scale and unit"):
+            find(xyz)
 
 
 def test_points_left_out_are_as_good_as_not_there():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -17,15 +18,8 @@ pytestmark = pytest.mark.pdal
 def test_all_that_is_needed_is_here(capsys, monkeypatch):
     assert cli.main(["doctor"]) == 0
     said = capsys.readouterr().out
-    for what in (
-        "pdal_stages: ",
-        "shipped model: ",
-        "PDAL: ",
-        "filters.python in this process",
-        "cores: ",
-        "compiled kernels",
-    ):
-        assert f"{what}" in said
+    told = "pdal_stages", "shipped model", "PDAL", "filters.python in this process", "cores"
+    assert all(f"{what}: " in said for what in (*told, "compiled kernels"))
     assert "MISSING" not in said
     assert said.count("filters.python in ") >= 2
 
@@ -46,16 +40,15 @@ def test_what_is_missing_has_its_cure(tmp_path):
 
 def test_another_python_is_told(tmp_path, monkeypatch):
     def run(stages):
-        (answer := stages[1]["pdalargs"]["answer"])
-        with open(answer, "w") as file:
-            file.write("/other\nModuleNotFoundError: No module named 'pdal_stages'")
+        Path(stages[1]["pdalargs"]["answer"]).write_text(
+            "/other\nModuleNotFoundError: No module named 'pdal_stages'"
+        )
 
     found = doctor._python_of("filters.python", run)
     assert found.cure == "/other/bin/python -m pip install pdal-stages" and "MISSING" in str(found)
 
     def another(stages):
-        with open(stages[1]["pdalargs"]["answer"], "w") as file:
-            file.write("/other\n/other/lib/pdal_stages/__init__.py")
+        Path(stages[1]["pdalargs"]["answer"]).write_text("/other\n/other/lib/pdal_stages/__init__.py")
 
     assert "another pdal_stages" in doctor._python_of("filters.python", another).found
     assert "did not run" in doctor._python_of("filters.python", lambda stages: None).found

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
+from pdal_stages import run_tiled
 from pdal_stages.base.errors import DimensionError, OptionError
 from pdal_stages.terrain.minima import hag_minima
-from pdal_stages.tiling import run_tiled
 
 pytestmark = pytest.mark.pdal
 

@@ -10,10 +10,10 @@ import laspy
 import numpy as np
 import pytest
 
+from pdal_stages import run_tiled
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.read import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.tiling import run_tiled
 
 pytestmark = pytest.mark.pdal
 FOLDER = Path(__file__).resolve().parent.parent / "pipelines"

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import tiling_clouds as clouds
 
+from pdal_stages import TilingOptions
 from pdal_stages.base.errors import OptionError
 from pdal_stages.base.resources import free_memory, parse_size
 from pdal_stages.cli import main
 from pdal_stages.stages.hag_morphological import Blocks
 from pdal_stages.synthetic.town import WKT
-from pdal_stages.tiling import TilingOptions
 from pdal_stages.tiling.settings import PARENT, Density, Extent, block_bytes, settled, worker_bytes
 
 pytestmark = pytest.mark.pdal

@@ -23,12 +23,12 @@ import numpy as np
 import pytest
 import tiling_clouds as clouds
 
+from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.resources import available_threads
 from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform
 from pdal_stages.tiling import cluster as dask_cluster
-from pdal_stages.tiling import run_tiled
 from pdal_stages.tiling.outputs import FileTask
 from pdal_stages.tiling.store import Store
 

@@ -8,6 +8,7 @@ import pytest
 from test_terrain_morphological import town
 
 import pdal_stages as ps
+from pdal_stages import run_tiled
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.cells import lowest_of_cells
 from pdal_stages.terrain.groundblocks import (
@@ -18,7 +19,7 @@ from pdal_stages.terrain.groundblocks import (
     reach_of_block,
 )
 from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions
-from pdal_stages.tiling import run_tiled, tile
+from pdal_stages.tiling import tile
 from pdal_stages.tiling.ground import FirstRoundTask
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.tiling import run_tiled
+from pdal_stages import run_tiled
 from pdal_stages.tiling.tile import TileTask
 
 pytestmark = pytest.mark.pdal

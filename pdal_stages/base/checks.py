@@ -123,11 +123,12 @@ def strict_json(text: str | bytes) -> Any:
     RecursionError
         If it is nested too deeply.
     """
-    return json.loads(text, parse_constant=_refuse, parse_float=_finite, object_pairs_hook=_unique)
+    return json.loads(text, parse_constant=refuse_constant, parse_float=_finite, object_pairs_hook=_unique)
 
 
-def _refuse(word: str) -> None:
-    raise ValueError(f"{word} is not a number")
+def refuse_constant(word: str) -> None:
+    """Refuse NaN and Infinity, which JSON has not."""
+    raise ValueError(f"{word} is not a JSON number")
 
 
 def _finite(word: str) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import stat
 import sys
 import threading
 from collections.abc import Callable
@@ -31,6 +32,7 @@ _ERRORS = {"error_model": "numpy"}
 _functions: dict[Any, Callable] = {}
 
 _lock = threading.RLock()
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 class Kernel:
@@ -60,6 +62,8 @@ class Kernel:
                 file: Any = getattr(getattr(made, "_cache", None), "_cache_file", None)
                 if hasattr(file, "_source_stamp"):
                     file._source_stamp = "-".join(sorted(_sources(self)))
+                    file.load, file.save = (_careful(file, act) for act in (file.load, file.save))
+                    _refuse_shared(file._cache_path)
                 self._dispatcher = made
             return self._dispatcher
 
@@ -104,7 +108,7 @@ def _numba() -> Any:
             import numba.np.arraymath
     finally:
         sys.meta_path.remove(absent)
-    Compiling.listen(numba.core.event)
+    _tell_compiling(numba.core.event)
     return numba
 
 
@@ -119,6 +123,34 @@ class _NoLinearAlgebra(NamedTuple):
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
         if name == "scipy.linalg" and threading.get_ident() == self.thread:
             raise ImportError(name)
+
+
+def _careful(file: Any, act: Callable) -> Callable:
+    """What loads or saves code, so that damage or a full disk costs no more than making it again."""
+
+    def done(*given: Any) -> Any:
+        try:
+            return act(*given)
+        except Exception:
+            with contextlib.suppress(OSError):
+                file.flush()
+            return None
+
+    return done
+
+
+@lru_cache(maxsize=256)
+def _refuse_shared(folder: str) -> None:
+    """Refuse a folder into which other users may put code: numba runs what it finds there."""
+    if not hasattr(os, "geteuid") or Path(folder).is_relative_to(_PACKAGE):
+        return
+    found = os.stat(folder)
+    if found.st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
+        raise DependencyError(
+            "other users may put code into the folder of compiled kernels",
+            found=folder,
+            cure="Name a folder of your own in NUMBA_CACHE_DIR, or take this one from the others",
+        )
 
 
 @lru_cache(maxsize=256)
@@ -149,34 +181,16 @@ def _sources(kernel: Any) -> set[str]:
     return digests
 
 
-class Compiling:
-    """Says on stderr how many kernels were compiled so far, where that takes longer than two seconds."""
-
-    _bar: Progress | None = None
-    _inside = threading.local()
-
-    @classmethod
-    def listen(cls, event: Any) -> None:
-        """Hear of what numba compiles from now on."""
-        if cls._bar is None:
-            listener = type("Listener", (event.Listener,), {"on_start": cls._start, "on_end": cls._end})
-            event.register("numba:compile", listener())
-            cls._bar = Progress(0, "compiling for this processor, once", "kernels")
-
-    @staticmethod
-    def _start(_: Any, event: Any) -> None:
-        Compiling._inside.depth = getattr(Compiling._inside, "depth", 0) + 1
-
-    @staticmethod
-    def _end(_: Any, event: Any) -> None:  # of the kernel itself, not of the functions it calls
-        Compiling._inside.depth = getattr(Compiling._inside, "depth", 1) - 1
-        if Compiling._inside.depth == 0 and Compiling._bar is not None:
-            Compiling._bar.update()
+@lru_cache(maxsize=1)
+def _tell_compiling(event: Any) -> None:
+    """Say on stderr how many functions were compiled so far, where that takes longer than two seconds."""
+    bar = Progress(0, "compiling for this processor, once", "functions")
+    heard = {"on_start": lambda *_: None, "on_end": lambda *_: bar.update()}
+    event.register("numba:compile", type("Listener", (event.Listener,), heard)())
 
 
 def kept_kernels() -> int:
     """How many kernels there is compiled code of, of whatever version, without asking numba."""
     named = os.environ.get("NUMBA_CACHE_DIR")
-    usual = [Path(__file__).resolve().parents[1], Path.home() / ".cache" / "numba"]
-    folders = [Path(named)] if named else usual
+    folders = [Path(named)] if named else [_PACKAGE, Path.home() / ".cache" / "numba"]
     return sum(1 for folder in folders for _ in folder.rglob("*.nbi"))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
 from ..base.files import LAS, Output
 
@@ -84,7 +85,7 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
     if not clean.strip():
         raise PipelineError("the pipeline is empty", where=name or None)
     try:
-        value = json.loads(clean, parse_constant=_no_constant)
+        value = json.loads(clean, parse_constant=refuse_constant)  # as PDAL does
     except json.JSONDecodeError as error:
         raise PipelineError(
             f"the pipeline is not valid JSON: {error.msg}",
@@ -125,11 +126,6 @@ def _places(text: str, at: int) -> list[int]:
 
 
 _decoder = json.JSONDecoder()
-
-
-def _no_constant(word: str) -> None:
-    """NaN and Infinity, which PDAL refuses too."""
-    raise ValueError(f"{word} is not a JSON number")
 
 
 #: What PDAL wants of the options that wire stages together.

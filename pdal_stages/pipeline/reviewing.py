@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..accuracy.expected import Patches, ReviewCells, find_patches, side_for
 from ..base import checks
 from ..base.errors import StageError
-from ..base.files import HTML, JSON, Output, check_outputs, write_whole
+from ..base.files import HTML, JSON, Output, check_outputs, whole_files
 from ..base.las import read_header
 from ..base.messages import Progress, duration, one_line, print_messages
 from ..base.version import __version__
@@ -195,11 +195,12 @@ def write_review(
     found = review_files(inputs, **how)
     reference = reference_of_file(found.files[0])
     layers = review_layers(found, reference.units.horizontal)
-    write_layers(output, layers, reference.wkt, styles(found.patches.errors))
-    if json_file:
-        write_whole(json_file, (json.dumps(found.to_dict(), indent=1) + "\n").encode())
-    if html:
-        write_whole(html, review_page(found).encode())
+    with whole_files(*filter(None, (json_file, html))) as files:
+        if json_file:
+            files[0].write_bytes((json.dumps(found.to_dict(), indent=1) + "\n").encode())
+        if html:
+            files[-1].write_bytes(review_page(found).encode())
+        write_layers(output, layers, reference.wkt, styles(found.patches.errors))
     return found
 
 

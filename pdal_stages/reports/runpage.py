@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..base.files import write_whole
 from ..base.las import class_name
 from ..base.messages import duration
 from .page import render
@@ -31,11 +29,6 @@ _SETTINGS = {
     "points_read_by_a_tile": "points read for a tile",
     "cpu_seconds": "processor time",
 }
-
-
-def write_run_report(path: str | os.PathLike[str], run: Mapping[str, Any]) -> Path:
-    """Write the page of :func:`run_page`, whole or not at all; StageError if it cannot be written."""
-    return write_whole(path, run_page(run).encode())
 
 
 def run_page(run: Mapping[str, Any]) -> str:

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
 from ..base.errors import StageError
-from ..base.files import HTML, JSON, Output, write_whole
+from ..base.files import HTML, JSON, Output, whole_files
 from ..base.las import UNINFORMATIVE
 from ..base.messages import Report, plain
 from ..base.units import name_of_wkt
@@ -144,15 +145,16 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
             if len(each) > 1:
                 print(plain(by_file([name for name, _ in parts], each)), file=out)
             print(plain(accuracy.table()), file=out)
-        if self.json:
-            written = accuracy.to_dict()
-            if len(each) > 1:
-                written["files"] = [
-                    {"name": name, **summary(one)} for (name, _), one in zip(parts, each, strict=True)
-                ]
-            write_whole(self.json, (json.dumps(written, indent=1) + "\n").encode())
-        if self.html:
-            self._write_page(self.html, parts, sides, accuracy, rule)
+        with whole_files(*(one.path for one in self.outputs())) as files:
+            if self.json:
+                written = accuracy.to_dict()
+                if len(each) > 1:
+                    written["files"] = [
+                        {"name": name, **summary(one)} for (name, _), one in zip(parts, each, strict=True)
+                    ]
+                files[0].write_bytes((json.dumps(written, indent=1) + "\n").encode())
+            if self.html:
+                self._write_page(files[-1], parts, sides, accuracy, rule)
         report.figures.update(
             {
                 "compared": accuracy.points,
@@ -220,7 +222,7 @@ out and counted. `classes`, `ignore` and `merge` overrule this.
 
     def _write_page(
         self,
-        path: str,
+        path: Path,
         parts: Sequence[tuple[str, Points]],
         sides: Sequence[Sides],
         accuracy: Accuracy,

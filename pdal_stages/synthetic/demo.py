@@ -35,6 +35,7 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     import numpy as np
 
     from ..pipeline.run import Pipeline
+    from ..reports.views import triptych, write_png
     from . import make_town, write_town
 
     folder = Path(folder)
@@ -56,7 +57,10 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     with _step("classifying it with the model that comes with the package, which has never seen such a town"):
         Pipeline(stages["standard"]).execute(arrays=False)
     with _step("drawing the picture"):
-        _draw(folder / "classified.png", job.arrays[0])
+        points = job.arrays[0]
+        shown = points[np.isin(points["Reference"], [int(code) for code in CLASSES])]
+        columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
+        write_png(folder / "classified.png", triptych(*columns))
     for file in ("classified.laz", "classified.png", "accuracy.html"):
         print(folder / file)
 
@@ -102,16 +106,6 @@ def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str
         {**las, "filename": str(folder / "standard.laz")},
     ]
     return {"train": train, "classify": classify, "standard": standard}
-
-
-def _draw(path: Path, points) -> None:
-    import numpy as np
-
-    from ..reports.views import triptych, write_png
-
-    shown = points[np.isin(points["Reference"], [int(code) for code in CLASSES])]
-    columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
-    write_png(path, triptych(*columns))
 
 
 @contextlib.contextmanager

@@ -245,7 +245,9 @@ def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link:
     if cells <= min(LARGEST, _FEW + _EMPTY * len(column)):
         yield slice(None), slice(None)
         return
-    for group in _groups(column, row, link):
+    groups = _groups(column, row, link)
+    refuse_scattered(len(column), len(groups))
+    for group in groups:
         c, r = column[group], row[group]
         if _cells(c, r) <= LARGEST:
             yield group, slice(None)
@@ -258,6 +260,16 @@ def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link:
             for part in _groups(c[near], r[near], link):
                 if mine[near[part]].any():
                     yield group[near[part]], mine[near[part]]
+
+
+def refuse_scattered(points: int, places: int) -> None:
+    """Refuse points most of which are alone in their places: each would take milliseconds, and none tells anything."""
+    if places > 4000 and points < 2 * places:
+        raise StageError(
+            "most points lie alone, far from any other",
+            found=f"{points:,} points in {places:,} places",
+            cure="Look whether the file's scale and unit are right: pdal info --summary FILE",
+        )
 
 
 def _cells(column: NDArray[np.int64], row: NDArray[np.int64]) -> int:

@@ -104,17 +104,19 @@ def objects_of(
     objects, wide = np.zeros((2, *raster.shape), bool)
     floor, openings = raster.copy(), {}
     rest, before, taken = np.flatnonzero(measured), raster[measured], (0, 0)
-    radii = opening_radii(window)
-    for radius in sorted({*radii, *keep}):
+    # An opening lowers nothing by more than all heights differ.
+    drops = {r: np.float32(min(slope * r * cell, LARGEST_DROP)) for r in opening_radii(window)}
+    drops = {radius: drop for radius, drop in drops.items() if drop < heights[-2] - heights[1]}
+    for radius in sorted({*drops, *keep}):
         squares, diamonds = _steps(min(radius, sum(raster.shape)))
         upended = highest_around(upended, squares - taken[0], diamonds - taken[1])
         taken = squares, diamonds
         opened = highest_around(np.minimum(last - upended, most), squares, diamonds)
         if radius in keep:
             openings[radius] = heights[opened]
-        if radius in radii:
+        if radius in drops:
             after = heights[opened.ravel()[rest]]
-            lowered = before - after > np.float32(min(slope * radius * cell, LARGEST_DROP))
+            lowered = before - after > drops[radius]
             found = rest[lowered]
             objects.ravel()[found], wide.ravel()[found] = True, radius * cell > WIDE
             floor.ravel()[found] = after[lowered]

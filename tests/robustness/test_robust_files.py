@@ -14,10 +14,8 @@ import sys
 import pytest
 from robustness_kit import HAG, job
 
-pytestmark = [
-    pytest.mark.pdal,
-    pytest.mark.skipif(shutil.which("strace") is None, reason="watches with strace"),
-]
+no_strace = shutil.which("strace") is None
+pytestmark = [pytest.mark.pdal, pytest.mark.skipif(no_strace, reason="watches with strace")]
 
 #: Ours: hidden folders, notes of tiled runs and of their pace, compiled kernels, temporary folders; and the system's.
 OWN = re.compile(

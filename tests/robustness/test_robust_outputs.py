@@ -12,8 +12,7 @@ import laspy
 import pytest
 from robustness_kit import HAG, job
 
-from pdal_stages import load_model
-from pdal_stages.tiling import run_tiled
+from pdal_stages import load_model, run_tiled
 
 pytestmark = [pytest.mark.pdal, pytest.mark.skipif(os.name == "nt", reason="devices and links of Unix")]
 
