@@ -181,7 +181,7 @@ def pits(raster: NDArray[np.float32], highest: NDArray[np.floating], cell: float
     `raster` has heights, holes ``inf``; `highest` those of the highest points; `cell` is a cell's side; meters.
     """
     number, size, side = linked_cells(raster, LINK, lambda away: STEP + GRADE * cell * away)
-    covered = sums_around(highest > raster + ABOVE, 1) > 0
+    covered = highest_around(highest > raster + ABOVE, 1, 0)
     share = np.bincount(number[covered & (number >= 0)], minlength=len(size))
     island = np.append(((size <= MOST) | (share >= COVERED * size)) & (side < EXTENT), False)[number]
     if not island.any():

@@ -36,6 +36,7 @@ from .cells import (
 )
 from .deckwalls import REACH as WALLS_REACH
 from .deckwalls import without_walls
+from .openings import highest_around
 from .walkable import (
     ACROSS,
     AHEAD,
@@ -190,7 +191,7 @@ def _goes_on(rim: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _filled(z, start, h, w, kind, deck) -> NDArray[np.bool_]:
     """The decks, and what is walked on and has more of them than of other ground around."""
     cell = np.repeat(np.arange(h * w), np.diff(start))
-    near = sums_around(np.bincount(cell[deck], minlength=h * w).reshape(h, w), LINK).ravel() > 0
+    near = highest_around(np.bincount(cell[deck], minlength=h * w).reshape(h, w) > 0, LINK, 0).ravel()
     one, other = _beside(z, start, h, w, kind, near[cell] & ~deck)
     return deck | (np.bincount(one, np.where(deck[other], 1, -1), len(z)) > 0)
 
@@ -263,7 +264,7 @@ def levels_near_decks(
             heights, cell = z[points][lowest], cell[lowest]
             kind, deck = deck_levels(heights, np.searchsorted(cell, np.arange(h * w + 1)), h, w, left, bottom)
             there = np.bincount(cell[deck], minlength=h * w).reshape(h, w) > 0
-            near = (sums_around(there, 2 * BESIDE) > 0).ravel()[cell]
+            near = highest_around(there, 2 * BESIDE, 0).ravel()[cell]
             mine = np.zeros(len(c), bool)
             mine[own] = True
             near &= mine[lowest]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import sums_around
+from .openings import highest_around
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
 #: ground of a fit lies to one side or on a line.
@@ -269,4 +269,4 @@ def around(
     """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose planes points blend."""
     held = np.zeros(shape, bool)
     held[row - bottom, column - left] = True
-    return sums_around(held, 1) > 0
+    return highest_around(held, 1, 0)
