@@ -33,8 +33,7 @@ def test_what_is_missing_has_its_cure(tmp_path):
     assert done.returncode == 1, done.stderr
     lines = done.stdout.splitlines()
     missing = [n for n, line in enumerate(lines) if line.startswith("MISSING")]
-    assert len(missing) == 2
-    assert all("PDAL_DRIVER_PATH" in lines[n + 1] for n in missing)
+    assert len(missing) == 2 and all("PDAL_DRIVER_PATH" in lines[n + 1] for n in missing)
     assert any(line.startswith("ok      cores") for line in lines)  # one fault does not hide the next
 
 

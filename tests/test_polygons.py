@@ -142,9 +142,9 @@ def test_points_on_an_edge_are_inside():
 def test_what_is_wrong_is_said_before_any_work(tmp_path, monkeypatch):
     with pytest.raises(StageError, match="the file of polygons does not exist"):
         Polygons({"polygons": [f"{tmp_path}/none.gpkg=9"]})
-    (tmp_path / "bad.gpkg").write_text("no map")
-    with pytest.raises(StageError, match="the vector file cannot be read"):
-        Polygons({"polygons": [f"{tmp_path}/bad.gpkg=9"]})
+    (tmp_path / "a!b.gpkg").write_text("GDAL would read b.gpkg")
+    with pytest.raises(StageError, match="the vector file cannot be read .* rename it"):
+        Polygons({"polygons": [f"{tmp_path}/a!b.gpkg=9"]})
     lines = tmp_path / "lines.gpkg"
     wkb = np.array([shapely.to_wkb(LAKE.exterior)], object)
     pyogrio.raw.write(str(lines), wkb, [np.arange(1)], ["id"], crs="EPSG:28992", geometry_type="LineString")

@@ -134,7 +134,6 @@ def _careful(file: Any, act: Callable) -> Callable:
         except Exception:
             with contextlib.suppress(OSError):
                 file.flush()
-            return None
 
     return done
 

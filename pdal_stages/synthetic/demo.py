@@ -42,10 +42,9 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     folder.mkdir(parents=True, exist_ok=True)
     if not folder.is_dir():
         raise StageError("the demo's folder cannot be made", found=str(folder))
-    town = str(folder / "town.laz")
     with _step(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"):
         made = make_town(size, density, seed)
-        write_town(made, town)
+        write_town(made, str(folder / "town.laz"))
     stages = pipelines(folder, float(np.floor((made.x.min() + made.x.max()) / 2)), seed)
     for name, listed in stages.items():
         write_whole(folder / f"{name}.json", (json.dumps(listed, indent=4) + "\n").encode())

@@ -117,10 +117,11 @@ def detached_noise(
         column, row = cell_numbers(x, SIDE), cell_numbers(y, SIDE)
         found = np.zeros(len(x), np.uint8)
         for points, own in patches(column, row, math.ceil(REACH / SIDE), 3 * BLOCK + 2):
-            if len(x[points]) <= ENOUGH:  # too few to tell anything by
-                continue
-            marks = _judge(x[points], y[points], z[points], column[points], row[points], cluster, gap, depth)
-            found[points if isinstance(points, slice) else points[own]] = marks[own]
+            if len(x[points]) > ENOUGH:  # fewer tell nothing
+                marks = _judge(
+                    x[points], y[points], z[points], column[points], row[points], cluster, gap, depth
+                )
+                found[points if isinstance(points, slice) else points[own]] = marks[own]
         codes[inside] = found
     if figures is not None:
         figures["low"], figures["high"] = (int(np.count_nonzero(codes == code)) for code in NOISE)

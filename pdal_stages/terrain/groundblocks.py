@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import HIGHEST, HOLE, cell_numbers, keys_of, lowest_of_cells, refuse_scattered, runs
+from .cells import HIGHEST, HOLE, cell_numbers, keys_of, lowest_of_cells, runs
 from .decks import CELL, decks_of_levels, level_points, levels_near_decks
 from .groundcells import (
     BLOCK_SIDE,
@@ -112,7 +112,6 @@ def by_block(
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
     parts = runs(keys_of(column, row))
-    refuse_scattered(len(mine), len(parts))
     return {
         (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[mine[p]] for axis in (x, y, z)])
         for p in parts
