@@ -143,8 +143,7 @@ def _refuse_shared(folder: str) -> None:
     """Refuse a folder into which other users may put code: numba runs what it finds there."""
     if not hasattr(os, "geteuid") or Path(folder).is_relative_to(_PACKAGE):
         return
-    found = os.stat(folder)
-    if found.st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
+    if (found := os.stat(folder)).st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
         raise DependencyError(
             "other users may put code into the folder of compiled kernels",
             found=folder,

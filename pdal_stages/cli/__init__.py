@@ -121,8 +121,8 @@ def _refuse_little_room() -> None:
         import resource
 
         if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < 2**30:
-            what = "this process may have too few addresses for its libraries"
-            raise StageError(what, found=f"ulimit -v {limit // 1024}", cure="Allow 1 GB: ulimit -v 1048576")
+            found = f"ulimit -v {limit // 1024}"
+            raise StageError("too little memory for our libraries", found=found, cure="Allow 1 GB")
 
 
 def _unforeseen(error: Exception) -> StageError:

@@ -56,8 +56,8 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     with _step("classifying it with the model that comes with the package, which has never seen such a town"):
         Pipeline(stages["standard"]).execute(arrays=False)
     with _step("drawing the picture"):
-        points = job.arrays[0]
-        shown = points[np.isin(points["Reference"], [int(code) for code in CLASSES])]
+        (points,) = job.arrays
+        shown = points[np.isin(points["Reference"], [*map(int, CLASSES)])]
         columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
         write_png(folder / "classified.png", triptych(*columns))
     for file in ("classified.laz", "classified.png", "accuracy.html"):

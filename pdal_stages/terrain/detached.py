@@ -118,9 +118,8 @@ def detached_noise(
         found = np.zeros(len(x), np.uint8)
         for points, own in patches(column, row, math.ceil(REACH / SIDE), 3 * BLOCK + 2):
             if len(x[points]) > ENOUGH:  # fewer tell nothing
-                marks = _judge(
-                    x[points], y[points], z[points], column[points], row[points], cluster, gap, depth
-                )
+                near = x[points], y[points], z[points], column[points], row[points]
+                marks = _judge(*near, cluster, gap, depth)
                 found[points if isinstance(points, slice) else points[own]] = marks[own]
         codes[inside] = found
     if figures is not None:
