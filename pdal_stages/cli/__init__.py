@@ -121,8 +121,7 @@ def _refuse_little_room() -> None:
         import resource
 
         if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < 2**30:
-            found = f"ulimit -v {limit // 1024}"
-            raise StageError("too little memory for our libraries", found=found, cure="Allow 1 GB")
+            raise StageError("too little memory", found=f"ulimit -v {limit // 1024}", cure="Allow 1 GB")
 
 
 def _unforeseen(error: Exception) -> StageError:
