@@ -122,7 +122,7 @@ def _classify(options: argparse.Namespace) -> int:
         print("1 input, in one piece")
         return 0
     end_at_once(options)
-    if options.is_program:  # laspy loads them, half of its import, for what it is not asked here
+    if options.is_program and not options.polygons:  # laspy loads them, half of its import, for nothing
         sys.modules.update(dict.fromkeys({"requests", "pyproj"} - sys.modules.keys()))  # type: ignore[arg-type]
     written = task.run_whole()
     print_messages(*written.messages)
