@@ -15,13 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from leave_one_out import NAMES, tables
-from leave_one_out import THINNED as LEFT_OUT_THINNED
+from leave_one_out import NAMES, THINNED, tables
 from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
 from rules import table
 from sources import SOURCES
-from surveys import SHIPPED, SURVEYS
-from unseen import THINNED
+from surveys import SHIPPED, SURVEYS, UNLIKE
 
 from pdal_stages import load_model
 from pdal_stages.stages.preparation import PREPARATION, as_json
@@ -35,17 +33,15 @@ def at(runs: list[dict[str, Any]], density: float | None) -> list[dict[str, Any]
 
 def by_class(runs: list[dict[str, Any]]) -> str:
     """A table for each class as Markdown: precision and recall by landscape and density, all surveys weighing alike."""
-    thinned = tuple(zip(THINNED, LEFT_OUT_THINNED, strict=True))
-    lines, where = [], ("as flown", *(f"{a:g} or {b:g}/m²" for a, b in thinned))
+    lines, where = [], ("as flown", *(f"{density:g}/m²" for density in THINNED))
     for number, (code, name) in enumerate(NAMES.items()):
         heads = [f"{density}: precision | recall" for density in where]
         lines += [f"| **{name}** in | {' | '.join(heads)} |", f"|---|{'---:|' * 2 * len(heads)}"]
         for landscape in dict.fromkeys(survey.landscape for survey in SURVEYS.values()):
             cells, surveys = [], []
-            for densities in ((None,), *thinned):
+            for density in (None, *THINNED):
                 shares = [
                     np.array(run["matrix"]) / run["points"]
-                    for density in densities
                     for run in at(runs, density)
                     if (survey := SURVEYS[run["cloud"].split(",")[0]]).landscape == landscape
                     and survey.tells(code)
@@ -130,7 +126,7 @@ def main() -> None:
             classes=by_class([*scores["surveys"], *unseen["surveys"]]),
             unseen=tables(unseen["surveys"], []).replace("survey left out", "survey"),
             others=len(at(unseen["surveys"], None)),
-            shipped=len(SHIPPED),
+            left=", ".join(UNLIKE),
             surveys="\n".join(surveys),
             rules=table(json.loads(args.rules.read_text())),
             count=OPTIONS.count,

@@ -132,7 +132,7 @@ SURVEYS = {
         fold=5,
         dropped=(7, 18, 26, 1),
         returns=False,
-        samples=300,
+        samples=12,
     ),
     "bank": LabeledSurvey(
         ("rural/lidarhd_bank.laz",),
@@ -142,7 +142,7 @@ SURVEYS = {
         SLOPE,
         fold=6,
         dropped=(7, 18, 65),
-        samples=150,
+        samples=12,
     ),
     "town's edge": LabeledSurvey(
         ("rural/ign_0p3ppm2.laz",),
@@ -176,7 +176,7 @@ SURVEYS = {
         fold=9,
         tall={1: 2.0},
         tall_scored=True,
-        samples=150,
+        samples=12,
     ),
     "pines": LabeledSurvey(
         ("us/neon_osbs.laz",),
@@ -185,7 +185,7 @@ SURVEYS = {
         _NEON,
         FOREST,
         fold=10,
-        samples=150,
+        samples=12,
     ),
     "Amsterdam": LabeledSurvey(
         ("nl/amsterdam_2386_9702.laz", "nl/amsterdam_2397_9705.laz"),
@@ -216,7 +216,7 @@ SURVEYS = {
         fold=1,
         tall={1: 2.0},
         tall_scored=True,
-        samples=80,
+        samples=12,
     ),
     "school": LabeledSurvey(
         ("nl/delft_ahn4.laz",),
@@ -225,7 +225,7 @@ SURVEYS = {
         _AHN,
         TOWN,
         fold=1,
-        samples=80,
+        samples=12,
     ),
     "small town": LabeledSurvey(
         ("fr/town_0382_6565.laz",),
@@ -261,7 +261,7 @@ SURVEYS = {
         FARMLAND,
         fold=7,
         dropped=(7, 18, 65),
-        samples=40,
+        samples=12,
     ),
     "rocks": LabeledSurvey(
         ("fr/corsica.laz",),
@@ -291,7 +291,7 @@ SURVEYS = {
         FOREST,
         fold=6,
         dropped=(7, 18, 65),
-        samples=60,
+        samples=12,
     ),
     "bush": LabeledSurvey(
         ("nz/westport.laz",),
@@ -309,7 +309,7 @@ SURVEYS = {
         _NEON,
         FOREST,
         fold=10,
-        samples=60,
+        samples=12,
     ),
     "Rockies": LabeledSurvey(
         ("us/neon_rmnp.las",),
@@ -318,7 +318,7 @@ SURVEYS = {
         _NEON,
         FOREST,
         fold=7,
-        samples=60,
+        samples=12,
     ),
     "firs": LabeledSurvey(
         ("us/fusion.laz",),
@@ -329,7 +329,7 @@ SURVEYS = {
         fold=8,
         tall={1: 2.0},
         tall_scored=True,
-        samples=150,
+        samples=12,
     ),
     "valley": LabeledSurvey(
         ("ca/alberta_sample1_test.laz",),
@@ -340,7 +340,7 @@ SURVEYS = {
         fold=2,
         dimension="Veg",
         low={1: 0.3},
-        samples=150,
+        samples=12,
     ),
     "alps": LabeledSurvey(
         ("ca/alberta_sample2_test.laz", "ca/alberta_sample3_train.laz", "ca/alberta_sample4_test.laz"),
@@ -362,8 +362,11 @@ SURVEYS = {
         fold=3,
         tall={1: 2.0},
         tall_scored=True,
-        samples=150,
+        samples=12,
     ),
 }
-#: What the shipped model was trained on; the others it has not seen.
-SHIPPED = tuple(SURVEYS)[:11]
+#: What the shipped model is not trained on. Nothing else looks like these: where such a survey is left out, the first pass
+#: is wrong in much of it, which teaches the passes after it to distrust what the first is right about in towns.
+UNLIKE = ("rocks", "scrub", "bush", "alps")
+#: What it is trained on.
+SHIPPED = tuple(name for name in SURVEYS if name not in UNLIKE)

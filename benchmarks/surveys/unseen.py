@@ -12,14 +12,11 @@ import json
 from pathlib import Path
 
 from clouds import load, thinned
-from leave_one_out import score
+from leave_one_out import THINNED, score
 from sources import check
 from surveys import SURVEYS
 
 from pdal_stages import Model, load_model
-
-#: Points per square meter that the surveys are thinned to.
-THINNED = (4.0, 1.0)
 
 
 def not_trained_on(model: Model) -> list[str]:
