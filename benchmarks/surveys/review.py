@@ -22,7 +22,7 @@ import laspy
 import numpy as np
 from clouds import slug, true_classes
 from folds import TREES, LeaveOneOut
-from surveys import SHIPPED, SURVEYS
+from surveys import SHIPPED, SURVEYS, VEGETATION
 
 import pdal_stages
 from pdal_stages import cli
@@ -67,8 +67,10 @@ def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.
     codes = []
     for number, file in enumerate(survey.files):
         las = laspy.read(data / file)
-        las.points = las.points[~np.isin(las.classification, survey.dropped)]
-        codes.append(np.asarray(las.classification).astype(np.uint8))
+        if str(las.header.version) == "1.0":  # which laspy does not write
+            las = laspy.convert(las, file_version="1.2")
+        las.points = las.points[~np.isin(las[survey.dimension], survey.dropped)]
+        codes.append(np.asarray(las[survey.dimension]).astype(np.uint8))
         las.write(folder / "raw" / f"{number}.laz")
     inputs = [str(path) for path in sorted((folder / "raw").iterdir())]
     target = str(folder / "classified") + "/"
@@ -90,7 +92,7 @@ def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.
 
 def sureness(surveys: Sequence[Classified]) -> Sureness:
     """How often the models were right where they were how sure, where the labels say what vegetation is."""
-    told = [one for one in surveys if not SURVEYS[one.name].tall]
+    told = [one for one in surveys if not SURVEYS[one.name].tall and SURVEYS[one.name].tells(VEGETATION)]
     out = Sureness(
         about=f"{len(told)} surveys ({', '.join(one.name for one in told)}), each classified by a model that had not seen it"
     )
@@ -133,6 +135,8 @@ def judged(one: Classified) -> tuple[int, int, float, float, float]:
 def _first(cells: ReviewCells, true: np.ndarray) -> float:
     """Share of the wrong points in the patches that come first, up to a tenth of the area; of the last as much as fits."""
     patches = find_patches(cells)
+    if not len(patches):
+        return 0.0
     area, held = np.cumsum(patches.area), np.cumsum(np.bincount(patches.of_cell, true, len(patches)))
     at = np.interp(FIRST * area[-1], np.append(0.0, area), np.append(0.0, held))
     return float(at / max(held[-1], 1))
