@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import laspy
 import numpy as np
@@ -116,9 +118,8 @@ def test_shapes_of_all_kinds(tmp_path):
     arrays = cloud()
     bow = shapely.Polygon([(85000, 446000), (85020, 446020), (85020, 446000), (85000, 446020)])
     solid = shapely.force_3d(shapely.MultiPolygon([shapely.box(85060, 446070, 85090, 446090)]), 3.0)
-    mixed = shapely.GeometryCollection(
-        [shapely.Point(85001, 446099), shapely.box(85000, 446080, 85020, 446099)]
-    )
+    parts = [shapely.Point(85001, 446099), shapely.box(85000, 446080, 85020, 446099)]
+    mixed = shapely.GeometryCollection(parts)
     shapes = [bow, solid, mixed]
     path = tmp_path / "kinds.gpkg"
     pyogrio.raw.write(
@@ -128,8 +129,7 @@ def test_shapes_of_all_kinds(tmp_path):
     found, _ = run([f"{path}=9"], arrays)
     shapes = [shapely.make_valid(bow), shapely.force_2d(solid), mixed.geoms[1]]
     assert np.array_equal(found == 9, inside(arrays, *shapes) & (arrays["Classification"] == 2))
-    found, report = run([f"{write(tmp_path / 'far.gpkg', [shapely.box(0, 0, 1, 1)])}=9"], arrays)
-    assert np.array_equal(found, arrays["Classification"])
+    _, report = run([f"{write(tmp_path / 'far.gpkg', [shapely.box(0, 0, 1, 1)])}=9"], arrays)
     assert not next(iter(report.figures["polygons"].values()))["points"]
 
 
@@ -183,19 +183,19 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las, capfd):
 
 @pytest.mark.pdal
 def test_water_of_delft_on_the_command_line(tmp_path, capsys, data_dir):
-    water = data_dir / "delft/water_train.geojson"
+    shapes = shapely.from_wkb(pyogrio.raw.read(str(data_dir / "delft/water_train.geojson"))[2])
+    water = write(tmp_path / "water.gpkg", shapes, 4258)
     las = laspy.read(data_dir / "delft/train.laz")
-    near = (np.abs(las.x - 84825) < 25) & (np.abs(las.y - 447545) < 25)
-    las.points = las.points[near]
+    las.points = las.points[(np.abs(las.x - 84825) < 25) & (np.abs(las.y - 447545) < 25)]
+    las.header.add_crs(pyproj.CRS(RD))
     las.write(tmp_path / "in.laz")
     out = tmp_path / "out.laz"
     words = ["classify", str(tmp_path / "in.laz"), str(out), "--polygons", f"{water}=9"]
-    assert main(words) == 0
+    program = [sys.executable, "-m", "pdal_stages.cli"]  # which does without pyproj where it can
+    said = subprocess.check_output([*program, *words], text=True)
     codes = np.asarray(laspy.read(out).classification)
-    assert (codes == 9).any() and "  9 Water" in capsys.readouterr().out
-    shapes = shapely.from_wkb(pyogrio.raw.read(str(water))[2])
-    points = shapely.points(las.x, las.y)
-    at = np.any([shapely.intersects(shape, points) for shape in shapes], axis=0)
+    assert (codes == 9).any() and "  9 Water" in said
+    at = inside({"X": las.x, "Y": las.y}, *shapes)
     assert not (codes[~at] == 9).any() and not (codes[at] == 2).any()
     assert main([*words, "--where", "Classification == 1"]) == 1
     assert "--where by Classification cannot be combined with --polygons" in capsys.readouterr().err

@@ -32,6 +32,8 @@ from pdal_stages import Model, load_model
 from pdal_stages.reports.views import BACKGROUND, CLASS_COLORS, png, triptych
 
 PLACES, COLUMNS, SEED = 10, 2, 1
+#: Points that a picture must show: of fewer nothing can be seen.
+SHOWN = 200
 #: A place is so many meters wide, and its section so high and, where points are dense, thick.
 SIDE, HIGH, THICK = 36.0, 18.0, 2.0
 #: Of a panel from above, of the space between panels, of a line of text, in pixels.
@@ -69,6 +71,12 @@ class Place:
         """Whether one picture would show both."""
         away = self.of.cloud.xyz[self.row, :2] - other.of.cloud.xyz[other.row, :2]
         return self.of is other.of and bool((np.abs(away) < SIDE).all())
+
+    @property
+    def shown(self) -> np.ndarray:
+        """(n,) points that the picture shows from above."""
+        corner = self.of.cloud.xyz[self.row, :2] - SIDE / 2
+        return ((self.of.cloud.xyz[:, :2] >= corner) & (self.of.cloud.xyz[:, :2] < corner + SIDE)).all(axis=1)
 
     @property
     def told(self) -> dict[str, str | int]:
@@ -109,7 +117,7 @@ def draw(surveys: list[Classified], random: np.random.Generator) -> list[Place]:
     for one in random.choice(len(size), len(size), replace=False, p=size / size.sum()):
         at = random.choice(np.flatnonzero(patch == one))
         place = Place(surveys[survey[at]], int(rows[at]), int(size[one]))
-        if not any(place.near(other) for other in out):
+        if not any(place.near(other) for other in out) and place.shown.sum() >= SHOWN:
             out.append(place)
         if len(out) == PLACES:
             break
@@ -120,7 +128,7 @@ def from_above(place: Place, codes: np.ndarray) -> Image.Image:
     """Heights and classes, side by side, with the point and the line of the section."""
     xyz = place.of.cloud.xyz
     corner = xyz[place.row, :2] - SIDE / 2
-    inside = ((xyz[:, :2] >= corner) & (xyz[:, :2] < corner + SIDE)).all(axis=1)
+    inside = place.shown
     x, y, z = xyz[inside].T
     scale = WIDTH / SIDE
     wide = max(int(scale * np.ptp(x)), 16)
