@@ -75,7 +75,7 @@ def test_the_shipped_model_says_what_it_costs():
     }
     standard = of_the_base({}, {}, find("standard"))
     joined = of_the_base(own, {}, find("standard"))
-    assert joined["about"] == standard["about"] and standard["about"].startswith("its base (8 surveys")
+    assert joined["about"] == standard["about"] and standard["about"].startswith("its base (15 surveys")
     assert joined["classes"] == {**standard["classes"], "14": own["classes"]["14"]}
     assert of_the_base(own, {}, "nowhere.model") == own
     sure = ClassifyRequest(keep_sure=0.98).cost  # buildings stay with 98 %, too
