@@ -366,7 +366,7 @@ SURVEYS = {
     ),
 }
 #: What the shipped model is not trained on. Nothing else looks like these: where such a survey is left out, the first pass
-#: is wrong in much of it, which teaches the passes after it to distrust what the first is right about in towns.
+#: is wrong in much of it, which likely teaches the passes after it to distrust what the first is right about in towns.
 UNLIKE = ("rocks", "scrub", "bush", "alps")
 #: What it is trained on.
 SHIPPED = tuple(name for name in SURVEYS if name not in UNLIKE)
