@@ -25,7 +25,7 @@ from surveys import SHIPPED, SURVEYS
 
 from pdal_stages import Model, TrainingCloud, load_model
 from pdal_stages.accuracy import Accuracy
-from pdal_stages.reports.views import triptych, write_png
+from pdal_stages.reports.views import png, triptych
 
 #: Points per square meter that the surveys are thinned to.
 THINNED = (4.0, 1.0)
@@ -39,7 +39,7 @@ def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str,
     if pictures is not None:
         shown = cloud.truth > 0
         drawn = triptych(*cloud.xyz[shown].T, found[shown], cloud.truth[shown])
-        write_png(pictures / f"standard-{cloud.name.replace(' ', '-')}.png", drawn)
+        (pictures / f"standard-{cloud.name.replace(' ', '-')}.png").write_bytes(png(drawn))
     known = cloud.truth > 0
     codes = sorted(set(cloud.truth[known].tolist()) | {2, 5, 6})
     result = Accuracy.from_labels(cloud.truth[known], found[known], classes=codes)

@@ -73,6 +73,9 @@ TOWN, FARMLAND, FOREST = "town", "village and farmland", "forest"
 SLOPE, COAST = "steep slope", "rocks and scrub"
 CLASSES = {2: GROUND, 4: VEGETATION, 5: VEGETATION, 6: BUILDING}
 TWO = {2: GROUND, 6: BUILDING, 9: GROUND}
+WILD = {2: GROUND, 4: VEGETATION, 5: VEGETATION}
+#: Samples of each class from each copy of what is alike all over, or has one building.
+FEW = 12
 SURVEYS = {
     "Montpellier": LabeledSurvey(
         (
@@ -132,7 +135,7 @@ SURVEYS = {
         fold=5,
         dropped=(7, 18, 26, 1),
         returns=False,
-        samples=12,
+        samples=FEW,
     ),
     "bank": LabeledSurvey(
         ("rural/lidarhd_bank.laz",),
@@ -142,7 +145,7 @@ SURVEYS = {
         SLOPE,
         fold=6,
         dropped=(7, 18, 65),
-        samples=12,
+        samples=FEW,
     ),
     "town's edge": LabeledSurvey(
         ("rural/ign_0p3ppm2.laz",),
@@ -176,7 +179,7 @@ SURVEYS = {
         fold=9,
         tall={1: 2.0},
         tall_scored=True,
-        samples=12,
+        samples=FEW,
     ),
     "pines": LabeledSurvey(
         ("us/neon_osbs.laz",),
@@ -185,7 +188,7 @@ SURVEYS = {
         _NEON,
         FOREST,
         fold=10,
-        samples=12,
+        samples=FEW,
     ),
     "Amsterdam": LabeledSurvey(
         ("nl/amsterdam_2386_9702.laz", "nl/amsterdam_2397_9705.laz"),
@@ -216,7 +219,7 @@ SURVEYS = {
         fold=1,
         tall={1: 2.0},
         tall_scored=True,
-        samples=12,
+        samples=FEW,
     ),
     "school": LabeledSurvey(
         ("nl/delft_ahn4.laz",),
@@ -225,7 +228,7 @@ SURVEYS = {
         _AHN,
         TOWN,
         fold=1,
-        samples=12,
+        samples=FEW,
     ),
     "small town": LabeledSurvey(
         ("fr/town_0382_6565.laz",),
@@ -255,17 +258,17 @@ SURVEYS = {
     ),
     "fields": LabeledSurvey(
         ("fr/fields_0484_6632.laz",),
-        {2: GROUND, 4: VEGETATION, 5: VEGETATION},
+        WILD,
         "French fields with a few trees",
         _LIDARHD,
         FARMLAND,
         fold=7,
         dropped=(7, 18, 65),
-        samples=12,
+        samples=FEW,
     ),
     "rocks": LabeledSurvey(
         ("fr/corsica.laz",),
-        {2: GROUND, 4: VEGETATION, 5: VEGETATION, 9: GROUND},
+        {**WILD, 9: GROUND},
         "Corsican rocks in the sea, up to 40 m high",
         _LIDARHD,
         COAST,
@@ -275,7 +278,7 @@ SURVEYS = {
     ),
     "scrub": LabeledSurvey(
         ("fr/scrub_0698_6259.laz",),
-        {2: GROUND, 4: VEGETATION, 5: VEGETATION},
+        WILD,
         "French hillside with scrub and a bridge",
         _LIDARHD,
         COAST,
@@ -285,17 +288,17 @@ SURVEYS = {
     ),
     "river": LabeledSurvey(
         ("fr/river_0689_6735.laz",),
-        {2: GROUND, 4: VEGETATION, 5: VEGETATION, 9: GROUND},
+        {**WILD, 9: GROUND},
         "French trees along a river",
         _LIDARHD,
         FOREST,
         fold=6,
         dropped=(7, 18, 65),
-        samples=12,
+        samples=FEW,
     ),
     "bush": LabeledSurvey(
         ("nz/westport.laz",),
-        {2: GROUND, 4: VEGETATION, 5: VEGETATION},
+        WILD,
         "New Zealand bush on steep slopes",
         "Toitu Te Whenua LINZ, CC BY 4.0",
         SLOPE,
@@ -309,7 +312,7 @@ SURVEYS = {
         _NEON,
         FOREST,
         fold=10,
-        samples=12,
+        samples=FEW,
     ),
     "Rockies": LabeledSurvey(
         ("us/neon_rmnp.las",),
@@ -318,7 +321,7 @@ SURVEYS = {
         _NEON,
         FOREST,
         fold=7,
-        samples=12,
+        samples=FEW,
     ),
     "firs": LabeledSurvey(
         ("us/fusion.laz",),
@@ -329,7 +332,7 @@ SURVEYS = {
         fold=8,
         tall={1: 2.0},
         tall_scored=True,
-        samples=12,
+        samples=FEW,
     ),
     "valley": LabeledSurvey(
         ("ca/alberta_sample1_test.laz",),
@@ -340,7 +343,7 @@ SURVEYS = {
         fold=2,
         dimension="Veg",
         low={1: 0.3},
-        samples=12,
+        samples=FEW,
     ),
     "alps": LabeledSurvey(
         ("ca/alberta_sample2_test.laz", "ca/alberta_sample3_train.laz", "ca/alberta_sample4_test.laz"),
@@ -362,7 +365,7 @@ SURVEYS = {
         fold=3,
         tall={1: 2.0},
         tall_scored=True,
-        samples=12,
+        samples=FEW,
     ),
 }
 #: What the shipped model is not trained on. Nothing else looks like these: where such a survey is left out, the first pass
