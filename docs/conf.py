@@ -26,7 +26,7 @@ release = version = __version__
 extensions = ["myst_parser", "sphinx_design", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "stage_texts"]
 html_theme = "pydata_sphinx_theme"
 html_title = "pdal_stages"
 html_theme_options = {

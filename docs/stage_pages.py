@@ -1,4 +1,4 @@
-"""Pages of stages, generated from their declarations: the same declaration gives JSON Schema, help, errors and these.
+"""Pages of stages: what is written of each in docs/stage_texts, with tables of its declarations, as JSON Schema has them.
 
 python docs/stage_pages.py        # writes docs/stages/*.md
 """
@@ -7,53 +7,45 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
-from pdal_stages.base.errors import StageError
 from pdal_stages.stages.base import Stage, stage_types
 
 FOLDER = Path(__file__).resolve().parent / "stages"
+#: What is written by hand of each stage: what it does, an example; the dimensions, where that needs files.
+TEXTS = FOLDER.with_name("stage_texts")
 
 
 def page(stage: type[Stage]) -> str:
     """One stage in the shape of PDAL's stage pages."""
-    made = _example(stage)
+    text = (TEXTS / f"{stage.type}.md").read_text(encoding="utf-8").strip()
     lines = [f"# {stage.type}", "", f"{stage.summary}.", ""]
-    doc = (stage.details or "").strip()
-    if doc:
-        lines += [doc, ""]
     if stage.source:
         lines += [f"Source: {stage.source} (see [the papers](../papers.md)).", ""]
-    lines += [
-        "## Example",
-        "",
-        "```json",
-        json.dumps(["input.laz", *stage.before, stage.example, *stage.after], indent=4),
-        "```",
-        "",
-    ]
-    lines += ["## Dimensions", ""]
-    if made is not None:
+    lines += [text, ""]
+    if "## Dimensions" not in text:
+        made = stage({name: value for name, value in example(stage).items() if name != "type"})
         reads, creates = made.reads(), made.creates()
         lines += [
+            "## Dimensions",
+            "",
             f"- Reads: X, Y, Z{''.join(f', {name}' for name in reads)}",
             f"- Writes: {', '.join(f'`{name}` ({kind})' for name, kind in list(creates.items())[:8]) or 'none'}"
             + (f" and {len(creates) - 8} more" if len(creates) > 8 else ""),
             f"- Halo: {made.halo_m():g} m round a tile, with the example's options",
             "",
         ]
-    elif stage.dimensions_help:
-        lines += [stage.dimensions_help, ""]
     lines += ["## Options", "", "| option | default | meaning |", "|---|---|---|"]
     lines += [_row(stage, option) for option in stage.all_options()]
     lines += ["| `tag`, `inputs` | | As in every PDAL stage |", ""]
     return "\n".join(lines)
 
 
-def _example(stage: type[Stage]) -> Stage | None:
-    try:
-        return stage({k: v for k, v in stage.example.items() if k != "type"})
-    except StageError:  # an example that names a file which is not here
-        return None
+def example(stage: type[Stage]) -> dict[str, Any]:
+    """The stage in the pipeline that its text shows."""
+    text = (TEXTS / f"{stage.type}.md").read_text(encoding="utf-8")
+    pipeline = json.loads(text.partition("```json\n")[2].partition("\n```")[0])
+    return next(one for one in pipeline if isinstance(one, dict) and one.get("type") == stage.type)
 
 
 def _row(stage: type[Stage], option) -> str:

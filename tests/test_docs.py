@@ -12,6 +12,7 @@ import sys
 import types
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -114,8 +115,12 @@ def test_stage_pages_are_made_from_the_registry(monkeypatch):
     for stage in stage_types().values():
         text = stage_pages.page(stage)
         assert all(f"`{option.name}`" in text for option in stage.all_options())
-        example = json.loads(blocks_of(text, "json")[0])
-        assert stage.example in example
+        assert all(heading in text for heading in ("## Example", "## Dimensions"))
+        example, schema = stage_pages.example(stage), stage.schema()
+        jsonschema.Draft202012Validator.check_schema(schema)
+        jsonschema.validate(example, schema)
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate({**example, "nonsense": 1}, schema)
     assert all(name in stage_pages.index() for name in stage_types())
 
 

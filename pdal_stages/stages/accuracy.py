@@ -79,31 +79,6 @@ class AccuracyStage(Stage):
     )
     files: list[str] = option("list", (), "Files that the report names; default: those of the readers")
     print_table: bool = option("boolean", True, "Print the table on standard output", name="print")
-    details = """
-Prints the table of overall accuracy, kappa, mean class recall and precision, mean F1 and the figures of each class
-on standard output; `json` and `html` write them to files. Keep the labels before classifying with
-`{"type": "filters.ferry", "dimensions": "Classification=>Reference"}`. Dimensions `Reliability` and `Margin`, where
-present, add a reliability curve and the error by margin.
-
-What is scored follows one rule, the one that training follows. With a model, its classes are scored, each made of the
-labels that it was trained on: a model of vegetation from 3, 4 and 5 counts all three as vegetation, and a binary
-model everything else that it was trained on as background. (A model of labels that are not ASPRS codes expects a
-reference in the codes that it writes.) Without one, every class of the reference is scored but 0
-and 1 (unclassified), 7 and 18 (noise) and 12 (overlap), which do not say what a point is. All other points are left
-out and counted. `classes`, `ignore` and `merge` overrule this.
-"""
-    before = (
-        {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
-        {"type": "filters.hag_minima"},
-        {"type": "filters.modelclassifier", "model": "town.model"},
-    )
-    after = ()
-    example = {
-        "type": "filters.accuracy",
-        "reference": "Reference",
-        "json": "accuracy.json",
-        "html": "accuracy.html",
-    }
 
     @classmethod
     def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

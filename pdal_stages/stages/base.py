@@ -62,16 +62,6 @@ class Stage(ABC):
     type: ClassVar[str]
     summary: ClassVar[str]
     source: ClassVar[str] = ""
-    example: ClassVar[dict[str, Any]] = {}
-    #: Stages shown round the example in the docs.
-    before: ClassVar[tuple[dict[str, Any], ...]] = ()
-    after: ClassVar[tuple[Any, ...]] = (
-        {"type": "writers.las", "filename": "output.laz", "forward": "all", "extra_dims": "all"},
-    )
-    #: Paragraphs of the docs page (Markdown).
-    details: ClassVar[str] = ""
-    #: Dimensions, for the docs of a stage whose example cannot be made without a file.
-    dimensions_help: ClassVar[str] = ""
     #: What `where` means here.
     where_help: ClassVar[str] = ""
     #: Whether `where` only chooses what to compute, so that tiles may narrow it down to what is seen.

@@ -23,20 +23,6 @@ class Bridges(ClassStage):
     code: int = option("integer", BRIDGE, "Class code of bridge decks", minimum=0, maximum=255)
     ignore: Selection = ignore_option("Points that keep their class")
     keep: Selection = keep_option("Further points that keep their class")
-    details = """
-Comes after a classification, and after `filters.hag_morphological` with `"decks": true`, which finds the decks by their
-shape: a classifier cannot know a deck from a road or a roof by what is near a point. All points of a deck's surface get the
-class; parapets, flanks and what stands on the deck get it where they are called ground or building. Vegetation, wires and
-lamps above keep theirs. The heights above ground are measured from the terrain below the bridge.
-
-Metadata count the points of decks (`decks`), of them those that rise or hang from it (`parts`), and the classes that
-they leave (`left`).
-"""
-    before = (
-        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "decks": True},
-        {"type": "filters.modelclassifier", "model": "standard"},
-    )
-    example = {"type": "filters.bridges"}
 
     def reads(self) -> list[str]:
         return ["Classification", "Deck"]

@@ -107,28 +107,6 @@ class ClassifierModel(Stage):
     memory: int = trained(
         "memory_mb", kind="integer", default=512, name="memory", minimum=16, exclusive=False, maximum=None
     )
-    details = """
-Samples `count` points of each class, spread over space; computes features for the samples only; fits
-histogram thresholds; grows a Random Forest; writes [one model file](../model-file.md). A class with fewer points
-has them several times, and the counts are in the file. For its score a forest of a quarter of the trees is
-cross-validated over spatial blocks, so that neighbors never stand on both sides (`folds` 0: not). With `groups`,
-points of one tile or flight are held out together instead of blocks; `pdal-stages train` holds out each of several
-files. With `passes` 2, a second forest also reads the first one's [probabilities all around a
-point](../model-file.md#context), and is trained on what they are on ground the first has not seen. On top of a `base`
-one pass is for few labels, in the base's voxels; two are for a labeled survey, in voxels of its own: the first reads
-what the base says of a point, the second what the first says all around it. With `"algorithm": "alsnet"` a network is
-trained instead, from `dimensions`, `classes`, `strategy`, `seed` and the options in `alsnet`
-([alsNet](../alsnet.md)). Points of several readers are merged first. `label` names the dimension that holds the
-classes.
-"""
-    before = ({"type": "filters.hag_minima"},)
-    after = ()
-    example = {
-        "type": "writers.classifiermodel",
-        "filename": "town.model",
-        "classes": {"2": "Ground", "5": "High vegetation", "6": "Building"},
-        "count": 10000,
-    }
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
         given = dict(given)

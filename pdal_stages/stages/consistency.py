@@ -34,19 +34,6 @@ class Consistency(ClassStage):
     )
     ignore: Selection = ignore_option("Points that are neither neighbors nor changed")
     keep: Selection = keep_option()
-    details = """
-The last step after a classification. Only ground (2), vegetation (3, 4, 5) and buildings (6) are changed, and only into one
-another; `ground` and `islands` need `HeightAboveGround` and `Ground`; without them they do nothing, which the metadata says.
-Each rule has an option of its name, and its number of changed points in the metadata.
-
-Neighbors are those in 3 x 3 x 3 voxels of 1 m on an absolute grid, so a tile with its halo gets the classes of the whole
-cloud. The feet of walls stay what they are: surveys label them building as often as ground.
-"""
-    before = (
-        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
-        {"type": "filters.modelclassifier", "model": "standard"},
-    )
-    example = {"type": "filters.consistency"}
 
     @property
     def _rules(self) -> list[str]:

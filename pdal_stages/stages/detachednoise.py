@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..base.las import NOISE
 from ..terrain.detached import REACH, detached_noise
-from .base import ClassStage, Stage
+from .base import ClassStage
 from .options import ignore_option, option
 from .points import Points, class_counts
 from .selection import Selection
@@ -45,24 +45,6 @@ class DetachedNoise(ClassStage):
     low_class: int = option("integer", NOISE[0], "Class code of low noise", minimum=0, maximum=255)
     high_class: int = option("integer", NOISE[1], "Class code of high noise", minimum=0, maximum=255)
     ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
-    details = """
-Marks echoes from below the ground (multiple reflections), birds, clouds and the sun, alone or in small clusters, in clouds
-of any density. Put it first: one echo 10 m below ground spoils a ground filter, and features, for many meters around.
-
-A point is suspect if it is of a cluster of at most `cluster` points that nothing joins to the rest of the cloud, or of one
-of any size, at most 15 m wide, that lies under others in nearly all of its columns. A suspect
-that lies above all that is near by more than `gap` is high noise (18); one that lies below a plane under its
-surroundings by more than `depth` is low noise (7). Not marked are what hangs in line with others, as wires do; what is as
-deep as ground near by, as courtyards and wells of light are; what is more than a fortieth of all around, or under a closed
-canopy about as deep as what is low around, as the ground that shows in single points is; and whatever has too little
-around it to be judged by. The thinner the cloud, the more it takes: at 0.3 points/m2 a tree may be a single point, and only
-what is some 15 m above everything is marked.
-
-Nothing depends on the order of points, and the grid is anchored to absolute coordinates: a tile with its halo gets the
-marks of the whole cloud. The counts are in the metadata as `low` and `high`.
-"""
-    after = ({"type": "filters.hag_morphological"}, *Stage.after)
-    example = {"type": "filters.detachednoise"}
 
     def halo_m(self) -> float:
         return REACH

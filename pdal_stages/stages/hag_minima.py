@@ -38,19 +38,6 @@ class HagMinima(Stage):
         unit="m",
     )
     ignore: Selection = ignore_option("Points that do not form the terrain but still receive heights")
-    details = """
-The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centers and
-evaluated on a fine grid; a point's height is its Z minus the value of the fine cell it falls in. Both grids are
-anchored to absolute coordinates (`floor(x / cell)`), so every tile of a survey sees the same cells. Empty coarse cells
-are counted in the metadata and filled from those with points that lie no more than 1.5 cells farther than the nearest one,
-weighted by one over the fourth power of the distance between cell centers; the paper does not speak of empty cells.
-
-The terrain is coarse on purpose: it needs no ground classification and never fails, and the classifier copes with its
-errors. Where heights themselves matter use `filters.hag_morphological`, or `filters.smrf` with `filters.hag_nn`;
-[the comparison](../benchmarks.md) says how far apart they are. Lengths are meters; `HeightAboveGround` is in
-the unit of Z.
-"""
-    example = {"type": "filters.hag_minima", "cell": 20, "resolution": 0.5}
 
     def check(self) -> None:
         check_sizes(self.cell, self.resolution)

@@ -102,35 +102,6 @@ class HagMorphological(Stage):
         "Also find bridge decks, which then are not ground, and write Deck: 1 on a deck, 2 its parapets, flanks and what "
         "stands on it, else 0",
     )
-    details = """
-The lowest point of every cell of a grid is taken, low outliers left out, alone or in clusters of any number of points that
-others lie above, and the grid opened with
-windows of growing radius: a cell that a window lowers by more than `slope` times its radius, or by 3.5 m, belongs to an
-object.
-A surface is fitted through what is left, ground that was taken from ridges and dams is regained where it continues the
-surface, and what is higher than all around it on every side, up to 200 m wide, is taken away: a roof has no ramp.
-Points within `threshold` plus `scalar` times the terrain's slope of the surface are ground. A point's height is its Z
-minus the surface through the ground points. `Classification` is read for `ignore` alone and not changed; return numbers
-are not looked at.
-
-The options mean what they mean in PDAL's `filters.smrf`. Unlike it, every step reaches a bounded way and the grid is
-anchored to absolute coordinates: a tile with its halo (about 680 m, less with a smaller `window`) gets the heights of
-the whole cloud, bit for bit. Large buildings are removed up to 200 m; what lies far from all ground, such as
-the middle of a large hall, is measured from the openings' level. A point with no usable point near has height 0;
-metadata counts these as `without_terrain`.
-
-`decks` are surfaces one can walk on, at most 60 m wide, that end at a drop (or at water) on both sides and lead on to
-the ground at two opposite ends, or at one and the rim of the cloud: raised in the profile across, level in the profile
-along. With it, the surface runs through the ground below. Clouds of less than 2 points/m2 show too little of them.
-
-`openings` are heights above what remains of the minimum grid when everything narrower than the window is removed. They
-need no threshold and tell a classifier what a point stands on: low above the narrow window and high above the wide one
-is a roof.
-
-Lengths are meters, whatever the unit of the points; `HeightAboveGround` and the heights above openings are in the unit
-of Z.
-"""
-    example = {"type": "filters.hag_morphological", "ground": True}
 
     def check(self) -> None:
         self._filter = FilterOptions(**{one.name: self.options[one.name] for one in fields(FilterOptions)})

@@ -85,24 +85,6 @@ class ModelClassifier(Stage):
     memory: int = option(
         "integer", 256, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
     )
-    details = """
-Computes the features the model needs block by block and classifies them at once, so memory does not grow with their
-number. A model asked for a dimension that the points lack names the dimension and the stage that makes it.
-`Reliability` is the probability of the winning class. PDAL's `filters.neighborclassifier` after this stage takes speckle
-out of a model of one pass.
-Noise and withheld points would spoil the features of all around them, so by default these are as good as not there
-(`ignore`), and keep their class. `keep` names what is a neighbor but is not overwritten. Both are counted in the
-metadata; `"ignore": "", "keep": ""` classifies everything.
-Where a model knows vegetation (5) as one class, `vegetation_heights` splits it by `HeightAboveGround`: 0.5 and 2 m are
-the limits of many national surveys, 2 and 5 m those of others.
-With LAS 1.0-1.3 the synthetic, key-point and withheld flags of each point stay. Codes above 31
-need LAS 1.4 (`"minor_version": 4, "dataformat_id": 6`), which is checked before any work is done.
-"""
-    dimensions_help = """- Reads: X, Y, Z, `Classification`, and what the model names (`pdal-stages model FILE`)
-- Writes: `Classification` (uint8_t), `Reliability` (float); on request `Margin` and `Probability_<code>` (float)
-- Halo: that of the model's neighborhoods"""
-    before = ({"type": "filters.hag_minima"},)
-    example = {"type": "filters.modelclassifier", "model": "town.model"}
 
     def check(self) -> None:
         self.limits  # noqa: B018  refused here where nothing is known of the model

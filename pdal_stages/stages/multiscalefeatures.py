@@ -64,20 +64,6 @@ class MultiscaleFeatures(Stage):
     memory: int = option(
         "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
     )
-    details = """
-Each neighborhood is a token, which ends the dimension's name: `Linearity_c2` is the linearity in the vertical cylinder
-of radius 2 m. See [neighborhoods and features](../features.md) for all tokens, presets and definitions.
-Shape distributions (`shapes`) need histogram thresholds, which are fitted to the points unless `bins` names a file;
-name one when several files must have comparable features. Features are 32-bit floats. LAS writers need
-`"extra_dims": "all"`, and one file describes at most 341 extra dimensions: training and classification compute
-features inside and need no dimensions at all. In clouds of hundreds of points per square meter `voxel` keeps the
-time per point bounded, whatever the radius: see [dense clouds](../features.md#dense-clouds).
-"""
-    example = {
-        "type": "filters.multiscalefeatures",
-        "neighborhoods": "c1,c2,c3,c5,kopt",
-        "feature_set": "covariance,geometric",
-    }
 
     @cached_property
     def plan(self) -> FeaturePlan:

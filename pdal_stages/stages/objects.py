@@ -129,31 +129,6 @@ class ObjectsFilter(ObjectOptions, Stage):
         "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area, of spans their length)",
     )
     refused_class: int = option("integer", 1, "The class that they get", minimum=0, maximum=255)
-    details = """
-Writes `ObjectID`, 0 for points of no object. An id is made of the object's kind and of the cell of an absolute grid that
-stands for it (its southernmost, westernmost one; of a tree that of its top). It is not counted, so the same object has
-the same id in every tile, in any order of points, and in the next run; below 2^53, it is exact in JSON and as a double.
-
-**Buildings** are connected cells with points of a building at least `building_height` above the ground, roofs and facades
-together. Roofs whose heights differ by more than `step` along two thirds of their border are two buildings; small parts
-(dormers, chimneys) go with the roof around them. A roof goes on, up to 3 m, into vegetation in its plane, which a
-classifier took for leaves; those points keep their class. Where nothing at all came back from inside a rim at one height,
-as of a wet roof, the roof is filled, up to 6 m from the rim. **Trees** are crowns: tops of the smoothed canopy that a
-`saddle` of some depth parts from all higher ground, and the cells that climb to them. **Spans** are wires between towers or
-poles, **decks** those of bridges.
-
-Heights are above the ground that the points of its classes show, so `Classification` is all that is read; a mean
-`Reliability`, where points have one, is part of the verdict. Each object is *sure* or *to be checked*, with the reasons:
-small, narrow (nowhere 2 m wide: wires), vehicle or container (a box of the size of one, which some garages have), low,
-rough roof, no facade, no ground near, unsure points, few points, thin crown, wide crown, pole (slim and hollow: lamps),
-short, not straight. Metadata counts objects by kind, verdict and reason. The objects of the reasons in `refuse` lose their
-class (and are counted): their points get `refused_class`, and no `ObjectID`.
-
-Tiles see what it takes: crowns and ground end within 150 m, and where a building reaches into a tile from farther away
-the tile is read wider. To write objects as polygons and points use `pdal-stages objects` or `writers.objects`.
-"""
-    before = ({"type": "filters.modelclassifier", "model": "town.model"},)
-    example = {"type": "filters.objects", "judged": True}
 
     def reads(self) -> list[str]:
         return ["Classification"]

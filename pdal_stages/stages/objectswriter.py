@@ -34,25 +34,6 @@ class ObjectsWriter(ObjectOptions, Stage):
         "Outlines of buildings and decks: straight, along walls, or along cells",
         choices=(STRAIGHT, CELLS),
     )
-    details = """
-The objects are those of `filters.objects`, with the same ids and options. Layers and their columns (measures in meters,
-whatever the unit of the coordinates; names fit into shapefiles):
-
-- `buildings`: polygons. `area`; `h_eave`, `h_ridge` above the ground; `ground`, its elevation; `slope` of the roof in
-  degrees, its number of `planes` and the share of it in planes, `planar`.
-- `trees`: points at the tops; `crowns`: their polygons. `height`, crown's `area` and `diam`eter, `dbh`: the stem's
-  likely diameter at breast height, cm; `ground`.
-- `spans`: lines along wires. `length`, `h_low` (the lowest point above the ground), `z_high`, `sag`.
-- `decks`: polygons of bridges. `area`, `z`, `clear`ance above what is below, `ground`.
-
-All have `object_id`, `points`, `reliab` (the points' mean `Reliability`, where they have one), `verdict` (sure, check) and
-the `reason` of a check. Straight outlines follow the main direction of what stands wall to wall; neighbors that touch share
-their edge; where no straight outline is like the cells, theirs is taken. A GeoPackage carries styles for QGIS, which
-tell what is to be checked; beside other files lies a `.qml`. Needs the extra `vector` (pyogrio, shapely).
-"""
-    before = ({"type": "filters.modelclassifier", "model": "town.model"},)
-    after = ()
-    example = {"type": "writers.objects", "filename": "town.gpkg"}
 
     #: Whether whoever reads the files may take larger cells than `cell` where points are few.
     widens = False

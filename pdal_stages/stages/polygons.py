@@ -26,22 +26,6 @@ class Polygons(ClassStage):
     )
     ignore: Selection = ignore_option("Points that keep their class")
     keep: Selection = keep_option("Further points that keep their class")
-    details = """
-Lays a map over the points: lakes, roads, bridges. A point inside a polygon, or on its edge, gets the code that belongs to
-the file, if its class is one of those that the code may be put in place of: ground (2) unless others are named, so
-that trees over a lake stay trees. Of several files a later one finds what the ones before made.
-
-Polygons are read with GDAL's vector drivers (OGR), only those near the points, and reprojected where their reference
-system is another than the points' (their corners; long edges stay straight). Every point is looked at by itself, so tiles
-have no seams. This takes the extra `vector`: `pip install 'pdal-stages[vector]'`. The counts are in the metadata by file.
-
-PDAL's own `filters.overlay` takes a class from a column of the file instead; it neither reprojects nor looks at the
-class a point has.
-"""
-    dimensions_help = (
-        "- Reads: X, Y, `Classification`\n- Writes: `Classification` (uint8_t)\n- Halo: 0 m round a tile"
-    )
-    example = {"type": "filters.polygons", "polygons": ["lakes.gpkg=9"]}
 
     def check(self) -> None:
         self.overlays = [Overlay.parse(str(one)) for one in self.polygons]

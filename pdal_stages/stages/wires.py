@@ -26,25 +26,6 @@ class Wires(ClassStage):
     tower_code: int = option("integer", TOWER, "Class code of towers and poles", minimum=0, maximum=255)
     ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
     keep: Selection = keep_option()
-    details = """
-Finds wires by their shape, whatever their class was: points more than 4 m above the ground on a straight line of 24 m
-that is filled and around which the air is empty, or of some lines side by side; lines that hang together over 30 m and
-hide nothing: an eave, a cornice or a balcony has no ground below, or none on one side. What goes on along the line is of
-it, up to 6 m into a tree or a tower.
-
-With `towers`, what stands upright and narrow where wires are highest, rising towards it from both sides (or from one, at a
-line's end), gets its class from 0.7 m above the ground on: lattice towers with their arms, and poles. Lamps, trees and masts
-that hold no wires keep theirs. Tiles are read wider for it.
-
-Put it after the classifier. Nothing depends on the order of points, and the grid is anchored to absolute coordinates: a
-tile with its halo gets the wires of the whole cloud. The counts are in the metadata as `wires` and `towers`, the classes
-that they leave as `left`.
-"""
-    before = (
-        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
-        {"type": "filters.modelclassifier", "model": "standard"},
-    )
-    example = {"type": "filters.wires"}
 
     def reads(self) -> list[str]:
         return ["Classification", "HeightAboveGround"]
