@@ -17,55 +17,9 @@ _KINDS = {
     **dict.fromkeys(("list", "numbers", "bands", "codes", "selection"), "List"),
 }
 
-_HEADER = """\
-// Written by pdal_stages from its stages' declarations.
-#pragma once
-
-#include <cstddef>
-
-namespace pdal_stages
-{{
-namespace declared
-{{
-
-constexpr const char *VERSION = {version};
-
-enum class Kind {{ Number, Integer, Boolean, List, Text }};
-
-struct Option
-{{
-    const char *name;
-    Kind kind;
-    bool hasDefault;
-    double number;
-    const char *text;
-    const char *help;
-}};
-
-struct Stage
-{{
-    const char *type;
-    const char *digest;
-    const char *summary;
-    const char *link;
-    const Option *options;
-    std::size_t count;
-}};
-
-{options}
-
-const Stage STAGES[] = {{
-{stages}
-}};
-constexpr std::size_t COUNT = {count};
-
-}} // namespace declared
-}} // namespace pdal_stages
-"""
-
 
 def header() -> str:
-    """The text of ``declarations.hpp``."""
+    """The text of ``declarations.hpp``, which ``stage.cpp`` includes below its types of stages and options."""
     options, stages = [], []
     for number, kind in enumerate(stage_types().values()):
         name = f"OPTIONS_{number}"
@@ -74,12 +28,8 @@ def header() -> str:
         stages.append(
             f"    {{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option) }},"
         )
-    return _HEADER.format(
-        version=json.dumps(__version__),
-        options="\n".join(options),
-        stages="\n".join(stages),
-        count=len(stages),
-    )
+    version = f"constexpr const char *VERSION = {json.dumps(__version__)};"
+    return "\n".join([version, *options, "const Stage STAGES[] = {", *stages, "};", ""])
 
 
 def digest(kind: type[Stage]) -> str:

@@ -12,6 +12,7 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <cstddef>
 #include <cstdint>
 #include <cstdio>
 #include <deque>
@@ -36,13 +37,42 @@
 #include <dlfcn.h>
 #endif
 
+// What the package declares: VERSION, and STAGES with their options.
+namespace declared
+{
+
+enum class Kind { Number, Integer, Boolean, List, Text };
+
+struct Option
+{
+    const char *name;
+    Kind kind;
+    bool hasDefault;
+    double number;
+    const char *text;
+    const char *help;
+};
+
+struct Stage
+{
+    const char *type;
+    const char *digest;
+    const char *summary;
+    const char *link;
+    const Option *options;
+    std::size_t count;
+};
+
 #include "declarations.hpp"
+
+constexpr std::size_t COUNT = sizeof(STAGES) / sizeof(Stage);
+
+} // namespace declared
 
 namespace
 {
 
 using namespace pdal;
-namespace declared = pdal_stages::declared;
 
 // What filters.python runs. No exception may leave it: filters.python releases an exception twice.
 const char *const SCRIPT = R"python(
