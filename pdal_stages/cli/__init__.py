@@ -7,6 +7,7 @@ import atexit
 import contextlib
 import gc
 import importlib
+import itertools
 import os
 import re
 import sys
@@ -104,6 +105,10 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     if not rest or rest[0] not in parser.commands:
         parser.parse_args(rest)  # which shows help or the version, or says what is wrong, and leaves
     command, *rest = rest
+    for before, word in itertools.pairwise([command, *rest]):
+        if not word or re.fullmatch("--[a-z-]+=", word):  # as a path it would be the current folder
+            lacking = f"what follows '{word or before}' is empty: is a variable not set?"
+            parser.commands[command].error(lacking)
     options, unknown = parser.commands[command].parse_known_intermixed_args(rest)
     if unknown:
         near = suggest(unknown[0].partition("=")[0], parser.commands[command]._option_string_actions)

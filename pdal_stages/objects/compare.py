@@ -178,20 +178,16 @@ class Things:
         shapely, pyogrio = vector("shapely"), vector("pyogrio")
         if not Path(path).exists():
             raise StageError("there is no such file", found=path)
-        try:
-            layers = pyogrio.list_layers(path)
-        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
-            raise StageError(
-                "objects are compared in vector files, and GDAL cannot read this one",
-                found=f"{path}: {error}",
-                cure="Of a cloud make one first: pdal-stages objects classified.laz town.gpkg",
-            ) from None
+        what = "objects are compared in vector files, and GDAL cannot read this one"
+        cure = "Of a cloud make one first: pdal-stages objects classified.laz town.gpkg"
+        with reading(path, what, cure) as plain:
+            layers = pyogrio.list_layers(plain)
         for name, kind in layers:
             for what, wanted in _LAYERS.items():
                 if wanted not in str(kind) or (len(layers) > 1 and name != what):
                     continue
-                with reading(path):
-                    about, _, geometry, values = pyogrio.raw.read(path, layer=name)
+                with reading(path) as plain:
+                    about, _, geometry, values = pyogrio.raw.read(plain, layer=name)
                     shapes = shapely.force_2d(shapely.from_wkb(geometry))
                     there = ~shapely.is_missing(shapes) & ~shapely.is_empty(shapes)
                     bounds = shapely.bounds(shapes[there])

@@ -20,7 +20,7 @@ from . import crowns, measure, roofs
 from .cells import Cells, Kind, cell_keys, object_id, unpack
 from .found import Objects, ObjectSettings, Table
 from .measure import Body
-from .view import AROUND, MARGIN, CellView, Window, extent_of
+from .view import AROUND, MARGIN, CellView, Window
 
 #: Meters more that are looked at first: most buildings that reach into a block end there, so few blocks are looked at twice.
 AHEAD = 64.0
@@ -54,11 +54,10 @@ def find_objects(
         _, row, column = unpack(cells.of_kind(kind).key)
         for north, east in np.unique(np.stack([row // block, column // block]), axis=1).T.tolist():
             of_block.setdefault((north, east), []).append(kind)
-    extent = extent_of(cells) if len(cells) else Window(0, 0, 0, 0)
     with Progress(len(of_block), "objects", "blocks", enabled=progress) as line:
         for (north, east), kinds in of_block.items():
             core = Window(north * block, east * block, block, block)
-            near = CellView(cells, core.widened(round((MARGIN + AHEAD) / cells.size)), extent, chosen)
+            near = CellView(cells, core.widened(round((MARGIN + AHEAD) / cells.size)), chosen)
             for kind in kinds:
                 found[kind] += _FINDERS[kind](near, core, kind)
             line.update()

@@ -8,13 +8,17 @@ direction get the same coordinate at both ends, the median of what their cells s
 from __future__ import annotations
 
 import ctypes
+import glob
 import math
 import multiprocessing
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -41,22 +45,33 @@ def vector(name: str) -> Any:
     return optional_import(name, "vector", "work with vector data")
 
 
+def is_odd(path: str) -> bool:
+    """Whether pyogrio takes a file for another: up to '!' it sees an archive, after ';' parameters, and only UTF-8."""
+    return "://" not in path and bool(re.search("[!\ud800-\udfff]|;[^/]*$", os.path.abspath(path)))
+
+
 @contextmanager
-def reading(path: str) -> Iterator[None]:
-    """What GDAL, GEOS and PROJ raise over a file, as an error of ours."""
-    try:
-        if set(path) & {"!", ";"}:  # GDAL would read another file
-            raise ValueError("GDAL reads no names with '!' or ';': rename it")
-        yield
-    except (StageError, MemoryError):
-        raise
-    except Exception as error:  # each package has its own
-        raise StageError(
-            "the vector file cannot be read",
-            where=path,
-            found=f"{type(error).__name__}: {error}",
-            cure="See whether ogrinfo -al reads it; ogr2ogr -makevalid new.gpkg FILE often mends what can be mended",
-        ) from error
+def reading(
+    path: str,
+    what: str = "the vector file cannot be read",
+    cure: str = "See whether ogrinfo -al reads it; ogr2ogr -makevalid new.gpkg FILE often mends what can be mended",
+) -> Iterator[str]:
+    """A name by which pyogrio finds a file; what GDAL, GEOS and PROJ raise over it is made an error of ours."""
+    with TemporaryDirectory() if is_odd(path) else nullcontext("") as links:
+        try:
+            yield _linked(Path(path).absolute(), Path(links)) if links else path
+        except (StageError, MemoryError):
+            raise
+        except Exception as error:  # each package has its own
+            raise StageError(what, where=path, found=f"{type(error).__name__}: {error}", cure=cure) from error
+
+
+def _linked(file: Path, folder: Path) -> str:
+    """A link to a file, of a plain name, beside links to what belongs to it."""
+    plain = re.sub("[!;\ud800-\udfff]", "_", file.stem)
+    for one in file.parent.glob(f"{glob.escape(file.stem)}.*"):
+        (folder / (plain + one.name.removeprefix(file.stem))).symlink_to(one)
+    return str(folder / (plain + file.suffix))
 
 
 def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -53,8 +53,8 @@ class Overlay:
         """The layer that will be read."""
         if "://" not in self.file and not Path(self.file).exists():
             raise StageError("the file of polygons does not exist", where=self.file, cure="Check the path")
-        with reading(self.file):
-            listed = vector("pyogrio").list_layers(self.file)
+        with reading(self.file) as name:
+            listed = vector("pyogrio").list_layers(name)
         layers = [str(name) for name, kind in listed if _POLYGONS.search(str(kind))]
         layer = self.layer or (layers[0] if len(layers) == 1 else "")
         if layer not in layers:
@@ -85,16 +85,14 @@ def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     layer = overlay.check()
     note, forward = "", None
-    with reading(overlay.file):
-        crs = pyogrio.read_info(overlay.file, layer=layer)["crs"]
+    with reading(overlay.file) as name:
+        crs = pyogrio.read_info(name, layer=layer)["crs"]
     if crs and wkt:
         forward, box = _transform(overlay.file, crs, wkt, box)
     else:
         note = f"{overlay.file}: {'the points have' if crs else 'it has'} no reference system: the same was assumed"
-    with reading(overlay.file):
-        _, _, geometry, _ = pyogrio.raw.read(
-            overlay.file, layer=layer, columns=[], bbox=box, where=where or None
-        )
+    with reading(overlay.file) as name:
+        _, _, geometry, _ = pyogrio.raw.read(name, layer=layer, columns=[], bbox=box, where=where or None)
         shapes = shapely.force_2d(shapely.get_parts(shapely.get_parts(shapely.from_wkb(geometry))))
         shapes = shapes[shapely.get_type_id(shapes) == shapely.GeometryType.POLYGON]
         if forward is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, cached_property
 from typing import NamedTuple
 
@@ -61,22 +61,25 @@ class Window(NamedTuple):
         return self.row <= row < self.row + self.rows and self.column <= column < self.column + self.columns
 
 
-def extent_of(cells: Cells) -> Window:
-    """The rectangle that holds all cells, and an empty rim."""
-    kind, row, column = unpack(cells.key)
-    wide = np.where(kind == Kind.GROUND, GROUND_CELLS, 1)
-    lows = [int((v * wide).min()) - 8 for v in (row, column)]
-    lows = [v - v % GROUND_CELLS for v in lows]
-    sizes = [int(((v + 1) * wide).max()) + 8 - low for v, low in zip((row, column), lows, strict=True)]
-    return Window(*lows, *(n + n % GROUND_CELLS for n in sizes))
+def _extent(parts: Mapping[Kind, Cells]) -> Window:
+    """The rectangle that holds the cells of all kinds, of which there must be one, and an empty rim."""
+    places = [np.stack(unpack(part.key)[1:]) * _width(kind) for kind, part in parts.items()]
+    low, high = (end(np.concatenate(places, axis=1), axis=1) for end in (np.min, np.max))
+    low, high = (end // GROUND_CELLS * GROUND_CELLS for end in (low - 8, high + 8 + 2 * GROUND_CELLS))
+    return Window(*low.tolist(), *(high - low).tolist())
+
+
+def _width(kind: Kind) -> int:
+    return GROUND_CELLS if kind == Kind.GROUND else 1
 
 
 class CellView:
     """What the cells of a window hold, as arrays of the part of it that has any; what several kinds need is made once."""
 
-    def __init__(self, cells: Cells, window: Window, extent: Window, chosen: ObjectSettings) -> None:
-        self.cells, self.seen, self.extent, self.chosen = cells, window, extent, chosen
-        self.window = window.common(extent)
+    def __init__(self, cells: Cells, window: Window, chosen: ObjectSettings) -> None:
+        self.cells, self.seen, self.chosen = cells, window, chosen
+        self.inside = {kind: cells.within(kind, *(n // _width(kind) for n in window)) for kind in Kind}
+        self.window = window.common(_extent(self.inside))
         self.held, self.surface = cache(self._held), cache(self._surface)
 
     def _held(self, kind: Kind) -> tuple[Cells, NDArray[np.int32]]:
@@ -84,9 +87,8 @@ class CellView:
 
         Those of the ground in a window of its own, wider cells.
         """
-        wide = GROUND_CELLS if kind == Kind.GROUND else 1
-        first_row, first_column, *shape = (n // wide for n in self.window)
-        inside = self.cells.within(kind, first_row, first_column, *shape)
+        first_row, first_column, *shape = (n // _width(kind) for n in self.window)
+        inside = self.inside[kind]
         _, row, column = unpack(inside.key)
         place = np.full(shape, -1, np.int32)
         place[row - first_row, column - first_column] = np.arange(len(inside))
@@ -158,7 +160,7 @@ class CellView:
             if not reached[part].any():
                 return view, mask
             more = max(margin, (view.seen.rows - core.rows) // 4)
-            view = CellView(self.cells, view.seen.widened(more), self.extent, self.chosen)
+            view = CellView(self.cells, view.seen.widened(more), self.chosen)
 
 
 def _wide(values: NDArray) -> NDArray:

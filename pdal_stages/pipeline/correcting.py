@@ -131,10 +131,10 @@ def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> 
     """Which points lie in the polygons of a file; of the patches of ``review`` those that were looked at."""
     file, _, layer = area.partition("|layername=")
     pyogrio = vector("pyogrio")
-    with reading(file):
-        if not layer and _PATCHES in [str(name) for name, _ in pyogrio.list_layers(file)]:
+    with reading(file) as name:
+        if not layer and _PATCHES in [str(one) for one, _ in pyogrio.list_layers(name)]:
             layer = _PATCHES
-        fields = pyogrio.read_info(file, layer=layer or None)["fields"]
+        fields = pyogrio.read_info(name, layer=layer or None)["fields"]
     done = f"{_DONE} = 1" if _DONE in fields else ""
     x, y = xyz[:, 0], xyz[:, 1]
     box = float(x.min()), float(y.min()), float(x.max()), float(y.max())

@@ -75,22 +75,17 @@ def _inside(folder: Path) -> list[str]:
 
 def locations(path: str, column: str = "location") -> list[str]:
     """The files a tile index names, made by ``pdal tindex create``; relative ones count from its folder, then from here."""
+    from ..objects.outlines import reading
+
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")
-    try:
-        with warnings.catch_warnings():  # GDAL's, of files that it reads nevertheless
-            warnings.simplefilter("ignore")
-            names = [*pyogrio.raw.read(path, columns=[column], read_geometry=False)[3], None][0]
+    cure = f"It needs a column '{column}' with file names (option tindex_name)"
+    with reading(path, "the tile index cannot be read", cure) as plain, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # GDAL's, of files that it reads nevertheless
+        names = [*pyogrio.raw.read(plain, columns=[column], read_geometry=False)[3], None][0]
         if names is None:
             raise ValueError(f"it has no column '{column}'")
         if odd := [name for name in names if not (isinstance(name, str) and name) or "\0" in name]:
             raise ValueError(f"{odd[0]!r} is not a file's name")
-    except (OSError, ValueError, RuntimeError) as error:
-        raise StageError(
-            "the tile index cannot be read",
-            where=path,
-            found=str(error),
-            cure=f"It needs a column '{column}' with file names (option tindex_name)",
-        ) from None
     if not len(names):
         raise StageError("the tile index names no file", where=path)
     there = {name: Path(path).absolute().parent / name for name in names}
@@ -109,8 +104,6 @@ def is_las(name: str) -> bool:
 
 def is_folder(target: str) -> bool:
     """Whether an output is a folder: one that is there, or a name that ends with a slash, or has neither suffix nor '#'."""
-    if not target:  # which for a path is the current folder
-        raise StageError("the name of the output is empty", cure="Name a file; is a variable not set?")
     path = Path(target)
     named = "#" not in path.name and not path.suffix and not path.exists()
     return path.is_dir() or target.endswith(("/", os.sep)) or named

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from ..objects.cells import CLASSES, Cells, Kind, refuse_unclassified
 from ..objects.find import find_objects
 from ..objects.found import Objects, ObjectSettings, Table
 from ..objects.measure import CHECK
-from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines, vector
+from ..objects.outlines import crown_outlines, is_odd, raw_outlines, straight_outlines, vector
 
 #: Ending of a file's name -> GDAL's driver, and whether one file holds many layers.
 DRIVERS = {
@@ -167,10 +168,9 @@ def check_target(path: str | Path, layers: Sequence[str] = LAYERS) -> None:
             found=str(path),
             cure=f"Give a name that ends in {', '.join(DRIVERS)}",
         )
-    if any(one == "!" or "\ud800" <= one <= "\udfff" for one in str(Path(path).absolute())):
-        raise StageError(
-            "GDAL takes names in UTF-8, without '!'", found=ascii(str(path)), cure="Give another"
-        )
+    if is_odd(str(path)):
+        what = "vector files are written to names in UTF-8, without '!' and ';'"
+        raise StageError(what, found=ascii(os.path.abspath(path)), cure="Give another")
     vector("pyogrio")
     vector("shapely")
     for name in target_files(path, layers):

@@ -110,9 +110,9 @@ REPLACING = [
     *(([*words, "pipe.las"], "the input is a pipe") for words in (["train", "--model", "o.model"], ["accuracy", "a.las", "--reference"])),
     (["pipeline", "pipe.json"], "the input is a pipe"),
     ([*CLASSIFY, "\udce9.las"], "rename the file"),
-    ([*CLASSIFY, ""], "the name of the output is empty"),
-    (["review", "a.las", ""], "Give a name that ends in .gpkg"),
-    *((["objects", "a.las", name], "UTF-8, without '!'") for name in ("\udce9.gpkg", "!b.gpkg")),
+    *(([*words, ""], f"what follows '{words[-1]}' is empty") for words in (CLASSIFY, ["review", "a.las"], ["demo"], ["plugin", "--check", "--folder"])),
+    ([*CLASSIFY, "o.las", "--metadata="], "what follows '--metadata=' is empty"),
+    *((["objects", "a.las", name], "UTF-8, without '!' and ';'") for name in ("\udce9.gpkg", "!b.gpkg", "a;b.shp")),
     ([*ACCURACY, "--json", "a\0b"], "has no name"),
 ]  # fmt: skip
 
