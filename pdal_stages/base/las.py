@@ -90,10 +90,15 @@ class LasHeader:
     box: tuple[float, float, float, float]  #: (min x, min y, max x, max y)
 
 
+def refuse_pipe(path: str | os.PathLike) -> None:
+    """Refuse an input that would be waited for, and can be read only once."""
+    if stat.S_ISFIFO(os.stat(path).st_mode):
+        raise StageError("the input is a pipe", where=str(path), cure="Write it into a file first")
+
+
 def read_header(path: str | os.PathLike) -> LasHeader | None:
     """The header of a LAS or LAZ file; None where the file is too short for one, or is something else."""
-    if stat.S_ISFIFO(os.stat(path).st_mode):  # which would be waited for
-        raise StageError("the input is a pipe", where=str(path), cure="Write it into a file first")
+    refuse_pipe(path)
     with open(path, "rb") as file:
         head = file.read(375)
     if len(head) < 227 or head[:4] != b"LASF":

@@ -7,6 +7,7 @@ import glob
 import json
 import os
 import re
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,11 +61,25 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     if isinstance(source, str) and source.lstrip("\ufeff \t\r\n")[:2].startswith(("[", "{", "//", "/*")):
         return parse_pipeline(source)
     try:
-        data = Path(source).read_bytes()
+        data = _content(Path(source))
     except (OSError, ValueError) as error:
         where = ascii(str(source)[:200])[1:-1]
         raise PipelineError("the pipeline file cannot be read", where=where, found=error) from None
     return parse_pipeline(decode(data, str(source)), str(source))
+
+
+def _content(path: Path) -> bytes:
+    """What a file holds, or what comes through a pipe, if somebody writes into it within some seconds."""
+    if not path.is_fifo():
+        return path.read_bytes()
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as pipe:
+        until = time.monotonic() + 5.0
+        while (first := pipe.read(1)) == b"":  # None where a writer is there, but has written nothing yet
+            if time.monotonic() > until:
+                raise OSError("nobody writes into this pipe")
+            time.sleep(0.05)
+        os.set_blocking(pipe.fileno(), True)
+        return (first or b"") + pipe.read()
 
 
 def decode(data: bytes, name: str) -> str:

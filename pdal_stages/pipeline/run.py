@@ -13,7 +13,7 @@ from typing import Any
 
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
-from ..base.las import supersede_copc
+from ..base.las import refuse_pipe, supersede_copc
 from ..base.lascheck import check_complete, check_readable
 from ..base.messages import Report
 from ..stages.base import stage_types
@@ -222,6 +222,7 @@ class Pipeline:
         """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
         for path in readers_files(self.expanded.stages):
             try:
+                refuse_pipe(path)
                 with open(path, "rb"):
                     pass
             except OSError as error:

@@ -39,7 +39,9 @@ def test_pipe(command, tmp_path, cloud):
     reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()))
     reader.start()
     path = job(tmp_path, cloud, {"type": "writers.las", "filename": str(pipe)})
-    command.runs(command.process("pipeline", path))
+    os.mkfifo(tmp_path / "job")
+    threading.Thread(target=lambda: (tmp_path / "job").write_bytes(path.read_bytes())).start()
+    command.runs(command.process("pipeline", tmp_path / "job"))
     reader.join()
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     (tmp_path / "got.las").write_bytes(read[0])
@@ -53,14 +55,9 @@ def test_pipe(command, tmp_path, cloud):
 def files(tmp_path, cloud, model, monkeypatch):
     """A cloud, another, a model and a page in the test's own folder, and a check that they are what they were."""
     monkeypatch.chdir(tmp_path)
-    for source, name in (
-        (cloud, "a.las"),
-        (cloud, "b.las"),
-        (cloud, "t_1.las"),
-        (model, "m.model"),
-        (model, "other.laz"),
-    ):
-        shutil.copy(source, tmp_path / name)
+    for source, names in ((cloud, ("a.las", "b.las", "t_1.las")), (model, ("m.model", "other.laz"))):
+        for name in names:
+            shutil.copy(source, tmp_path / name)
     (tmp_path / "page.html").write_text("<!DOCTYPE html>\n<p>mine</p>\n")
     (tmp_path / "poly.geojson").write_text('{"type": "FeatureCollection", "features": []}')
     (tmp_path / "link.las").symlink_to("a.las")
@@ -71,10 +68,8 @@ def files(tmp_path, cloud, model, monkeypatch):
     assert {path: path.read_bytes() for path in tmp_path.iterdir() if path in before} == before
 
 
-WRITE, BINS = (
-    {"type": "writers.las"},
-    {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "bins": "b.json", "feature_set": "D1"},
-)
+WRITE = {"type": "writers.las"}
+BINS = {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "bins": "b.json", "feature_set": "D1"}
 PIPELINES = {
     "p.json": ["a.las", HAG],
     "bins.json": ["a.las", BINS],
@@ -84,10 +79,8 @@ PIPELINES = {
     "pipe.json": ["pipe.las", HAG],
     "twice.json": ["a.las", {**WRITE, "filename": "o.las"}, {**WRITE, "filename": "./o.las"}],
 }  # fmt: skip
-CLASSIFY, ACCURACY = (
-    ["classify", "a.las", "--model", "m.model"],
-    ["accuracy", "a.las", "--reference", "b.las"],
-)
+CLASSIFY = ["classify", "a.las", "--model", "m.model"]
+ACCURACY = ["accuracy", "a.las", "--reference", "b.las"]
 INPUT, OTHER = "is one of the inputs", "would replace a LAS or LAZ file"
 REPLACING = [
     (["train", "b.las", "--model", "a.las", *SMALL], OTHER),
@@ -109,6 +102,7 @@ REPLACING = [
     (["pipeline", "twice.json"], "two output files are one"),
     *(([*words, "pipe.las"], "the input is a pipe") for words in (["train", "--model", "o.model"], ["accuracy", "a.las", "--reference"])),
     (["pipeline", "pipe.json"], "the input is a pipe"),
+    (["pipeline", "pipe.las"], "nobody writes into this pipe"),
     ([*CLASSIFY, "\udce9.las"], "rename the file"),
     *(([*words, ""], f"what follows '{words[-1]}' is empty") for words in (CLASSIFY, ["review", "a.las"], ["demo"], ["plugin", "--check", "--folder"])),
     ([*CLASSIFY, "o.las", "--metadata="], "what follows '--metadata=' is empty"),
