@@ -8,7 +8,10 @@ import sys
 
 
 def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
-    code = "import numpy; from pdal_stages.features.index import build_tree; build_tree(*numpy.eye(3))"
+    code = (
+        "import numpy as np; from pdal_stages.synthetic.townplan import Plan, ground, heights; plan = Plan(1, "
+        "np.ones((2, 4)), 0, np.eye(2)); assert ground(3.0, 40.0, plan)[0] == heights(np.array([[3.0, 40.0]]), plan)"
+    )
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "lines"}
 
     def said(code: str = code) -> str:
@@ -16,6 +19,9 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
 
     assert "compiling for this processor, once" in said()
     assert not said()
+    for caller in (tmp_path / "kernels").rglob("*.heights-*"):
+        caller.unlink()  # and is compiled again, with what it calls from the cache
+    assert "compiling for this processor, once" in said()
     for index in (tmp_path / "kernels").rglob("*.nbi"):
         index.write_bytes(b"damaged")
     assert "Traceback" not in said("import os; os.environ['PDAL_STAGES_PROGRESS'] = '0'; " + code)

@@ -33,15 +33,7 @@ VALUES = {
     "door": ["classify", "pipeline", "objects", "stock"],
     "model": ["standard", "one pass", "two passes", "binary", "network"],
     "tiles": ["none", "no workers", "two workers, per tile", "two workers, per file", "resumed"],
-    "option": [
-        "none",
-        "where",
-        "ignore",
-        "keep",
-        "reject_below",
-        "vegetation_heights",
-        "probabilities",
-    ],
+    "option": ["none", "where", "ignore", "keep", "reject_below", "vegetation_heights", "probabilities"],
     "writer": ["las 1.2", "las 1.4", "laz", "text", "gdal", "ogr", "none"],
 }
 OPTIONS = {

@@ -15,7 +15,7 @@ import stat
 import sys
 import threading
 from collections.abc import Callable
-from functools import lru_cache, update_wrapper
+from functools import lru_cache, partial, update_wrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,6 +63,7 @@ class Kernel:
                 if hasattr(file, "_source_stamp"):
                     file._source_stamp = "-".join(sorted(_sources(self)))
                     file.load, file.save = (_careful(file, act) for act in (file.load, file.save))
+                    made._cache.load_overload = partial(_load, made._cache, made._cache.load_overload)
                     _refuse_shared(file._cache_path)
                 self._dispatcher = made
             return self._dispatcher
@@ -123,6 +124,36 @@ class _NoLinearAlgebra(NamedTuple):
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
         if name == "scipy.linalg" and threading.get_ident() == self.thread:
             raise ImportError(name)
+
+
+def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:
+    """Load a kernel without what only compiling needs: before it loads one, numba imports all that it can compile."""
+    from numba.core.runtime import rtsys
+
+    codegen = target.codegen()
+    try:
+        rtsys.initialize(target)
+        codegen.unserialize_library = partial(_library, codegen)
+        return cache._load_overload(signature, target)
+    except AttributeError:  # of another numba: nobody promises these methods
+        return usual(signature, target)
+    finally:
+        vars(codegen).pop("unserialize_library", None)
+
+
+def _library(codegen: Any, state: tuple[str, str, tuple[bytes, bytes]]) -> Any:
+    """A kernel's code; the intermediate code waits for kernels that call it to be compiled: most of a job's own memory."""
+    from llvmlite.binding import parse_bitcode
+
+    name, _, (code, intermediate) = state
+    library = codegen.create_library(name)
+    library.enable_object_caching()
+    library._set_compiled_object(code)
+    library._finalize_final_module()
+    library._get_module_for_linking = lru_cache(partial(parse_bitcode, intermediate))
+    # Which names it has numba reads from the intermediate code; what is asked for is there.
+    library.get_pointer_to_function = codegen._engine.get_function_address
+    return library
 
 
 def _careful(file: Any, act: Callable) -> Callable:

@@ -183,15 +183,7 @@ class AdaptiveNeighborhoods:
         return reach
 
     def choose(
-        self,
-        search: Search,
-        points: Axes,
-        threshold=None,
-        shapes=None,
-        out=None,
-        *,
-        least=0,
-        curvature=None,
+        self, search: Search, points: Axes, threshold=None, shapes=None, out=None, *, least=0, curvature=None
     ) -> np.ndarray:
         """Moments (numbers, ROWS, m) of what is chosen; shapes, surfaces and curvatures go where arguments say."""
         m = len(points[0])

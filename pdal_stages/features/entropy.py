@@ -145,21 +145,9 @@ def lowest_entropy(s, first, last, least_members):
         return last - 1
     entropy = s[MOMENTS]
     estimate_entropies(
-        s[N],
-        s[SX],
-        s[SY],
-        s[SZ],
-        s[SXX],
-        s[SXY],
-        s[SXZ],
-        s[SYY],
-        s[SYZ],
-        s[SZZ],
-        entropy,
-        first,
-        last,
-        least_members,
-    )
+        s[N], s[SX], s[SY], s[SZ], s[SXX], s[SXY], s[SXZ], s[SYY], s[SYZ], s[SZZ],
+        entropy, first, last, least_members,
+    )  # fmt: skip
     least = NEVER
     for j in range(first, last):
         least = min(least, entropy[j])

@@ -171,10 +171,7 @@ def run_tail(
 
 
 def read_with(
-    callbacks: Callbacks,
-    readers: list[dict[str, Any]],
-    new: list[NewValues],
-    flags: Sequence[bool],
+    callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: Sequence[bool]
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Stages that read points and give them their new values, and the tags of the last ones.
 
