@@ -288,9 +288,8 @@ def test_a_deck_that_the_rim_of_the_cloud_cuts():
 @given(st.integers(0, 100), st.tuples(st.integers(-3000, 3000), st.integers(-3000, 3000)))
 def test_order_and_shifts_by_whole_cells_change_nothing(seed, cells):
     xyz, _ = small(seed % 3, seed % 2 == 0)
-    xyz = (
-        np.round(xyz - (85_000, 447_000, 0), 3) * 1024 // 1 / 1024
-    )  # of binary fractions, so that shifts are exact
+    # Of binary fractions, so that shifts are exact.
+    xyz = np.round(xyz - (85_000, 447_000, 0), 3) * 1024 // 1 / 1024
     deck = found(xyz)
     order = np.random.default_rng(seed).permutation(len(xyz))
     assert np.array_equal(found(xyz[order]), deck[order])
@@ -332,13 +331,8 @@ def test_levels_of_far_points_stand_for_all():
 
 
 def test_degenerate_clouds_and_points_left_out():
-    for xyz in (
-        np.empty((0, 3)),
-        np.zeros((1, 3)),
-        np.zeros((50, 3)),
-        np.random.default_rng(0).normal(0, 50, (500, 3)),
-    ):
-        assert not found(xyz).any()
+    clouds = [np.zeros((n, 3)) for n in (0, 1, 50)] + [np.random.default_rng(0).normal(0, 50, (500, 3))]
+    assert not any(found(xyz).any() for xyz in clouds)
     far = np.vstack([np.random.default_rng(0).uniform(0, 9, (200, 3)), [[1e7, 1e7, 0.0]]])
     assert not found(far).any()
     xyz, codes = seen("overpass")

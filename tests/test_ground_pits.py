@@ -91,23 +91,17 @@ def test_clusters_at_one_depth_are_pits():
     assert np.array_equal(pits(raster, raster, 1.0), low)
 
 
-@pytest.mark.parametrize("what", ["ditch", "quarry", "cellar beside a street", "wood"])
+@pytest.mark.parametrize("what", ["ditch", "quarry", "cellar beside a street"])
 def test_what_is_deep_but_ground_is_kept(what):
-    raster, rng = field()
+    raster, _ = field()
     if what == "ditch":
         raster[:, 30:32] -= 2
     elif what == "quarry":
         raster[20:29, 20:30] -= 12
-    elif what == "cellar beside a street":
+    else:
         raster[:, :] += 9
         raster[:, 60:] -= 9
         raster[40:45, 40:44] -= 9
-    else:
-        raster[:] = rng.uniform(6, 16, raster.shape)
-        seen = rng.random(raster.shape) < 0.05
-        raster[seen] = 0
-        assert pits(raster, np.where(seen, 12, raster), 1.0)[seen].mean() < 0.05
-        return
     assert not pits(raster, raster, 1.0)[raster < (4 if what.startswith("cellar") else -1.5)].any()
 
 

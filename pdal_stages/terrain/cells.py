@@ -89,20 +89,21 @@ def _linked(padded, offsets, steps, reach, number):
 
 
 def linked_cells(
-    raster: NDArray[np.float32], reach: int, step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    raster: NDArray[np.float32], reach: float, step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and their :func:`longest_sides`.
 
     Cells at most `reach` away from each other are linked across a `step` of meters, by the distance in cells.
     """
-    j, i = np.mgrid[: reach + 1, -reach : reach + 1]
+    side = int(reach)
+    j, i = np.mgrid[: side + 1, -side : side + 1]
     away = np.hypot(j, i)
     after = ((j > 0) | (i > 0)) & (away <= reach)
     number = np.full(raster.shape, -1)
     # With holes beside and below, so that no step has to look where the raster ends.
-    padded = np.pad(raster, ((0, reach), (reach, reach)), constant_values=HOLE)
+    padded = np.pad(raster, ((0, side), (side, side)), constant_values=HOLE)
     offsets = np.column_stack([j[after], i[after]])
-    count = _linked(padded, offsets, step(away[after]).astype(np.float32), reach, number)
+    count = _linked(padded, offsets, step(away[after]).astype(np.float32), side, number)
     rows, columns = np.nonzero(number >= 0)
     sets = number[rows, columns]
     return number, np.bincount(sets, minlength=count), longest_sides(sets, (rows, columns), count)

@@ -21,6 +21,7 @@ from .belowground import pits, pits_reach
 from .cells import HOLE, SIDE, cell_numbers, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
+from .hillside import roofs_of_hillsides
 from .openings import JUMP, LINK, WALL, objects_of, opening_radius, plateau_reach, remove_plateaus
 from .planes import GroundRaster, from_parents, planes_of_blocks
 from .planes import reach as planes_reach
@@ -254,7 +255,10 @@ def ground_raster(
     cut = within(np.flatnonzero(wide & ~ground), 0)
     if cut.size:
         cut = cut[near(cut, FAR)]
+    below = roofs_of_hillsides(ground, raster, cell)
     remove_plateaus(ground, floor, raster, cell, cut)
+    roofs = ground & (below != HOLE)
+    ground[roofs], floor[roofs] = False, below[roofs]
     # The terrain runs below: no level of a deck stands for it either.
     ground &= ~on_deck
     raster[on_deck] = HOLE

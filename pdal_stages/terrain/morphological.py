@@ -10,7 +10,8 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface, and
   from farther away what only wide ones took: they have no room above a scarp that the rim of the cloud cuts off;
-* what is higher than all around it on every side is no ground (:mod:`.openings`), nor are bridges (:mod:`.decks`);
+* what is higher than all around it on every side is no ground (:mod:`.openings`), nor are roofs that a slope runs into
+  (:mod:`.hillside`) and bridges (:mod:`.decks`);
 * low outliers are told from ground under a canopy (:mod:`.belowground`).
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from .cells import HOLE, linked_cells
 
 #: Drops beyond this, in meters, are objects however large the window: halls are not higher for being wider.
@@ -172,6 +172,22 @@ def plateau_reach(cell: float) -> int:
     return int(WIDEST / cell) + 1 + LINK + BEYOND
 
 
+def sums_of_sets(number: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sums of the rows and of the columns of the cells of each set, and how many they are (n, 3), from their `size` (n,)."""
+    rows, columns = np.nonzero(number >= 0)
+    sets = number[rows, columns]
+    sums = [np.bincount(sets, at, len(size)) for at in (rows, columns)]
+    return np.column_stack([*sums, size]).astype(np.int64)
+
+
+@device
+def direction(sums, j, i):
+    """Which of 16 directions a cell lies in from the middle of a set, of which sums are given."""
+    # Times the set's size: whole numbers, the same wherever the array begins.
+    v, u = j * sums[2] - sums[0], i * sums[2] - sums[1]
+    return int((np.arctan2(float(v), float(u)) / (2 * np.pi) + 1.0) * 16) % 16
+
+
 @njit
 def _look_around(number, asked, ground, raster, cell, sums, sectors, around, level, uphill):
     """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level.
@@ -195,10 +211,7 @@ def _look_around(number, asked, ground, raster, cell, sums, sectors, around, lev
                     if drop > jump:
                         around[k, 0] += 1
                         level[k] += raster[y, x]
-                        # From the set's middle, times its size: whole numbers, the same wherever the array begins.
-                        v, u = y * sums[k, 2] - sums[k, 0], x * sums[k, 2] - sums[k, 1]
-                        turn = np.arctan2(float(v), float(u)) / (2 * np.pi) + 1.0
-                        sectors[k, int(turn * 16) % 16] = True
+                        sectors[k, direction(sums[k], y, x)] = True
                     elif abs(drop) < STEP:
                         around[k, 1] += 1
 
@@ -212,12 +225,7 @@ def remove_plateaus(
     numbered row by row, become ground where they are of no plateau, and show none.
     """
     number, size, side = linked_cells(raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away))
-    rows, columns = np.nonzero(number >= 0)
-    sets = number[rows, columns]
-    count = len(size)
-    sums = np.column_stack([np.bincount(sets, rows, count), np.bincount(sets, columns, count), size]).astype(
-        np.int64
-    )
+    count, sums = len(size), sums_of_sets(number, size)
     grounds = np.bincount(number[ground], minlength=count)
     asked = (grounds > FOOTING * size) & (side < int(WIDEST / cell))
     sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
