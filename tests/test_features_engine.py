@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pdal_stages.base.errors import DimensionError, OptionError, StageError
 from pdal_stages.base.messages import Progress
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins, compute_features
-from pdal_stages.features.plan import ALL_FEATURES, GROUPS, describe
+from pdal_stages.features.plan import GROUPS
 
 #: Every kind of neighborhood, small enough for small clouds.
 TOKENS = "c1,c2.5,s1.5,s4,k8,kopt(5,30),ropt(0.5,1.5,0.25),copt"
@@ -79,7 +79,6 @@ def test_order_of_features():
     assert names[:13] == tuple(f"{n}_c2_5" for n in (*GROUPS["covariance"], *GROUPS["geometric"][:4], "A3_0"))
     assert names[61] == "D4_9_c2_5" and names[62] == "Linearity_kopt"
     assert names[74] == "Radius_kopt" and names[75] == "A3_0_kopt" and names[-1] == "Intensity"
-    assert all(describe(feature) for feature in ALL_FEATURES)
 
 
 def test_feature_sets():
@@ -124,7 +123,7 @@ def test_halo():
     assert FeaturePlan.parse("c1,s5").halo_m == 6.0
     assert FeaturePlan.parse("c50").halo_m == 54.0
     assert FeaturePlan.parse("copt").halo_m == 4.0
-    assert FeaturePlan.parse("c1,kopt").halo_m == 16.0 and FeaturePlan.parse("c1,kopt").unbounded
+    assert FeaturePlan.parse("c1,kopt").halo_m == 16.0
     assert FeaturePlan.parse("c0.2").halo_m < 0.5
 
 

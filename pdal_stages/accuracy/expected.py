@@ -99,9 +99,8 @@ class Patches:
     points: NDArray[np.int64]
     file: NDArray[np.int64]
     box: NDArray[np.float64]  #: (n, 4) west, south, east, north of its cells, meters
-    reason: list[
-        str
-    ]  #: of which class most of the expected errors are, and how sure the model is of its points
+    #: of which class most of the expected errors are, and how sure the model is of its points
+    reason: list[str]
 
     def __len__(self) -> int:
         return len(self.errors)

@@ -58,9 +58,8 @@ class Accuracy:
     """
 
     classes: tuple[int, ...]  #: codes of the matrix's rows: the classes of the reference, ascending
-    extra: tuple[
-        int, ...
-    ]  #: of the columns after those: classes that were predicted but are not in the reference
+    #: of the columns after those: classes that were predicted but are not in the reference
+    extra: tuple[int, ...]
     matrix: npt.NDArray[np.int64]  #: (K, K + E) points; rows are the reference, columns the prediction
     names: Mapping[int, str] = field(default_factory=dict)
     #: reference points that were not compared, by their reference class before any merge

@@ -8,28 +8,16 @@ perceptron that describes the ball, and the widths of the one that carries featu
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import Any
 
 from ..base import checks
 from ..base.errors import OptionError, suggest
+from ..base.settings import Settings, setting
 
 #: A configuration's largest number of shared layers: a model file holds 63 arrays.
 MAX_LAYERS = 60
-
-
-def _checked(check: Callable[[str, Any], Any], **more: Any) -> Any:
-    """A field whose value is what `check`, given its name in quotes and the value, makes of it."""
-    return field(metadata={"check": check}, **more)
-
-
-def _whole(low: int, high: int, **more: Any) -> Any:
-    return _checked(lambda what, value: checks.whole(what, value, low, high), **more)
-
-
-def _number(low: float, high: float, **more: Any) -> Any:
-    return _checked(lambda what, value: checks.number(what, value, low, high), **more)
 
 
 def _widths(what: str, value: Any) -> tuple[int, ...]:
@@ -38,39 +26,29 @@ def _widths(what: str, value: Any) -> tuple[int, ...]:
     return tuple(checks.whole(what, width, 1, 4096) for width in value)
 
 
-class _Checked:
-    """Dataclasses whose fields check themselves; OptionError where one does not fit."""
-
-    def __post_init__(self) -> None:
-        for one in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, one.name)
-            if "check" in one.metadata and not (value is None and one.default is None):
-                object.__setattr__(self, one.name, one.metadata["check"](f"'{one.name}'", value))
-
-
 @dataclass(frozen=True)
-class Level(_Checked):
+class Level(Settings):
     """One level of set abstraction and the feature propagation back from it."""
 
-    centers: int = _whole(1, 10**7)  #: points kept, by farthest point sampling; all where there are fewer
-    radius: float = _number(1e-3, 1e4)  #: of the ball around each center, meters
-    samples: int = _whole(1, 1024)  #: points taken from a ball
-    #: widths of the shared perceptron over a ball's points; the maximum over the points follows
-    mlp: tuple[int, ...] = _checked(_widths)
+    centers: int = setting(MISSING, "integer", "Points kept, by farthest point sampling, or all", 1, 10**7)
+    radius: float = setting(MISSING, "number", "Radius of the ball around each center, meters", 1e-3, 1e4)
+    samples: int = setting(MISSING, "integer", "Points taken from a ball", 1, 1024)
+    #: of the shared perceptron over a ball's points; the maximum over the points follows
+    mlp: tuple[int, ...] = setting(MISSING, "numbers", "Widths", check=_widths)
     #: of the shared perceptron after interpolation to the level above
-    up: tuple[int, ...] = _checked(_widths)
+    up: tuple[int, ...] = setting(MISSING, "numbers", "Widths", check=_widths)
 
 
 @dataclass(frozen=True)
-class Configuration(_Checked):
+class Configuration(Settings):
     """A whole network, but for the number of inputs and classes."""
 
     name: str
-    points: int = _whole(16, 10**7)  #: of a batch: the nearest around a grid point
+    points: int = setting(MISSING, "integer", "Points of a batch: the nearest around a grid point", 16, 10**7)
     levels: tuple[Level, ...] = ()
-    #: widths after the last propagation; dropout follows, then one linear layer to the classes
-    head: tuple[int, ...] = _checked(_widths, default=(128,))
-    dropout: float = _number(0.0, 0.95, default=0.5)  #: share of the head's outputs left out in training
+    #: after the last propagation; dropout follows, then one linear layer to the classes
+    head: tuple[int, ...] = setting((128,), "numbers", "Widths", check=_widths)
+    dropout: float = setting(0.5, "number", "Share of the head's outputs left out in training", 0.0, 0.95)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -210,10 +188,6 @@ CONFIGURATIONS = {
 }  # fmt: skip
 
 
-def _choice(*choices: str, default: str) -> Any:
-    return _checked(lambda what, value: checks.one_of(what, value, choices), default=default)
-
-
 def _file(what: str, value: Any) -> str:
     if not isinstance(value, str):
         raise OptionError(f"{what} must be a file name", found=repr(value))
@@ -221,35 +195,38 @@ def _file(what: str, value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class NetworkOptions(_Checked):
+class NetworkOptions(Settings):
     """How a network is trained; docs/alsnet.md says more of each."""
 
     configuration: Any = "small"  #: the name of one of :data:`CONFIGURATIONS`, or one of your own
     points: int | None = None  #: of a batch, instead of the configuration's
-    #: of the batches' grid in meters; None: for four batches a point
-    spacing: float | None = _number(0.01, 1e5, default=None)
-    coordinates: str = _choice("", "Z", "XYZ", default="Z")  #: from the batch's center, which are inputs
-    epochs: int = _whole(1, 100_000, default=60)  #: at most; each sees every chosen batch once
-    batches_per_step: int = _whole(1, 1024, default=2)  #: batches whose gradients make one step
-    #: at the start; it falls to 1 % of that along a cosine
-    learning_rate: float = _number(1e-8, 10.0, default=0.002)
-    #: weight of a class in the loss: 1 / sqrt(share), 1 ("none") [WM19], or 1 / share ("balanced")
-    class_weights: str = _choice("none", "sqrt", "balanced", default="sqrt")
+    #: None: for four batches a point
+    spacing: float | None = setting(None, "number", "Spacing of the batches' grid, meters", 0.01, 1e5)
+    #: from the batch's center
+    coordinates: str = setting("Z", "string", "Coordinates that are inputs", choices=("", "Z", "XYZ"))
+    #: each sees every chosen batch once
+    epochs: int = setting(60, "integer", "Most epochs", 1, 100_000)
+    batches_per_step: int = setting(2, "integer", "Batches whose gradients make one step", 1, 1024)
+    #: it falls to 1 % of that along a cosine
+    learning_rate: float = setting(0.002, "number", "Learning rate at the start", 1e-8, 10.0)
+    #: 1 / sqrt(share), 1 ("none") [WM19], or 1 / share ("balanced")
+    class_weights: str = setting(
+        "sqrt", "string", "Weights in the loss", choices=("none", "sqrt", "balanced")
+    )
     #: batches whose class shares have a standard deviation of this or more (per cent) are not trained on: they hold next
     #: to nothing but one class [WM19: 20 %]; 100: all are used
-    histogram_threshold: float = _number(0.0, 100.0, default=20.0)
-    #: turn, move, shake and thin each batch, anew in each epoch
-    augment: bool = _checked(checks.flag, default=True)
-    #: share of the ground held out, in whole blocks, to choose the best epoch; 0: none
-    validation: float = _number(0.0, 0.5, default=0.2)
-    block_size: float = _number(0.1, 1e6, default=25.0)  #: side of those blocks, meters
-    #: epochs without a better mean F1 on the held out blocks after which training ends; 0: never
-    patience: int = _whole(0, 100_000, default=20)
-    #: file written after every epoch; where it exists, training goes on from it
-    checkpoint: str | None = _checked(_file, default=None)
-    #: model file whose weights training starts from; classes it shares keep theirs, others start afresh
-    start_from: str | None = _checked(_file, default=None)
-    device: str = _choice("auto", "cpu", "cuda", default="auto")
+    histogram_threshold: float = setting(20.0, "number", "Most uneven batch that is used", 0.0, 100.0)
+    augment: bool = setting(True, "boolean", "Turn, move, shake and thin each batch, anew in each epoch")
+    #: in whole blocks, to choose the best epoch; 0: none
+    validation: float = setting(0.2, "number", "Share of the ground held out", 0.0, 0.5)
+    block_size: float = setting(25.0, "number", "Side of those blocks, meters", 0.1, 1e6)
+    #: without a better mean F1 on the held out blocks; 0: never
+    patience: int = setting(20, "integer", "Epochs after which training ends", 0, 100_000)
+    #: where it exists, training goes on from it
+    checkpoint: str | None = setting(None, "filename", "File written after every epoch", check=_file)
+    #: classes it shares keep their weights, others start afresh
+    start_from: str | None = setting(None, "filename", "Model file that training starts from", check=_file)
+    device: str = setting("auto", "string", "Where it is trained", choices=("auto", "cpu", "cuda"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

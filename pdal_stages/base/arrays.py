@@ -19,6 +19,14 @@ def begins_run(ascending: npt.NDArray) -> npt.NDArray[np.bool_]:
     return new
 
 
+def places_among(
+    ascending: npt.NDArray, wanted: npt.NDArray
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Where wanted values are among others, ascending and some; and whether they are."""
+    place = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
+    return place, ascending[place] == wanted
+
+
 #: Values hashed in one go: they stay in a core's cache, and take no memory to speak of.
 _TOGETHER = 1 << 16
 #: What splitmix64 adds before it mixes.

@@ -117,6 +117,14 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
     )  # fmt: skip
 
 
+def header_there(path: str | os.PathLike) -> LasHeader | None:
+    """The same; None too where the file cannot be read, which is said when its points are."""
+    try:
+        return read_header(path)
+    except (OSError, ValueError):
+        return None
+
+
 def holds_flags(path: str | os.PathLike) -> bool:
     """Whether a file is of LAS 1.0 to 1.3, whose flags (synthetic, key-point, withheld) share a byte with the class."""
     header = read_header(path)

@@ -236,10 +236,8 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
     table, begin = int.from_bytes(place, "little", signed=True), header.offset + 8
     inside = len(place) == 8 and begin <= table <= size - 8
     if not header.count:
-        room = (
-            table - 8 if inside else _end_of_points(header, size)
-        ) - begin  # an empty file may have 8 bytes
-        return _none_counted(room) if room > 0 else None
+        end = table - 8 if inside else _end_of_points(header, size)  # an empty file may have 8 bytes
+        return _none_counted(end - begin) if end > begin else None
     if not inside:
         return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"
     coding = b""

@@ -100,12 +100,19 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
         return
     system = geodetic.find("CS")  # WKT 2 has one keyword for both
     centered = geodetic.keyword == "GEOCCS" or (system is not None and system.name.lower() == "cartesian")
+    zone = utm_code(*place, root.name) if place is not None and not centered else None
+    code = f"EPSG:{zone or 'CODE'}"
+    what = "the UTM zone of the points; or take the national grid of the area"
+    if not zone:
+        what = "the UTM zone or national grid of the area in place of CODE"
     raise StageError(
         "the coordinates are geocentric (from the earth's center); heights need an axis that is up"
         if centered
         else "the coordinates are geographic (degrees); neighborhoods and grids need meters",
         found=root.name or wkt[:60],
-        cure=reprojection_cure(root.name, None if centered else place),
+        cure=f'Add a reprojection before this stage, {{"type": "filters.reprojection", "out_srs": "{code}"}}, or '
+        "reproject the files first, pdal translate IN OUT reprojection "
+        f"--filters.reprojection.out_srs={code}; with {what}",
     )
 
 
@@ -119,19 +126,6 @@ def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float
             cure="Reproject the files first: pdal translate IN OUT reprojection --filters.reprojection.in_srs=EPSG:4326 "
             f"--filters.reprojection.out_srs=EPSG:{code}; of meters, set horizontal_unit",
         )
-
-
-def reprojection_cure(name: str = "", place: tuple[float, float] | None = None) -> str:
-    """What to do about degrees: reproject into the UTM zone of a place, on the datum that a reference's name tells."""
-    zone = utm_code(*place, name) if place is not None else None
-    code = f"EPSG:{zone or 'CODE'}"
-    what = "the UTM zone of the points; or take the national grid of the area"
-    if not zone:
-        what = "the UTM zone or national grid of the area in place of CODE"
-    return (
-        f'Add a reprojection before this stage, {{"type": "filters.reprojection", "out_srs": "{code}"}}, or reproject the '
-        f"files first, pdal translate IN OUT reprojection --filters.reprojection.out_srs={code}; with {what}"
-    )
 
 
 def utm_code(longitude: float, latitude: float, name: str = "") -> int | None:

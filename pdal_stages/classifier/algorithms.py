@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..base import checks
 from ..base.errors import DimensionError, ModelError
 from ..base.messages import Report
+from ..base.settings import Settings, setting
 from ..features import returns
 from ..features.index import CellGrid
 
@@ -98,24 +98,18 @@ class PredictRequest:
 
 
 @dataclass(frozen=True)
-class PredictionOptions:
+class PredictionOptions(Settings):
     """How a cloud is classified."""
 
     threads: int | None = None
-    memory_mb: float = 256.0  #: for the blocks of features under way
+    memory_mb: float = setting(256.0, "number", "For the blocks of features under way", 1, None, unit="MB")
     probabilities: bool = False  #: whether to return them
     margin: bool = False
-    reject_below: float | None = None  #: points less reliable do not get the winning class, and are counted
-    rejected_code: int | None = None  #: class of rejected points, instead of their old one
+    #: points less reliable do not get the winning class, and are counted
+    reject_below: float | None = setting(None, "number", "Least reliability", 0, 1)
+    rejected_code: int | None = setting(None, "integer", "Class of rejected points, or their old one", 0, 255)
     #: as `reject_below`, for points of each class; the larger one counts
     limits: Mapping[int, float] | None = None
-
-    def __post_init__(self) -> None:
-        checks.number("'memory_mb'", self.memory_mb, 1, unit="MB")
-        if self.reject_below is not None:
-            checks.number("'reject_below'", self.reject_below, 0, 1)
-        if self.rejected_code is not None:
-            checks.whole("'rejected_code'", self.rejected_code, 0, 255)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.arrays import places_among
 from ..base.errors import OptionError
 from ..base.resources import map_blocks
-from ..features.cells import WHOLE, cell_keys, cell_means, take_means
+from ..features.cells import WHOLE, cell_keys, cell_means
 from ..features.neighborhoods import SIDES
 
 #: Word of a token, which the side of a cell in meters follows: axes of the cells (3 x 3 x 3 around the point's, or 3 x 3
@@ -105,7 +106,8 @@ class Context:
                 if token == OWN:
                     part[:] = shares[points] / WHOLE
                 else:
-                    take_means(*cells[token], points, part)
+                    cell, mean = cells[token]
+                    part[:] = mean[cell[points]]
             return out
 
         return columns
@@ -134,6 +136,5 @@ def around(
     keys, offsets = cell_keys(xyz[:, :2], context.strip)
     wanted = np.unique(keys[rows])
     near = np.unique(np.add.outer(np.add.outer(wanted, offsets), np.array([-1, 0, 1])))
-    at: Any = np.minimum(np.searchsorted(near, keys), len(near) - 1)
-    found = np.flatnonzero(near[at] == keys)
+    found = np.flatnonzero(places_among(near, keys)[1])
     return None if len(found) == len(xyz) else found

@@ -75,9 +75,8 @@ class Blend:
     trusted: float = 1.0
     #: with the binary strategy, the class that alone is changed; the other of `labeled` is everything else
     target: int | None = None
-    factors: tuple[float, ...] | None = (
-        None  #: what the forest's classes are multiplied by for being frequent
-    )
+    #: what the forest's classes are multiplied by for being frequent
+    factors: tuple[float, ...] | None = None
 
     @classmethod
     def from_dict(cls, said: Mapping[str, Any], codes: Sequence[int]) -> Blend:
@@ -125,10 +124,8 @@ class Blend:
             if target in self.before:
                 mine = trusted * mine + (1.0 - trusted) * out[:, at[0]]
             out[:, at] = 0.0
-            rest = out.sum(axis=1)
-            mine = np.where(
-                rest > NOTHING, mine, 1.0
-            )  # where the base knows of nothing else it stays the target
+            rest = out.sum(axis=1)  # where the base knows of nothing else it stays the target
+            mine = np.where(rest > NOTHING, mine, 1.0)
             out *= ((1.0 - mine) / np.maximum(rest, NOTHING))[:, None]
             out[:, at[0]] = mine
             return out

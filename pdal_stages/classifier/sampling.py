@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import summary
-from ..base.arrays import hash_of
+from ..base.arrays import hash_of, places_among
 from ..base.errors import OptionError
 from ..base.messages import Progress
 
@@ -255,8 +255,8 @@ class Folds:
         if self.surveys:
             return np.full(len(xyz), self.surveys[survey], np.int16)
         number = _numbers(xyz, self.side)
-        at = np.minimum(np.searchsorted(self.blocks, number), len(self.blocks) - 1)
-        return np.where(self.blocks[at] == number, self.fold[at], number % self.count).astype(np.int16)
+        at, there = places_among(self.blocks, number)
+        return np.where(there, self.fold[at], number % self.count).astype(np.int16)
 
 
 def _numbers(xyz: npt.NDArray[np.float64], side: float) -> npt.NDArray[np.int64]:

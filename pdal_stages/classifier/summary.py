@@ -140,16 +140,12 @@ def score(info: Mapping[str, Any]) -> str:
     row = held_out(info)
     if not row:
         return f"not scored     {info['training'].get('unscored', 'the model file holds no score')}"
-    crossed = info["accuracy"]["cross_validation"]
-    label = f"{held_out_by(crossed)} held out" if crossed else "ground held out, which chose the best epoch"
+    label = "ground held out, which chose the best epoch"
+    if crossed := info["accuracy"]["cross_validation"]:
+        by = crossed.get("by", "blocks")
+        label = f"{groups_word(str(crossed.get('groups'))) if by == 'groups' else by} held out"
     values = [_percent(row.get(name)) for name in ("overall_accuracy", "kappa", "mean_f1")]
     return "{:<17}overall accuracy {}, kappa {}, mean F1 {}".format(label, *values)
-
-
-def held_out_by(crossed: Mapping[str, Any]) -> str:
-    """What a cross-validation held out: blocks, surveys, files, or values of a dimension."""
-    by = crossed.get("by", "blocks")
-    return groups_word(str(crossed.get("groups"))) if by == "groups" else by
 
 
 def groups_word(dimension: str) -> str:

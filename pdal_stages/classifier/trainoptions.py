@@ -5,7 +5,7 @@ from __future__ import annotations
 # ruff: noqa: RUF009  options are declared, nothing is shared
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.las import NOISE
 from ..base.resources import resolve_threads
+from ..base.settings import Settings, setting
 from ..features import FeaturePlan
 from ..features.cells import LARGEST, check_side
 from .algorithms import ALGORITHMS, trainer
@@ -32,18 +33,8 @@ DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
-def setting(default: Any, kind: str, help: str, *bounds: float, **rule: Any) -> Any:
-    """Declare an option: what it is in a sentence, for help texts too, and the `bounds` of a number.
-
-    `kind` and `rule` (``exclusive``, ``unit``, ``choices``) are those of an option of a stage.
-    """
-    if bounds:
-        rule |= {"minimum": bounds[0], "maximum": bounds[1]}
-    return field(default=default, metadata={"kind": kind, "help": help, **rule})
-
-
 @dataclass(frozen=True)
-class TrainingOptions:
+class TrainingOptions(Settings):
     """How a model is trained."""
 
     neighborhoods: Any = setting(
@@ -167,21 +158,10 @@ class TrainingOptions:
     )
 
     def __post_init__(self) -> None:
-        def put(name: str, check: Any, *bounds: float, **more: Any) -> None:
-            object.__setattr__(self, name, check(f"'{name}'", getattr(self, name), *bounds, **more))
+        def put(name: str, check: Any) -> None:
+            object.__setattr__(self, name, check(f"'{name}'", getattr(self, name)))
 
-        for one in fields(self):
-            rule = one.metadata
-            value, kind = getattr(self, one.name), rule["kind"]
-            if value is None and one.default is None:
-                continue
-            if "choices" in rule:
-                checks.one_of(f"'{one.name}'", value, rule["choices"])
-            elif kind == "integer" and "minimum" in rule:
-                put(one.name, checks.whole, rule["minimum"], rule["maximum"])
-            elif kind == "number":
-                more = {"above": rule.get("exclusive", False), "unit": rule.get("unit", "")}
-                put(one.name, checks.number, rule["minimum"], rule["maximum"], **more)
+        super().__post_init__()
         if not isinstance(self.groups, str):
             raise OptionError("'groups' must be the name of a dimension", found=repr(self.groups)[:60])
         check_side(self.voxel)

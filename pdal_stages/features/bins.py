@@ -79,8 +79,12 @@ class ShapeBins:
 
     def comparable(self, tokens: Iterable[str]) -> np.ndarray:
         """Thresholds as the kernels compare them: (neighborhoods, 5, 9) float32."""
-        rows = [_to_comparable(self.thresholds(token)) for token in tokens]
-        return np.array(rows, np.float32).reshape(-1, len(METRICS), INNER)
+        found = []
+        for token in tokens:
+            a3, d1, d2, d3, d4 = self.thresholds(token)
+            cosine = np.cos(a3)
+            found.append([-cosine * np.abs(cosine), d1**2, d2**2, 4 * d3**4, 6 * d4**3])
+        return np.array(found, np.float32).reshape(-1, len(METRICS), INNER)
 
     def to_dict(self) -> dict[str, Any]:
         """``{"c1": {"A3": [9 numbers], "D1": ...}, ...}``, JSON-able and exact."""
@@ -145,10 +149,3 @@ def _to_units(rows: np.ndarray) -> np.ndarray:
     return np.array(
         [np.arccos(np.clip(cosine, -1, 1)), np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)]
     )
-
-
-def _to_comparable(rows: np.ndarray) -> np.ndarray:
-    """Radians and meters as the kernels compare them."""
-    a3, d1, d2, d3, d4 = rows
-    cosine = np.cos(a3)
-    return np.array([-cosine * np.abs(cosine), d1**2, d2**2, 4 * d3**4, 6 * d4**3])

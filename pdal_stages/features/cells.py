@@ -250,15 +250,6 @@ def average_around(keys, sums, offsets, means):
 
 
 @njit
-def take_means(cell, means, points, out):
-    """The means of the points' cells."""
-    for i in range(len(points)):
-        k = cell[points[i]]
-        for c in range(means.shape[1]):
-            out[i, c] = means[k, c]
-
-
-@njit
 def choose_one_each(order, keys, hashes, by):
     """Fill `by`: of points of equal keys, which follow each other in `order`, the one of the least hash.
 

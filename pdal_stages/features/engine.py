@@ -341,19 +341,14 @@ def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
     array = np.asarray(queries)
     if array.ndim == 2:
         return None, check_xyz(array, "queries")
-    if array.ndim != 1 or array.dtype.kind not in "iu":
-        if array.size == 0 and array.ndim == 1:
-            array = array.astype(np.int64)
-        else:
-            cure = "Use np.flatnonzero(mask)" if array.dtype.kind == "b" else None
-            raise OptionError(
-                "'queries' must be indices of points or (m, 3) coordinates",
-                found=f"dtype {array.dtype}, shape {array.shape}",
-                cure=cure,
-            )
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        raise OptionError(
+            "'queries' must be indices of points or (m, 3) coordinates",
+            found=f"dtype {array.dtype}, shape {array.shape}",
+            cure="Use np.flatnonzero(mask)" if array.dtype.kind == "b" else None,
+        )
     array = array.astype(np.int64, copy=False)
-    outside = np.count_nonzero((array < 0) | (array >= len(cloud)))
-    if outside:
+    if outside := np.count_nonzero((array < 0) | (array >= len(cloud))):
         raise OptionError(f"'queries' has indices outside the cloud of {len(cloud)} points", found=outside)
     return array, cloud[array]
 
@@ -367,10 +362,9 @@ def _dimensions(
         if name not in given:
             if name in ("X", "Y", "Z"):
                 continue
-            there = ", ".join(map(str, given)) or "none"
             raise DimensionError(
                 f"the dimension '{name}' is needed as a feature but missing",
-                found=there,
+                found=", ".join(map(str, given)) or "none",
                 cure=f"Give dimensions={{'{name}': values}}, or leave it out of the plan",
             )
         values = np.asarray(given[name])
@@ -459,22 +453,18 @@ def fit_clouds(
         threshold = curvature_threshold(np.concatenate(each))
     if not plan.shapes:
         return None, threshold
+    samples = [smallest_hashes(np.asarray(cloud), seed) for cloud in clouds]
+    hashes = np.sort(np.concatenate([found for found, _ in samples]))
+    last = hashes[min(SAMPLES, len(hashes)) - 1]
     values: dict[str, list[np.ndarray]] = {}
-    for cloud, rows in zip(clouds, _samples(clouds, seed), strict=True):
+    for cloud, (found, of_cloud) in zip(clouds, samples, strict=True):
+        rows = of_cloud[found <= last]  # a thinned copy's points tie, and all stay
         if len(rows):
             engine = FeatureEngine(cloud, plan, copt_threshold=threshold, seed=seed, threads=threads)
             for token, some in engine.shape_values(rows).items():
                 values.setdefault(token, []).append(some)
             del engine  # one index at a time
     return ShapeBins.fit({token: np.concatenate(parts) for token, parts in values.items()}), threshold
-
-
-def _samples(clouds: Sequence[npt.ArrayLike], seed: int) -> list[np.ndarray]:
-    """Rows of each cloud that are among the points with the smallest hashes; a thinned copy's points tie, and all stay."""
-    each = [smallest_hashes(np.asarray(cloud), seed) for cloud in clouds]
-    hashes = np.sort(np.concatenate([found for found, _ in each]))
-    last = hashes[min(SAMPLES, len(hashes)) - 1]
-    return [rows[found <= last] for found, rows in each]
 
 
 def warmup() -> None:

@@ -76,14 +76,6 @@ GROUPS: dict[str, tuple[str, ...]] = {
 WITH_DIMENSIONS = ("all", "geometric")
 
 
-def describe(feature: str) -> str:
-    """One line of what a feature is, for docs and schemas."""
-    metric, _, number = feature.partition("_")
-    if metric in SHAPES and number:
-        return f"share of 255 pulls in bin {number} of 10: {SHAPES[metric]}"
-    return {**COVARIANCE, **GEOMETRIC, **SHAPES, **RELATIVE, **SURFACES}[feature]
-
-
 def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
     """Words of a feature set: groups, features, features of one neighborhood (``Linearity_c1``).
 
@@ -108,7 +100,8 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
             continue
         name = known.get(word.lower())
         if name is None:  # a feature of one neighborhood keeps its suffix
-            head = _longest_feature(word)
+            heads = (name for name in ALL_FEATURES if word.lower().startswith(f"{name.lower()}_"))
+            head = max(heads, key=len, default=None)
             if head is None:
                 cure = suggest(word, (*GROUPS, *ALL_FEATURES))
                 single = (*COVARIANCE, *GEOMETRIC, *RELATIVE, *SURFACES)
@@ -123,11 +116,6 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
             "'feature_set' names no feature", found=repr(spec), cure="Write all, or leave it out"
         )
     return tuple(found)
-
-
-def _longest_feature(word: str) -> str | None:
-    found = (name for name in ALL_FEATURES if word.lower().startswith(name.lower() + "_"))
-    return max(found, key=len, default=None)
 
 
 #: What is computed where nothing is asked for, by the function and the stage alike.
@@ -228,10 +216,11 @@ class FeaturePlan:
                 found=", ".join(n.token for n in self.neighborhoods),
             )
         if not names:
+            cure = "Neighbors' surfaces exist for k20 and the like only" if wanted & {*SURFACES} else None
             raise OptionError(
                 f"none of the neighborhoods has the feature '{', '.join(self.features)}'",
                 found=", ".join(n.token for n in self.neighborhoods),
-                cure=_cure(wanted),
+                cure="Radius exists for kopt, ropt and copt only" if "Radius" in wanted else cure,
             )
         if clash := {*names} & {*self.dimensions}:
             raise OptionError(f"the dimension '{min(clash)}' is also a computed feature")
@@ -273,7 +262,7 @@ class FeaturePlan:
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
         reach = max(reach, returns.reach(self.dimensions))
-        if self.unbounded:
+        if any(n.reach is None for n in self.neighborhoods):
             reach = max(reach, POINTS_HALO)
         for k in self._surfaced:
             reach = max(reach, POINTS_HALO * (math.sqrt(k) + math.sqrt(AROUND)) / math.sqrt(100))
@@ -291,18 +280,14 @@ class FeaturePlan:
         """Whether a neighborhood is curvature-adaptive, so that its threshold is needed."""
         return any(c.at and c.neighborhood.kind == "copt" for c in self.layout)
 
-    @property
-    def unbounded(self) -> bool:
-        """Whether a neighborhood's size is a number of points, so that no halo is sure to suffice."""
-        return any(n.reach is None for n in self.neighborhoods)
-
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able description; :meth:`from_dict` reads it."""
+        by_radius = any(one.kind in ("ropt", "copt") for one in self.neighborhoods)
         return {
             "neighborhoods": [n.token for n in self.neighborhoods],
             "features": list(self.features),
             "dimensions": list(self.dimensions),
-            **({"least_members": self.least_members} if _by_radius(self.neighborhoods) else {}),
+            **({"least_members": self.least_members} if by_radius else {}),
         }
 
     @classmethod
@@ -326,14 +311,3 @@ def has(neighborhood: Neighborhood, feature: str) -> bool:
     if feature == "Radius":
         return neighborhood.adaptive
     return feature not in SURFACES or neighborhood.kind == "knn"
-
-
-def _cure(wanted: set[str]) -> str | None:
-    if "Radius" in wanted:
-        return "Radius exists for kopt, ropt and copt only"
-    return "Neighbors' surfaces exist for k20 and the like only" if wanted & {*SURFACES} else None
-
-
-def _by_radius(neighborhoods: Iterable[Neighborhood]) -> bool:
-    """Whether any of them chooses among radii, so that `least_members` matters."""
-    return any(one.kind in ("ropt", "copt") for one in neighborhoods)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import places_among
 from ..base.errors import StageError
 from ..base.las import NOISE, by_height
-from ..terrain.cells import places_among
 
 #: Rules in the order in which they are applied, and how many voxels to each side they look.
 RULES = {"ground": 2, "islands": 1, "lone": 1}

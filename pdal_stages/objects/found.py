@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from itertools import chain, compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import checks
+from ..base.arrays import places_among
+from ..base.settings import Settings, setting
 from .cells import Kind, point_keys
 
 
 def _setting(default: float, what: str, low: float, high: float, unit: str = "m"):
-    return field(default=default, metadata={"low": low, "high": high, "what": what, "unit": unit})
+    return setting(default, "number", what, low, high, unit=unit)
 
 
 @dataclass(frozen=True)
-class ObjectSettings:
+class ObjectSettings(Settings):
     """How objects are told apart; wrong values raise an OptionError."""
 
     cell: float = _setting(
@@ -55,10 +56,6 @@ class ObjectSettings:
     )
     dbh_power: float = _setting(0.809, "See `dbh_factor`", 0, 2, "")
     span_gap: float = _setting(2.0, "Wires with larger gaps are two spans", 0.5, 20)
-
-    def __post_init__(self) -> None:
-        for one in fields(self):
-            checks.number(f"'{one.name}'", getattr(self, one.name), one.metadata["low"], one.metadata["high"])
 
 
 @dataclass
@@ -117,9 +114,8 @@ class Objects:
         """The id of each point's object, 0 where it is of none; `kinds` are numbers of :class:`Kind`, or -1."""
         if self.key.size == 0:
             return np.zeros(len(x), np.int64)
-        key = point_keys(x, y, kinds, self.settings.cell)
-        at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
-        return np.where(self.key[at] == key, self.owner[at], 0)
+        at, there = places_among(self.key, point_keys(x, y, kinds, self.settings.cell))
+        return np.where(there, self.owner[at], 0)
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Of each kind (``buildings``): how many objects, how many are to be checked, and why."""

@@ -161,13 +161,9 @@ class ClassifyRequest:
             return made
         return {name: kind for name, kind in made.items() if name in self.dimensions}
 
-    def writer(self, target: str) -> dict[str, Any]:
-        """The writer of an output, before it is told which extra dimensions to write."""
-        return writer_of(target)
-
     def pipeline(self, source: str, target: str) -> Pipeline:
         """Read a file, make heights where the model wants them, classify, write with everything else kept."""
-        writer = self.writer(target)
+        writer = writer_of(target)
         if writer.get("type") in LAS_WRITERS:
             listed = extra_dims_option([source], self.beside)
             writer |= {"extra_dims": listed} if listed else {}

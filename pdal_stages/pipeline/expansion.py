@@ -201,14 +201,13 @@ def check_dimensions(expanded: Expanded) -> None:
     of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
     for ours in expanded.ours:
         before = list(enumerate(expanded.stages[: ours.index]))
-        moved = [stage for _, stage in before if stage.get("type") == "filters.reprojection"]
-        if moved and _DEGREES.search(
-            str(moved[-1].get("out_srs", ""))
-        ):  # scripts are told the reader's reference
+        # Scripts are told the reader's reference
+        moved = [s.get("out_srs", "") for _, s in before if s.get("type") == "filters.reprojection"]
+        if moved and _DEGREES.search(str(moved[-1])):
             raise PipelineError(
                 "the points are in degrees here; neighborhoods and grids need meters",
                 where=ours.place,
-                found=f"filters.reprojection to {moved[-1]['out_srs']}",
+                found=f"filters.reprojection to {moved[-1]}",
                 cure="Put the reprojection after the stages of pdal_stages, or reproject to a projected reference",
             )
         for name in ours.stage.reads():

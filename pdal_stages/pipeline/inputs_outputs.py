@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import os
+import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
-from ..base.las import projection, read_header
+from ..base.las import header_there, projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from ..classifier.modelfile import find
 from ..stages.base import Stage
@@ -194,22 +194,7 @@ def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str
 MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
 #: What differs between references whose coordinates lie within a meter: units are compared apart.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
-_ASIDE = tuple(
-    f"+{word}"
-    for word in [
-        "units",
-        "vunits",
-        "to_meter",
-        "vto_meter",
-        "towgs84",
-        "geoidgrids",
-        "no_defs",
-        "type",
-        "wktext",
-    ]
-)
-
-
+_ASIDE = re.compile(r"\+(v?units|v?to_meter|towgs84|geoidgrids|no_defs|type|wktext)")
 #: In what is said of inputs that have none, beside others.
 NO_REFERENCE = "no spatial reference;"
 
@@ -235,7 +220,8 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
     wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
     try:
-        count, (x0, y0, x1, y1) = _extent(str(reader["filename"]))
+        header = header_there(str(reader["filename"]))
+        count, (x0, y0, x1, y1) = (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
         middle = ((x0 + x1) / 2, (y0 + y1) / 2) if count else None
         units = units_of_wkt(wkt, horizontal=horizontal, place=middle)
         if units.assumed:
@@ -243,7 +229,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     except StageError as error:
         raise error.at(str(reader["filename"])) from None
     words = str(srs.get("proj4") or "").split()
-    plane = frozenset(w for w in words if w not in _ALIKE and not w.startswith(_ASIDE))
+    plane = frozenset(w for w in words if w not in _ALIKE and not _ASIDE.match(w))
     root = parse_wkt(wkt)
     height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
     across = str(srs.get("horizontal") or srs.get("wkt") or "")
@@ -254,14 +240,6 @@ def reference_of_file(path: str, horizontal: str = "") -> Reference:
     """The same of a file."""
     las = read_header(path) is not None if path.lower().endswith((".las", ".laz")) else False
     return reference_of({"filename": path} | ({"type": "readers.las", "count": 1} if las else {}), horizontal)
-
-
-def _extent(path: str) -> tuple[int, tuple[float, float, float, float]]:
-    """The number of points of a LAS file, and their box; of none where it is not one."""
-    with contextlib.suppress(OSError, ValueError):
-        if (header := read_header(path)) is not None:
-            return header.count, header.box
-    return 0, (0.0, 0.0, 0.0, 0.0)
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
@@ -276,16 +254,11 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
         across, upward = one.units.horizontal, one.units.vertical
         assumed = ", as no reference says otherwise" if one.units.assumed else ""
         units.setdefault((across, upward), f"{across:g} m across and {upward:g} m upward in {path}{assumed}")
-        if one.plane:
-            planes.setdefault(one.plane, f"{one.name} in {path}")
-        if one.height:
-            heights.setdefault(one.height, f"{one.name} in {path}")
-    kinds_of = {
-        "units of length": units,
-        "reference systems": planes,
-        "reference systems of heights": heights,
-    }
-    for what, kinds in kinds_of.items():
+        for kinds, said in ((planes, one.plane), (heights, one.height)):
+            if said:
+                kinds.setdefault(said, f"{one.name} in {path}")
+    of_kind = {"units of length": units, "reference systems": planes, "reference systems of heights": heights}
+    for what, kinds in of_kind.items():
         if len(kinds) > 1:
             raise StageError(
                 f"the inputs have different {what}",

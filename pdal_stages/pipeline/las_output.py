@@ -7,14 +7,13 @@ become one of class 130.
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
-from ..base.las import LEGACY_LIMIT, LasHeader, extra_dimensions, read_header, supersede_copc
+from ..base.las import LEGACY_LIMIT, LasHeader, extra_dimensions, header_there, supersede_copc
 from ..stages.base import Stage, stage_types
 from . import pdal as pdal_env
 from .read import is_reader, is_writer, reader_files, writes_las
@@ -46,11 +45,8 @@ def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) 
 
 def las_headers(readers: Iterable[Mapping[str, Any]]) -> list[LasHeader]:
     """Headers of the LAS files that stages read, as far as they can be read here."""
-    found = []
-    for path in [name for stage in readers for name in reader_files(dict(stage), las=True)]:
-        with contextlib.suppress(OSError, ValueError):
-            found.append(read_header(path))
-    return [header for header in found if header is not None]
+    paths = [name for stage in readers for name in reader_files(dict(stage), las=True)]
+    return [header for header in map(header_there, paths) if header is not None]
 
 
 def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:

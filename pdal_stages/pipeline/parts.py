@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,47 +26,22 @@ _LASPY = {
 }
 
 
-@dataclass
-class Part:
-    """Points that are neither noise nor withheld.
-
-    Attributes
-    ----------
-    xyz : (n, 3) float64
-        Meters.
-    codes : (n,) uint8
-    arrays : dict
-        What else they have; heights in meters.
-    """
-
-    xyz: NDArray[np.float64]
-    codes: NDArray[np.uint8]
-    arrays: dict[str, NDArray]
-
-    def __len__(self) -> int:
-        return len(self.codes)
-
-    @classmethod
-    def join(cls, parts: Sequence[Part]) -> Part:
-        """All points of several parts."""
-        if len(parts) == 1:
-            return parts[0]
-        return cls(
-            np.concatenate([part.xyz for part in parts]),
-            np.concatenate([part.codes for part in parts]),
-            {name: np.concatenate([part.arrays[name] for part in parts]) for name in parts[0].arrays},
-        )
-
-
 def reads_in_parts(path: str) -> bool:
     """Whether parts of a file can be read: LAS, LAZ and COPC files."""
     return Path(path).suffix.lower() in (".las", ".laz") and read_header(path) is not None
 
 
-def parts_of(path: str, wkt: str) -> Iterator[Part]:
-    """The points of a file, in its order, with those of the dimensions :data:`WANTED` that it has."""
+def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
+    """The points of a file that are neither noise nor withheld, in its order.
+
+    Of each part ``xyz`` (n, 3), ``codes`` (n,), and those of the dimensions :data:`WANTED` that it has; meters.
+    """
     for arrays, flags in arrays_in_parts(path, WANTED):
-        yield _part(Points(arrays, wkt=wkt, legacy_flags=flags))
+        points = Points(arrays, wkt=wkt, legacy_flags=flags)
+        codes = points.class_codes
+        kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
+        more = {name: np.asarray(points.dimension(name))[kept] for name in WANTED if name in arrays}
+        yield {"xyz": points.xyz[kept], "codes": codes[kept], **more}
 
 
 def arrays_in_parts(
@@ -139,10 +113,3 @@ def header_of(path: str) -> Any:
     for records in filter(None, (header.vlrs, header.evlrs)):
         records[:] = [record for record in records if record.user_id != "copc"]
     return header
-
-
-def _part(points: Points) -> Part:
-    codes = points.class_codes
-    kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
-    arrays = {name: np.asarray(points.dimension(name))[kept] for name in WANTED if name in points.arrays}
-    return Part(points.xyz[kept], codes[kept], arrays)

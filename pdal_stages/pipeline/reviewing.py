@@ -26,7 +26,7 @@ from ..reports.objectlayers import Layer, check_target, qml, write_layers
 from ..reports.page import render
 from ..stages.preparation import PREPARATION, made_of_coordinates
 from .inputs_outputs import check_one_reference, input_files, reference_of_file
-from .parts import Part, parts_of, reads_in_parts
+from .parts import parts_of, reads_in_parts
 from .workers import each_file
 
 #: What is written, in this order.
@@ -140,18 +140,18 @@ def review_files(
 def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
     """The cells of a file, whose number it is; reliabilities are as they are there, or made now, which is said."""
     found: list[ReviewCells] = []
-    whole: list[Part] = []
+    whole: list[dict[str, NDArray]] = []
     for part in parts_of(path, wkt):
-        if "Reliability" not in part.arrays:
+        if "Reliability" not in part:
             whole.append(part)
-        elif len(part):
-            found.append(ReviewCells.of(part.xyz, part.codes, part.arrays["Reliability"], side, number))
+        elif len(part["codes"]):
+            found.append(ReviewCells.of(part["xyz"], part["codes"], part["Reliability"], side, number))
     if whole:
         print_messages(
             f"{path} has no Reliability: made now by the model {model}, which takes as long as classifying"
         )
-        part = Part.join(whole)
-        found.append(ReviewCells.of(part.xyz, part.codes, reliability_of(part, model), side, number))
+        every = {name: np.concatenate([part[name] for part in whole]) for name in whole[0]}
+        found.append(ReviewCells.of(every["xyz"], every["codes"], reliability_of(every, model), side, number))
     return [ReviewCells.join(found)] if found else []
 
 
@@ -167,19 +167,19 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
     return (points, area) if area > 0 else (1, 1e-9)
 
 
-def reliability_of(points: Part, model: str) -> NDArray[np.float32]:
-    """The probability that a model gives to the class each point has; 1 for classes that it does not know."""
+def reliability_of(points: Mapping[str, NDArray], model: str) -> NDArray[np.float32]:
+    """The probability that a model gives to the class each point of a part has; 1 for classes that it does not know."""
     loaded = loaded_model(model)
     made = {}
     if list(loaded.info.get("preparation") or []) == list(PREPARATION):  # else it says what it needs
-        made = dict(made_of_coordinates(PREPARATION, points.xyz))
-    given = {name: points.arrays[name] for name in loaded.welcome_dimensions if name in points.arrays}
-    found: Any = loaded.predict(points.xyz, {**made, **given}, probabilities=True).probabilities
+        made = dict(made_of_coordinates(PREPARATION, points["xyz"]))
+    given = {name: points[name] for name in loaded.welcome_dimensions if name in points}
+    found: Any = loaded.predict(points["xyz"], {**made, **given}, probabilities=True).probabilities
     place = np.full(256, -1)
     place[loaded.codes] = np.arange(len(loaded.codes))
     lower = [code for code in (3, 4) if place[code] < 0]
     place[lower] = place[5]  # vegetation as one class
-    mine = place[points.codes]
+    mine = place[points["codes"]]
     own = np.take_along_axis(found, np.maximum(mine, 0)[:, None], axis=1)[:, 0]
     return np.where(mine >= 0, own, 1.0).astype(np.float32)
 
@@ -295,9 +295,8 @@ def styles(errors: NDArray[np.float64]) -> dict[str, str]:
         ("looked at", "done = 1"),
     ]
     patches = [(*rule, ink) for rule, ink in zip(rules, (*_INKS, _LOOKED_AT), strict=True)]
+    tiles = [("tile", "", "0,0,0,0")]
     return {
         "patches": qml("MultiPolygon", patches, outline_color="80,40,20,255", outline_width=0.3),
-        "tiles": qml(
-            "MultiPolygon", [("tile", "", "0,0,0,0")], outline_color="60,60,60,255", outline_width=0.5
-        ),
+        "tiles": qml("MultiPolygon", tiles, outline_color="60,60,60,255", outline_width=0.5),
     }

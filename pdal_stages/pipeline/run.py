@@ -124,9 +124,7 @@ class Pipeline:
             self._check_inputs()
             # Some of PDAL's writers open their file, and empty it, when they are prepared: theirs are in a folder of ours.
             with TemporaryDirectory(prefix="pdal-stages-") as folder:
-                names = [
-                    os.path.basename(output.path).replace("#", "0") for output in writers_outputs(stages)
-                ]
+                names = [os.path.basename(one.path).replace("#", "0") for one in writers_outputs(stages)]
                 elsewhere = [os.path.join(folder, f"{n}-{name}") for n, name in enumerate(names)]
                 pdal_env.validate(with_outputs(stages, elsewhere))
         except StageError as error:
@@ -229,8 +227,8 @@ class Pipeline:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
         stages = self.expanded.stages
         if stages and not is_reader(stages, 0):  # newer PDAL refuses it, older PDAL runs it on nothing
-            first = [ours.stage.type for ours in self.expanded.ours if ours.index == 0]
-            found = (first or [stages[0].get("type", "")])[0]
+            ours = {one.index: one.stage.type for one in self.expanded.ours}
+            found = ours.get(0, stages[0].get("type", ""))
             cure = "Put the file that is to be read first"
             raise PipelineError("the pipeline does not start with a reader", found=found, cure=cure)
         check_dimensions(self.expanded)

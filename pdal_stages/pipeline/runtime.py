@@ -194,9 +194,9 @@ def wkt_of(reference: Any) -> str:
     return str(srs.get("compoundwkt") or srs.get("wkt") or srs.get("horizontal") or "")
 
 
-def node(name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
+def node(name: str, children: list[dict[str, Any]], value: str = "", kind: str = "") -> dict[str, Any]:
     """A node of PDAL's metadata, as a script gives it."""
-    return {"name": name, "value": "", "type": "", "description": "", "children": children}
+    return {"name": name, "value": value, "type": kind, "description": "", "children": children}
 
 
 def leaves(report: Report) -> list[dict[str, Any]]:
@@ -216,7 +216,7 @@ def leaf(name: str, value: Any) -> dict[str, Any]:
         text, kind = value, "string"
     else:
         text, kind = json.dumps(value, default=str), "json"
-    return {"name": name, "value": _encodable(text), "type": kind, "description": "", "children": []}
+    return node(name, [], _encodable(text), kind)
 
 
 def remember_stdout() -> None:

@@ -20,8 +20,6 @@ from ..pipeline import expansion, runtime
 from ..stages.base import Stage, stage_type, stage_types
 from . import declarations
 
-_Leaf = dict[str, Any]
-
 
 def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
     """Answer one question; True, whatever happened.
@@ -40,21 +38,17 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     # PDAL's module object stays alive; the register need not grow.
     sys.modules.pop(question["label"], None)
     try:
+        stage, warning = _made(question)
         if question["step"] == "prepare":
-            said = _prepare(question)
+            said = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
+            said += [] if warning is None else [runtime.leaf("pdal_stages_warning", warning)]
         else:
-            said = runtime.leaves(runtime.run_on_view(_made(question)[0], module, ins, outs))
+            said = runtime.leaves(runtime.run_on_view(stage, module, ins, outs))
     except BaseException as error:
         outs.clear()
         said = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
     module["out_metadata"] = runtime.node("pdal_stages", said)
     return True
-
-
-def _prepare(question: Mapping[str, Any]) -> list[_Leaf]:
-    stage, warning = _made(question)
-    made = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
-    return [*made, *([] if warning is None else [runtime.leaf("pdal_stages_warning", warning)])]
 
 
 def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:

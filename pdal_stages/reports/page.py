@@ -23,9 +23,8 @@ def render(template: str, **context: Any) -> str:
     """
     context = {"subtitle": "", "version": __version__, "date": _today(), **context}
     page = _templates().get_template(template).render(context)
-    return plain(
-        page.encode(errors="backslashreplace").decode()
-    )  # names that are not UTF-8, or command a terminal
+    # Names that are not UTF-8, or command a terminal
+    return plain(page.encode(errors="backslashreplace").decode())
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,7 @@ from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, whole_files
-from ..base.las import UNINFORMATIVE
+from ..base.las import HIGH, LOW, MEDIUM, UNINFORMATIVE
 from ..base.messages import Report, plain
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
@@ -27,8 +27,8 @@ from .options import option
 from .points import Points
 from .selection import Selection
 
-#: Vegetation in ASPRS's codes: low and medium, and the code that stands for all of it.
-LOWER, HIGH = (3, 4), 5
+#: Parts of what HIGH stands for where vegetation is one class.
+LOWER = (LOW, MEDIUM)
 
 
 class Sides(NamedTuple):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..base.las import BRIDGE
 from ..terrain.decks import PARTS, SURFACE
 from .base import ClassStage
-from .options import ignore_option, keep_option, option
+from .options import code_option, ignore_option, keep_option
 from .points import Points, class_counts
 from .selection import Selection
 
@@ -20,7 +20,7 @@ class Bridges(ClassStage):
     type = "filters.bridges"
     summary = "Give bridge decks their class, which leave ground and buildings"
     where_help = "Points outside keep their class."
-    code: int = option("integer", BRIDGE, "Class code of bridge decks", minimum=0, maximum=255)
+    code: int = code_option(BRIDGE, "Class code of bridge decks")
     ignore: Selection = ignore_option("Points that keep their class")
     keep: Selection = keep_option("Further points that keep their class")
 
@@ -31,7 +31,7 @@ class Bridges(ClassStage):
         return self.code
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        free = points.inside & ~points.ignored(self.ignore) & ~points.chosen(self.keep)
+        free = points.changeable(self.ignore, self.keep)
         before, deck = points.class_codes, points.dimension("Deck")
         parts = free & (deck == PARTS) & np.isin(before, _MISTAKEN)
         found = parts | (free & (deck == SURFACE))

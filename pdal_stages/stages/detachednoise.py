@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..base.las import NOISE
 from ..terrain.detached import REACH, detached_noise
 from .base import ClassStage
-from .options import ignore_option, option
+from .options import code_option, ignore_option, option
 from .points import Points, class_counts
 from .selection import Selection
 
@@ -42,8 +42,8 @@ class DetachedNoise(ClassStage):
         maximum=1000,
         unit="m",
     )
-    low_class: int = option("integer", NOISE[0], "Class code of low noise", minimum=0, maximum=255)
-    high_class: int = option("integer", NOISE[1], "Class code of high noise", minimum=0, maximum=255)
+    low_class: int = code_option(NOISE[0], "Class code of low noise")
+    high_class: int = code_option(NOISE[1], "Class code of high noise")
     ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
 
     def halo_m(self) -> float:

@@ -16,7 +16,7 @@ from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.modelfile import find
 from ..classifier.summary import Limit, Sureness, said, sureness_of
 from .base import Stage
-from .options import ignore_option, keep_option, option, vegetation_heights_option
+from .options import code_option, ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts
 from .preparation import as_json, same
 from .selection import Selection
@@ -52,12 +52,8 @@ class ModelClassifier(Stage):
         minimum=0,
         maximum=1,
     )
-    rejected_code: int | None = option(
-        "integer",
-        None,
-        "Class code for rejected points; by default they keep the class they had",
-        minimum=0,
-        maximum=255,
+    rejected_code: int | None = code_option(
+        None, "Class code for rejected points; by default they keep the class they had"
     )
     keep_sure: float | None = option(
         "number",

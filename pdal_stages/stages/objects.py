@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import checks
+from ..base.arrays import places_among
 from ..objects.cells import CLASSES, ENOUGH, Cells, Kind, kind_of_code, refuse_unclassified
 from ..objects.find import FOUND, find_objects
 from ..objects.found import Objects, ObjectSettings
 from ..objects.measure import CHECK, REASONS
 from ..objects.view import MARGIN
 from .base import Stage
-from .options import ignore_option, option
+from .options import code_option, ignore_option, option
 from .points import Points
 from .selection import Selection
 
@@ -100,12 +101,7 @@ class ObjectOptions:
 
 
 for _name, _one in _SETTINGS.items():
-    _rule = _one.metadata
-    _made = option(
-        "number", _one.default, _rule["what"], minimum=_rule["low"], maximum=_rule["high"], unit=_rule["unit"]
-    )
-    _made.__set_name__(ObjectOptions, _name)
-    setattr(ObjectOptions, _name, _made)
+    setattr(ObjectOptions, _name, option(name=_name, default=_one.default, **_one.metadata))
 
 
 #: What each kind of object is measured by, as points carry it: height and area or length.
@@ -128,7 +124,7 @@ class ObjectsFilter(ObjectOptions, Stage):
         False,
         "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area, of spans their length)",
     )
-    refused_class: int = option("integer", 1, "The class that they get", minimum=0, maximum=255)
+    refused_class: int = code_option(1, "The class that they get")
 
     def reads(self) -> list[str]:
         return ["Classification"]
@@ -214,6 +210,6 @@ def _places(ids: NDArray[np.int64], known: NDArray[np.int64]) -> tuple[NDArray[n
     """Which of the sorted known ids points have, and the rows of those points."""
     if known.size == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    at = np.minimum(np.searchsorted(known, ids), known.size - 1)
-    rows = np.flatnonzero((known[at] == ids) & (ids != 0))
+    at, there = places_among(known, ids)
+    rows = np.flatnonzero(there & (ids != 0))
     return at[rows], rows

@@ -176,6 +176,11 @@ def option(kind: str, default: Any, help: str, **more: Any) -> Any:
     return Option(kind, default, help, **more)
 
 
+def code_option(default: int | None, help: str) -> Any:
+    """An option for a class code."""
+    return option("integer", default, help, minimum=0, maximum=255)
+
+
 def ignore_option(points: str) -> Any:
     """The option `ignore`, which noise and withheld points are unless told; says what becomes of the `points`."""
     words = ": class codes, ranges such as Classification[7:7], or the word withheld"

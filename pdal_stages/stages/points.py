@@ -222,6 +222,10 @@ class Points:
         """The points inside `where` that are not ignored; those that are, are counted."""
         return self.inside & ~self.ignored(ignored)
 
+    def changeable(self, ignored: Selection, kept: Selection) -> NDArray[np.bool_]:
+        """The points inside `where` that are neither ignored, which is counted, nor keep what they have."""
+        return self.usable(ignored) & ~self.chosen(kept)
+
     def wanting(self, name: str, made_before: bool) -> NDArray[np.bool_]:
         """The points that get a height: those inside `where`, and others that have none yet (0)."""
         return self.inside if made_before else self.inside | (self.arrays[name] == 0)

@@ -39,7 +39,7 @@ class Polygons(ClassStage):
         return max((overlay.code for overlay in self.overlays), default=0)
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        change = points.inside & ~points.ignored(self.ignore) & ~points.chosen(self.keep)
+        change = points.changeable(self.ignore, self.keep)
         x, y = (np.asarray(points.arrays[name], np.float64) for name in "XY")
         box = float(x.min()), float(y.min()), float(x.max()), float(y.max())
         codes = points.class_codes.copy()

@@ -10,7 +10,7 @@ from ..terrain import towers
 from ..terrain.towers import find_towers
 from ..terrain.wires import REACH, find_wires
 from .base import ClassStage
-from .options import ignore_option, keep_option, option
+from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
 from .selection import Selection
 
@@ -19,11 +19,11 @@ class Wires(ClassStage):
     type = "filters.wires"
     summary = "Give wires their class, long thin lines that hang in the air, and the towers that hold them"
     where_help = "Points outside keep their class but still serve as neighbors."
-    code: int = option("integer", WIRE, "Class code of wires", minimum=0, maximum=255)
+    code: int = code_option(WIRE, "Class code of wires")
     towers: bool = option(
         "boolean", False, "Also give towers and poles their class, where wires end and meet"
     )
-    tower_code: int = option("integer", TOWER, "Class code of towers and poles", minimum=0, maximum=255)
+    tower_code: int = code_option(TOWER, "Class code of towers and poles")
     ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
     keep: Selection = keep_option()
 

@@ -6,7 +6,6 @@ import dataclasses
 import datetime
 import math
 import os
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from ..base.errors import OptionError, StageError, suggest
 from ..base.files import whole_files
 from ..base.messages import Progress
 from ..base.resources import map_blocks
+from ..base.settings import Settings, setting
 from ..base.version import __version__
 from .districts import fill
 from .solids import VEGETATION, build_scene, cast
@@ -43,24 +43,20 @@ WKT = (
     'PARAMETER["false_northing",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],'
     'AXIS["Northing",NORTH],AUTHORITY["EPSG","25832"]]'
 )
-#: Bounds of the options that have any.
-LIMITS = {"size": (20, 20_000), "density": (0.05, 500), "seed": (0, 2**31 - 1), "noise": (0, 0.5)}
 
 
 @dataclasses.dataclass(frozen=True)
-class TownOptions:
+class TownOptions(Settings):
     """How to make a town; wrong values raise an OptionError."""
 
-    size: float = 200.0  #: side of the square, meters
-    density: float = 7.0  #: returns per square meter, met within a few per cent
-    seed: int = 1  #: another number, another town
-    noise: float = 0.02  #: standard deviation of a range, meters
+    size: float = setting(200.0, "number", "Side of the square, meters", 20, 20_000)
+    density: float = setting(7.0, "number", "Returns per square meter, met within a few per cent", 0.05, 500)
+    seed: int = setting(1, "integer", "Another number, another town", 0, 2**31 - 1)
+    noise: float = setting(0.02, "number", "Standard deviation of a range, meters", 0, 0.5)
     origin: tuple = (500_000.0, 5_400_000.0, 60.0)  #: x, y of the low corner; height of the quays
 
     def __post_init__(self) -> None:
-        for name, limits in LIMITS.items():
-            check: Callable = checks.whole if name == "seed" else checks.number
-            check(f"'{name}'", getattr(self, name), *limits)
+        super().__post_init__()
         if np.shape(self.origin) != (3,):
             raise OptionError("'origin' must be three numbers: x, y, z", found=self.origin)
         for value in self.origin:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.arrays import begins_run
+from ..base.arrays import begins_run, places_among
 from ..base.errors import StageError
 from ..base.jit import device, njit
 
@@ -172,14 +172,6 @@ def runs(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Numbers of those (n,) that have the same key, for each there is."""
     order = np.argsort(key, kind="stable")
     return np.split(order, np.flatnonzero(begins_run(key[order]))[1:]) if len(key) else []
-
-
-def places_among(
-    keys: NDArray[np.int64], wanted: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Where wanted keys are among others, ascending and some; and whether they are."""
-    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return place, keys[place] == wanted
 
 
 def lowest_points(

@@ -104,11 +104,8 @@ class AdaptTask:
 
 def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:
     """Every so many-th file, so that they have about `most` points; and what is to be told."""
-    try:
-        headers = [las.read_header(name) for name in files] if all(map(is_las, files)) else []
-        points = sum(header.count for header in headers if header)
-    except OSError:  # said when it is read
-        points = 0
+    headers = [las.header_there(name) for name in files] if all(map(is_las, files)) else []
+    points = sum(header.count for header in headers if header)
     step = min(max(1, round(points / most)), len(files))
     if step == 1:
         return list(files), []

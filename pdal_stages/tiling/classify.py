@@ -13,7 +13,7 @@ from ..base import las
 from ..base.errors import OptionError, StageError
 from ..base.files import JSON, Output, check_outputs, write_whole
 from ..pipeline.classify_request import ClassifyRequest
-from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
+from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
 from .report import Job, TiledRun
 from .settings import TilingOptions, fits_whole
 
@@ -55,10 +55,7 @@ class ClassifyTask:
             return False
         if not is_las(self.files[0]):
             return not is_ept(self.files[0])
-        try:
-            header = las.read_header(self.files[0])
-        except OSError:
-            header = None  # said when it is read
+        header = las.header_there(self.files[0])
         return header is None or fits_whole(header.count, options.memory)
 
     @property
@@ -128,7 +125,7 @@ class ClassifyTask:
                 "several inputs, clouds too large for the memory, --tile, --per, --resume and --report",
             )
         alike = one_format(self.files) if self._per_tile else {}
-        writer = {**self.request.writer(named), "filename": target, **alike}
+        writer = {**writer_of(named), "filename": target, **alike}
         stages = [*self.request.stages, writer]
         plan, source = plan_of_files(self.files, stages, self.request.overrides, self.options.buffer)
         beside = self.request.beside

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import places_among
 from ..pipeline.runtime import points_of
 from ..stages.hag_morphological import HagMorphological, inside_block
 from .inputs import CloudIndex, InputSource
@@ -150,9 +151,7 @@ def _changed(names: Sequence[str], left: list[str], piece: Piece) -> Changed:
     for path in left if names else ():
         kept = load_arrays(path, under=f"{piece.source.key}/")
         if "index" in kept:
-            rows = np.searchsorted(piece.index, kept["index"])
-            rows[rows == len(piece.index)] = 0
-            there = piece.index[rows] == kept["index"]
+            rows, there = places_among(piece.index, kept["index"])
             parts.append((rows[there], *(kept[f"dim/{name}"][there] for name in names)))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     return {name: (columns[0], column) for name, column in zip(names, columns[1:], strict=False)}

@@ -1,0 +1,45 @@
+"""Settings: fields of dataclasses that say what they are and within which bounds, and are checked when one is made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import field, fields
+from typing import Any
+
+from . import checks
+
+
+def setting(default: Any, kind: str, help: str, *bounds: float | None, **rule: Any) -> Any:
+    """Declare a field: what it is in a sentence, for help texts too, and the `bounds` of a number.
+
+    `kind` and `rule` (``exclusive``, ``unit``, ``choices``) are those of an option of a stage; or `rule` has a ``check``,
+    which makes of a name and the value what the field holds. MISSING as `default`: it must be given.
+    """
+    if bounds:
+        rule |= {"minimum": bounds[0], "maximum": bounds[1]}
+    return field(default=default, metadata={"kind": kind, "help": help, **rule})
+
+
+class Settings:
+    """Base of dataclasses with settings; OptionError where one does not fit. A default of None stays."""
+
+    def __post_init__(self) -> None:
+        for one in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, one.name)
+            if one.metadata and not (value is None and one.default is None):
+                object.__setattr__(self, one.name, _checked(f"'{one.name}'", value, one.metadata))
+
+
+def _checked(what: str, value: Any, rule: Mapping[str, Any]) -> Any:
+    if "check" in rule:
+        return rule["check"](what, value)
+    if "choices" in rule:
+        return checks.one_of(what, value, rule["choices"])
+    if rule["kind"] == "boolean":
+        return checks.flag(what, value)
+    if "minimum" not in rule:
+        return value
+    if rule["kind"] == "integer":
+        return checks.whole(what, value, rule["minimum"], rule["maximum"])
+    above, unit = rule.get("exclusive", False), rule.get("unit", "")
+    return checks.number(what, value, rule["minimum"], rule["maximum"], above=above, unit=unit)
