@@ -26,6 +26,7 @@ from tempfile import TemporaryDirectory
 import laspy
 import numpy as np
 from scipy.spatial import cKDTree
+from woods import closed_wood
 
 from pdal_stages import detached_noise, filtered_ground
 from pdal_stages.cli import main as command
@@ -168,19 +169,6 @@ def terrain(folder: Path) -> None:
             print(f"| {name} | {cells} |", flush=True)
 
 
-def closed_wood(slope: float, density: float, seen: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """300 x 300 m of woods and meadows on a slope: coordinates, and which are ground in the woods, of whose points that is a
-    share `seen`."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0, 300, (2, int(90_000 * density)))
-    ground = slope * x + 2 * np.sin(x / 19 + seed) * np.cos(y / 23) + rng.normal(0, 0.04, len(x))
-    crowns = rng.uniform(12, 26, (50, 50))[(y / 6).astype(int), (x / 6).astype(int)]
-    wood = np.sin(x / 37 + seed) * np.cos(y / 31 + 2 * seed) > -0.3
-    bare = ~wood | (rng.random(len(x)) < seen)
-    share = np.where(rng.random(len(x)) < 0.85, rng.beta(5, 1.3, len(x)), rng.random(len(x)))
-    return np.column_stack([x, y, ground + np.where(bare, 0, crowns * share)]), bare & wood
-
-
 def steep_place(what: str, density: float, seed: int) -> np.ndarray:
     """All ground: 200 x 200 m with a steep place."""
     rng = np.random.default_rng(seed)
@@ -209,8 +197,8 @@ def places() -> None:
         for seen in (0.01, 0.03, 0.1, 0.2):
             shown = []
             for density in densities:
-                woods = [closed_wood(slope, density, seen, seed) for seed in range(3)]
-                marked = [(detached_noise(xyz) == 7)[ground].mean() for xyz, ground in woods]
+                woods = [closed_wood(slope, density, seen, seed, 300) for seed in range(3)]
+                marked = [(detached_noise(xyz) == 7)[ground & wood].mean() for xyz, ground, wood in woods]
                 shown.append(f"{100 * np.mean(marked):.2f}")
             print(f"| wood, slope {slope:g}, {seen:.0%} ground | {' | '.join(shown)} |", flush=True)
     for what in ("cliff", "overhang", "tunnel mouth", "quarry", "gorge"):

@@ -31,6 +31,7 @@ from typing import Any
 
 import laspy
 import numpy as np
+from woods import closed_wood
 
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
@@ -200,21 +201,6 @@ def tables(results: dict) -> str:
     return "\n".join(lines)
 
 
-def slope_wood(slope: float, density: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """220 x 220 m of closed woods and meadows on a slope: coordinates, and which are ground."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0, 220, (2, int(48_400 * density)))
-    turn = np.array([np.cos(0.5 * seed), np.sin(0.5 * seed)])
-    up, across = turn[0] * x + turn[1] * y, turn[0] * y - turn[1] * x
-    z = slope * up + 2 * np.sin(up / 19 + seed) * np.cos(across / 23) + rng.normal(0, 0.04, len(x))
-    wood = np.sin(x / 37 + seed) * np.cos(y / 31 + 2 * seed) > -0.3
-    gaps, crowns = rng.beta(1.2, 1.2, (37, 37)), rng.uniform(12, 26, (37, 37))
-    at = (y / 6).astype(int), (x / 6).astype(int)
-    hit = wood & (rng.random(len(x)) > 0.2 * gaps[at])
-    share = np.where(rng.random(len(x)) < 0.85, rng.beta(5, 1.3, len(x)), rng.random(len(x)))
-    return np.column_stack([x, y, z + np.where(hit, crowns[at] * share, 0)]), ~hit
-
-
 def corners() -> None:
     """Print how ground is found in clips of woods on slopes, and in the whole."""
     print("| slope | points/m² | missed, % | > 1 m too high, % | at most, m | in the whole, % |")
@@ -223,7 +209,7 @@ def corners() -> None:
         for density in (0.5, 2.0, 6.0):
             rows = []
             for seed in range(4):
-                xyz, ground = slope_wood(slope, density, seed)
+                xyz, ground, _ = closed_wood(slope, density, 0.1, seed, 220)
                 whole = ps.filtered_ground(xyz)["HeightAboveGround"]
                 rng = np.random.default_rng(seed)
                 for side in (30, 50, 100) * 4:

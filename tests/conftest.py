@@ -21,6 +21,7 @@ Environment
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -33,6 +34,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from block_scene import ground_and_block
 from hypothesis import HealthCheck, settings
 
 # nohup and background jobs of scripts ignore signals, and so would all that tests start and interrupt.
@@ -265,6 +267,46 @@ def write_las():
     return write
 
 
+@pytest.fixture
+def run(capsys):
+    """Return a function that runs a command of ours: ``run(*words) -> (exit code, output, errors)``."""
+    from pdal_stages.cli import main
+
+    def go(*words):
+        code = main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return go
+
+
+@pytest.fixture
+def run_job(tmp_path, run):
+    """Return a function that writes a pipeline and runs a command on it: ``run_job(stages, *words, command="pipeline")``."""
+
+    def go(stages, *words, command="pipeline"):
+        path = tmp_path / "job.json"
+        path.write_text(json.dumps([stage if isinstance(stage, dict) else str(stage) for stage in stages]))
+        return run(command, path, *words)
+
+    return go
+
+
+# ---- models ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def wide_model(tmp_path_factory, write_las) -> Path:
+    """A model of ground and of a class above 31, which tells them by Z: of points some 100 m up."""
+    import pdal_stages as ps
+
+    folder = tmp_path_factory.mktemp("wide")
+    source = write_las(folder / "train.las", ground_and_block(2000, at=(0, 0, 100)), point_format=6)
+    writer = {"type": "writers.classifiermodel", "filename": str(folder / "wide.model")}
+    writer |= {"neighborhoods": "c1", "feature_set": "geometric", "dimensions": ["Z"], "count": 100}
+    ps.run_pipeline([str(source), {**writer, "trees": 5, "classes": {"2": 2, "6": "64 Shed"}}])
+    return folder / "wide.model"
+
+
 # ---- what the ready pipelines read and apply ---------------------------------------------------------------
 
 
@@ -292,9 +334,7 @@ def ready_halves(ready_town, tmp_path_factory) -> Path:
     folder, las = tmp_path_factory.mktemp("halves"), laspy.read(ready_town)
     west = np.asarray(las.x) <= 500_030
     for name, mine in (("west", west), ("east", ~west)):
-        half = laspy.LasData(las.header)
-        half.points = las.points[mine]
-        half.write(folder / f"{name}.laz")
+        las[mine].write(folder / f"{name}.laz")
     return folder
 
 

@@ -92,15 +92,8 @@ def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
     whole, tiled = laspy.read(tmp_path / "whole.las"), laspy.read(tmp_path / "tiled.las")
 
     def rows(las):
-        columns = [
-            las.X,
-            las.Y,
-            las.Z,
-            las.intensity,
-            las.classification,
-            las["Reliability"],
-        ]
-        table = np.column_stack([np.asarray(c, np.float64) for c in columns])
+        names = ("X", "Y", "Z", "intensity", "classification", "Reliability")
+        table = np.column_stack([np.asarray(las[name], np.float64) for name in names])
         return table[np.lexsort(table.T[::-1])]
 
     assert np.array_equal(rows(whole), rows(tiled))

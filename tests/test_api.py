@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from block_scene import ground_and_block
 
 import pdal_stages as ps
 from pdal_stages.base.errors import DependencyError, OptionError, StageError
@@ -20,11 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 @pytest.fixture(scope="module")
 def scene():
     """Ground (2) and a block (6), meters."""
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(0, 40, (2, 1500))
-    block = (x > 25) & (y > 25)
-    z = np.where(block, 6.0, 0.0) + rng.normal(0, 0.03, 1500)
-    return np.column_stack([x, y, z]), np.where(block, 6, 2)
+    made = ground_and_block(1500, size=40.0)
+    return np.column_stack([made[axis] for axis in "XYZ"]), made["Classification"]
 
 
 @pytest.fixture(scope="module")

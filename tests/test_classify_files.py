@@ -12,6 +12,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+from block_scene import QUICK_TRAINING, ground_and_block
 
 from pdal_stages.base.errors import PipelineError
 from pdal_stages.cli import main
@@ -27,40 +28,20 @@ def folder(tmp_path_factory, write_las):
     base = tmp_path_factory.mktemp("many")
     (base / "in").mkdir()
     for number in range(3):
-        rng = np.random.default_rng(number)
-        x, y = rng.uniform(0, 30, (2, 500))
-        block = (x > 15) & (y > 15)
-        arrays = {"X": x, "Y": y, "Z": np.where(block, 5, 0) + rng.normal(0, 0.02, 500)}
-        arrays["Classification"] = np.where(block, 6, 2).astype("u1")
+        arrays = ground_and_block(500, seed=number)
         if number == 0:
-            arrays["Amplitude"] = rng.random(500).astype("f4")
+            arrays["Amplitude"] = arrays["X"].astype("f4")
         write_las(base / "in" / f"t{number}.laz", arrays, point_format=1)
-    options = {
-        "trees": 8,
-        "passes": 1,
-        "feature_set": "Linearity,HeightRange",
-        "dimensions": "HeightAboveGround",
-    }
-    words = [
-        "train",
-        base / "in" / "t0.laz",
-        "--model",
-        base / "m.model",
-        "--neighborhoods",
-        "k8",
-        "--count",
-        100,
-    ]
-    assert main([*map(str, words), *(f"--writers.classifiermodel.{k}={v}" for k, v in options.items())]) == 0
+    words = ["train", str(base / "in" / "t0.laz"), "--model", str(base / "m.model"), *QUICK_TRAINING]
+    assert main([*words, "--writers.classifiermodel.dimensions=HeightAboveGround"]) == 0
     return base
 
 
 @pytest.fixture()
-def classify(folder, capsys):
+def classify(folder, run):
     def go(*words):
         words = words if "--workers" in words else (*words, "--workers", 0)
-        code = main([str(w) for w in ("classify", *words, "--model", folder / "m.model", "--no-progress")])
-        return code, *capsys.readouterr()
+        return run("classify", *words, "--model", folder / "m.model", "--no-progress")
 
     return go
 

@@ -7,8 +7,8 @@ import re
 import sys
 
 import laspy
-import numpy as np
 import pytest
+from block_scene import ground_and_block
 
 from pdal_stages.cli import _COMMANDS, main, parsed
 from pdal_stages.stages.base import stage_types
@@ -18,13 +18,7 @@ pytestmark = pytest.mark.pdal
 
 @pytest.fixture()
 def cloud(tmp_path, write_las):
-    rng = np.random.default_rng(1)
-    n = 800
-    x, y = rng.uniform(0, 30, (2, n))
-    block = (x > 15) & (y > 15)
-    z = np.where(block, 5.0, 0.0) + rng.normal(0, 0.02, n)
-    arrays = {"X": x, "Y": y, "Z": z, "Classification": np.where(block, 6, 2).astype(np.uint8)}
-    return write_las(tmp_path / "cloud.laz", arrays, point_format=3)
+    return write_las(tmp_path / "cloud.laz", ground_and_block(800), point_format=3)
 
 
 @pytest.fixture()
@@ -41,99 +35,75 @@ def job(tmp_path, cloud):
     return path
 
 
-def run(capsys, *words):
-    code = main([str(w) for w in words])
-    return code, *capsys.readouterr()
-
-
-def test_pipeline_with_overrides(job, tmp_path, capsys):
+def test_pipeline_with_overrides(job, tmp_path, run):
     out = tmp_path / "other.las"
     words = ["--stage.height.cell=10", f"--writers.las.filename={out}", "--metadata", tmp_path / "m.json"]
-    code, _, err = run(capsys, "pipeline", job, *words)
+    code, _, err = run("pipeline", job, *words)
     assert code == 0, err
     assert len(laspy.read(out)) == 800
     assert json.loads((tmp_path / "m.json").read_text())["metadata"]["filters.hag_minima"]["cells"] == 9
     assert "meters were assumed" in err
 
 
-def test_stdin_and_expand(job, capsys, monkeypatch, tmp_path):
+def test_stdin_and_expand(job, run, monkeypatch, tmp_path):
     import io
 
-    code, out, _ = run(capsys, "expand", job)
+    code, out, _ = run("expand", job)
     assert code == 0
     plain = json.loads(out)
     assert [s.get("type") for s in plain["pipeline"]] == [None, "filters.python", "writers.las"]
     monkeypatch.setattr(sys, "stdin", io.StringIO(job.read_text(encoding="utf-8-sig")))
-    assert run(capsys, "pipeline", "--stdin")[0] == 0
-    assert run(capsys, "expand", job, "-o", tmp_path / "plain.json")[0] == 0
+    assert run("pipeline", "--stdin")[0] == 0
+    assert run("expand", job, "-o", tmp_path / "plain.json")[0] == 0
     assert json.loads((tmp_path / "plain.json").read_text())["pipeline"][1]["function"] == "stage"
 
 
-def test_standard_input_is_named_in_tiles_too(capsys, monkeypatch):
+def test_standard_input_is_named_in_tiles_too(run, monkeypatch):
     import io
 
     for words in ([], ["--tile", "50"]):
         monkeypatch.setattr(sys, "stdin", io.StringIO('["in.las", {"type": ]'))
-        code, _, err = run(capsys, "pipeline", "--stdin", *words)
+        code, _, err = run("pipeline", "--stdin", *words)
         assert code == 1 and "standard input, line 1" in err
 
 
-def test_validate(job, capsys, tmp_path):
-    assert run(capsys, "validate", job)[0] == 0
-    code, out, _ = run(capsys, "pipeline", "--validate", job)
+def test_validate(job, run, tmp_path):
+    assert run("validate", job)[0] == 0
+    code, out, _ = run("pipeline", "--validate", job)
     assert code == 0
     assert json.loads(out)["valid"] is True
     assert not (tmp_path / "out.las").exists()
 
 
-def test_drivers_and_options_answer_like_pdal(capsys):
-    code, out, _ = run(capsys, "drivers")
+def test_drivers_and_options_answer_like_pdal(run):
+    code, out, _ = run("drivers")
     assert code == 0
     assert all(name in out for name in [*stage_types(), "readers.las"])
-    listed = json.loads(run(capsys, "drivers", "--showjson")[1])
+    listed = json.loads(run("drivers", "--showjson")[1])
     assert {"filters.hag_minima", "writers.las"} <= {d["name"] for d in listed}
     for name, stage in stage_types().items():
-        out = run(capsys, "options", name)[1]
+        out = run("options", name)[1]
         assert all(f"\n  {o.name}" in out for o in stage.all_options())
-        schema = json.loads(run(capsys, "options", name, "--showjson")[1])
+        schema = json.loads(run("options", name, "--showjson")[1])
         assert set(schema["properties"]) >= {o.name for o in stage.all_options()}
-    assert "max_distance" in run(capsys, "options", "filters.hag_nn")[1]
-    code, _, err = run(capsys, "options", "filters.hag_minma")
+    assert "max_distance" in run("options", "filters.hag_nn")[1]
+    code, _, err = run("options", "filters.hag_minma")
     assert code == 1 and "Did you mean 'filters.hag_minima'?" in err
 
 
-def test_train_model_classify_accuracy(cloud, tmp_path, capsys):
+def test_train_model_classify_accuracy(cloud, tmp_path, run):
     model, out = tmp_path / "m.model", tmp_path / "out.laz"
-    code, printed, err = run(
-        capsys,
-        "train",
-        cloud,
-        "--model",
-        model,
-        "--neighborhoods",
-        "c1,s2",
-        "--count",
-        100,
-        "--writers.classifiermodel.trees=5",
-    )
+    small = ["--neighborhoods", "c1,s2", "--count", 100, "--writers.classifiermodel.trees=5"]
+    code, printed, err = run("train", cloud, "--model", model, *small)
     assert code == 0, err
     assert "Ground" in printed and "Building" in printed
-    assert run(capsys, "model", model)[0] == 0
-    assert json.loads(run(capsys, "model", model, "--showjson")[1])
-    code, printed, err = run(capsys, "classify", cloud, out, "--model", model)
+    assert run("model", model)[0] == 0
+    assert json.loads(run("model", model, "--showjson")[1])
+    code, printed, err = run("classify", cloud, out, "--model", model)
     assert code == 0, err
     assert "800 points written" in printed
-    code, _, err = run(
-        capsys,
-        "accuracy",
-        out,
-        "--reference",
-        cloud,
-        "--json",
-        tmp_path / "a.json",
-        "--html",
-        tmp_path / "a.html",
-    )
+    pages = ["--json", tmp_path / "a.json", "--html", tmp_path / "a.html"]
+    code, _, err = run("accuracy", out, "--reference", cloud, *pages)
     assert code == 0, err
     assert (tmp_path / "a.html").stat().st_size > 10_000
 

@@ -177,16 +177,8 @@ def test_training_draws_from_checked_points_alone(town, tmp_path, capsys):
     las.classification[wrong] = 2  # nobody looked at these
     las.write(tmp_path / "checked.laz")
     model = tmp_path / "m.model"
-    common = [
-        "train",
-        str(tmp_path / "checked.laz"),
-        "--base",
-        "standard",
-        "--classes",
-        "2,5,6",
-        "--model",
-        str(model),
-    ]
+    common = ["train", str(tmp_path / "checked.laz"), "--model", str(model)]
+    common += ["--base", "standard", "--classes", "2,5,6"]
     assert cli.main(common) == 0
     said = capsys.readouterr()
     assert "were checked by a person" in said.err + said.out

@@ -143,18 +143,8 @@ def test_skips_that_must_not_happen_fail(tmp_path):
         "PDAL_STAGES_REQUIRE": "pdal,data",
         "PDAL_STAGES_DATA": str(tmp_path / "absent"),
     }
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-c",
-        os.devnull,
-        "--rootdir",
-        tmp_path,
-    ]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    command += ["-c", os.devnull, "--rootdir", tmp_path]
     done = subprocess.run([*command, tmp_path], env=environment, capture_output=True, text=True, timeout=120)
     counts = dict.fromkeys(("failed", "error", "skipped"), 0)
     for number, word in re.findall(r"(\d+) (failed|error|skipped)", done.stdout.splitlines()[-1]):

@@ -18,11 +18,6 @@ from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.stages.preparation import made_of_coordinates, preparation_of
 
 
-@pytest.fixture
-def town(ready_town):
-    return ready_town
-
-
 def test_every_shipped_model_loads_says_its_preparation_and_is_small(tmp_path):
     assert STANDARD in shipped()
     for path in shipped().values():
@@ -63,11 +58,11 @@ def test_heights_are_made_as_in_training_beside_return_numbers():
 
 
 @pytest.mark.pdal
-def test_a_raw_tile_is_classified_without_a_model_named(town, tmp_path, capsys):
+def test_a_raw_tile_is_classified_without_a_model_named(ready_town, tmp_path, capsys):
     out = tmp_path / "classified.laz"
-    assert main(["classify", str(town), str(out)]) == 0
+    assert main(["classify", str(ready_town), str(out)]) == 0
     assert "points written" in capsys.readouterr().out
-    points, truth = (Pipeline([str(path)]) for path in (out, town))
+    points, truth = (Pipeline([str(path)]) for path in (out, ready_town))
     points.execute()
     truth.execute()
     found, known = points.arrays[0], truth.arrays[0]
@@ -85,12 +80,12 @@ def test_models_are_listed(capsys):
 
 
 @pytest.mark.pdal
-def test_a_pipeline_with_other_heights_is_told(town):
-    same = [str(town), *load_model(shipped()[STANDARD]).info["preparation"]]
+def test_a_pipeline_with_other_heights_is_told(ready_town):
+    same = [str(ready_town), *load_model(shipped()[STANDARD]).info["preparation"]]
     classify = {"type": "filters.modelclassifier", "model": STANDARD}
     assert Pipeline([*same, classify]).expanded.warnings == []
     other = [
-        str(town),
+        str(ready_town),
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "window": 20},
     ]
     (warning,) = Pipeline([*other, classify]).expanded.warnings
@@ -98,23 +93,23 @@ def test_a_pipeline_with_other_heights_is_told(town):
 
 
 @pytest.mark.pdal
-def test_missing_heights_come_with_the_stage_to_paste(town):
-    pipeline = Pipeline([str(town), {"type": "filters.modelclassifier", "model": STANDARD}])
+def test_missing_heights_come_with_the_stage_to_paste(ready_town):
+    pipeline = Pipeline([str(ready_town), {"type": "filters.modelclassifier", "model": STANDARD}])
     with pytest.raises(StageError) as caught:
         pipeline.execute()
     assert '{"type": "filters.hag_morphological", "ground": true, "openings": [5, 17]}' in str(caught.value)
 
 
 @pytest.mark.pdal
-def test_training_keeps_the_stages_before_it(town, tmp_path):
+def test_training_keeps_the_stages_before_it(ready_town, tmp_path):
     path = tmp_path / "own.model"
     writer = {"type": "writers.classifiermodel", "filename": str(path), "classes": {"2": 2, "5": 5, "6": 6}}
     few = {"neighborhoods": "k10", "feature_set": "covariance", "count": 50, "trees": 3, "passes": 1}
     heights = {"type": "filters.hag_minima", "cell": 10, "tag": "h"}
     few["dimensions"] = "HeightAboveGround"
-    Pipeline([str(town), heights, {**writer, **few}]).execute()
+    Pipeline([str(ready_town), heights, {**writer, **few}]).execute()
     assert load_model(path).info["preparation"] == [{"type": "filters.hag_minima", "cell": 10}]
-    expanded = json.loads(Pipeline([str(town), heights, {**writer, **few}]).json)
+    expanded = json.loads(Pipeline([str(ready_town), heights, {**writer, **few}]).json)
     arguments = expanded["pipeline"][-1]["pdalargs"]
     assert arguments["preparation"] == [{"type": "filters.hag_minima", "cell": 10}]
 
@@ -128,9 +123,12 @@ def test_heights_follow_from_what_is_read():
 
 
 @pytest.mark.pdal
-def test_vegetation_by_height(town):
+def test_vegetation_by_height(ready_town):
     """``vegetation_heights``: low below the first, medium below the second, nothing else touched."""
-    plain, split = classified(town), classified(town, vegetation_heights="0.5,2", reject_below=0.8)
+    plain, split = (
+        classified(ready_town),
+        classified(ready_town, vegetation_heights="0.5,2", reject_below=0.8),
+    )
     height, sure = plain["HeightAboveGround"], plain["Reliability"] >= np.float32(0.8)
     expected = np.where(sure, plain["Classification"], 0)  # rejected ones keep the class they had
     called = expected == 5
@@ -157,14 +155,14 @@ def test_vegetation_heights_that_mean_nothing(wrong):
 
 
 @pytest.mark.pdal
-def test_a_shipped_model_by_name_in_tiles(town, tmp_path, monkeypatch):
+def test_a_shipped_model_by_name_in_tiles(ready_town, tmp_path, monkeypatch):
     """In processes of their own as well, and whatever the current folder holds."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / STANDARD).write_text("mine")
     preparation = load_model(STANDARD).info["preparation"]
 
     def job(target):
-        return [str(town), *preparation, {"type": "filters.modelclassifier", "model": STANDARD}, target]
+        return [str(ready_town), *preparation, {"type": "filters.modelclassifier", "model": STANDARD}, target]
 
     Pipeline(job("whole.laz")).execute(arrays=False)
     run = run_tiled(job("tiles.laz"), 40, workers=2, progress=False)

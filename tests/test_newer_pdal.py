@@ -5,6 +5,7 @@ from __future__ import annotations
 import laspy
 import numpy as np
 import pytest
+from block_scene import ground_and_block
 
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
@@ -22,15 +23,9 @@ def needs(*version: int) -> None:
 
 
 def scene(n=2000, seed=3):
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0, 50, (2, n)).round(2)
-    high = (x > 20) & (y > 20)
     return {
-        "X": x + 500_000,
-        "Y": y + 5_400_000,
-        "Z": np.where(high, 6.0, 0.0) + rng.normal(100, 0.05, n).round(2),
-        "Intensity": rng.integers(0, 999, n).astype(np.uint16),
-        "Classification": np.where(high, 6, 2).astype(np.uint8),
+        **ground_and_block(n, seed, 50.0, at=(500_000, 5_400_000, 100)),
+        "Intensity": np.random.default_rng(seed).integers(0, 999, n).astype(np.uint16),
         "GpsTime": np.arange(n, dtype=float),
         "Mine": np.arange(n, dtype=np.int32),
     }
@@ -39,17 +34,6 @@ def scene(n=2000, seed=3):
 @pytest.fixture()
 def cloud(tmp_path, write_las):
     return write_las(tmp_path / "in.laz", scene(), point_format=6, scale=0.01)
-
-
-@pytest.fixture(scope="module")
-def wide_model(tmp_path_factory, write_las):
-    """A model of ground and a class above 31."""
-    folder = tmp_path_factory.mktemp("wide")
-    source = write_las(folder / "train.las", scene(), point_format=6, scale=0.01)
-    trained = {"type": "writers.classifiermodel", "filename": str(folder / "m"), "neighborhoods": "c1", "count": 100,
-               "feature_set": "geometric", "dimensions": [], "classes": {"2": 2, "6": "64 Shed"}, "trees": 5}  # fmt: skip
-    ps.run_pipeline([str(source), trained])
-    return folder / "m"
 
 
 def heights(las):

@@ -9,6 +9,7 @@ import sys
 import laspy
 import numpy as np
 import pytest
+from block_scene import QUICK_TRAINING, ground_and_block
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError
@@ -19,19 +20,11 @@ from pdal_stages.stages.selection import Selection
 
 pytestmark = pytest.mark.pdal
 FLAGS = ("Synthetic", "KeyPoint", "Withheld")
-
-
-def scene(seed=1, n=900):
-    """Ground (2) and a block (6)."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0, 30, (2, n)).round(2)
-    block = (x > 15) & (y > 15)
-    z = (np.where(block, 5.0, 0.0) + rng.normal(0, 0.02, n)).round(2)
-    return {"X": x, "Y": y, "Z": z, "Classification": np.where(block, 6, 2).astype(np.uint8)}
+NEWER = {"minor_version": 4, "dataformat_id": 6}
 
 
 def flagged(seed=1):
-    arrays = scene(seed)
+    arrays = ground_and_block(900, seed)
     rng = np.random.default_rng(seed)
     return {**arrays, **{name: (rng.random(len(arrays["X"])) < 0.2).astype(np.uint8) for name in FLAGS}}
 
@@ -39,27 +32,15 @@ def flagged(seed=1):
 @pytest.fixture(scope="module")
 def model(tmp_path_factory, write_las):
     folder = tmp_path_factory.mktemp("model")
-    source = write_las(folder / "train.las", scene(), point_format=1)
+    source = write_las(folder / "train.las", ground_and_block(900), point_format=1)
     path = folder / "small.model"
-    words = ["train", source, "--model", path, "--neighborhoods", "k8", "--count", 200]
-    options = {
-        "trees": 8,
-        "passes": 1,
-        "feature_set": "Linearity,HeightRange",
-        "dimensions": "HeightAboveGround",
-    }
-    assert main([*map(str, words), *(f"--writers.classifiermodel.{k}={v}" for k, v in options.items())]) == 0
+    words = ["train", str(source), "--model", str(path), *QUICK_TRAINING]
+    assert main([*words, "--writers.classifiermodel.dimensions=HeightAboveGround"]) == 0
     return path
 
 
-def run(capsys, *words):
-    code = main([str(w) for w in words])
-    return code, *capsys.readouterr()
-
-
-def same_flags(source, out):
-    for name in ("synthetic", "key_point", "withheld"):
-        assert np.array_equal(np.asarray(source[name]), np.asarray(out[name])), name
+def all_flags(las):
+    return np.array([np.asarray(las[name]) for name in ("synthetic", "key_point", "withheld")])
 
 
 # ---- flags of LAS 1.0-1.3 in LAS 1.4 -----------------------------------------------------------------------
@@ -67,48 +48,32 @@ def same_flags(source, out):
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 @pytest.mark.parametrize("tiles", [False, True])
-def test_flags_of_old_files_stay_flags_in_new_ones(tmp_path, capsys, write_las, model, suffix, tiles):
+def test_flags_of_old_files_stay_flags_in_new_ones(tmp_path, run, run_job, write_las, model, suffix, tiles):
     source, out = write_las(tmp_path / "in.las", flagged(), point_format=1), tmp_path / f"out.{suffix}"
-    newer = {"minor_version": 4, "dataformat_id": 6}
     if tiles:
-        stages = [
-            str(source),
-            {"type": "filters.hag_minima"},
-            {"type": "filters.modelclassifier", "model": str(model), "ignore": ""},
-            {"type": "writers.las", "filename": str(out), "forward": "all", **newer},
-        ]
-        (tmp_path / "job.json").write_text(json.dumps(stages))
-        words = ["pipeline", tmp_path / "job.json", "--tile", 20, "--workers", 0]
+        classifier = {"type": "filters.modelclassifier", "model": str(model), "ignore": ""}
+        writer = {"type": "writers.las", "filename": str(out), "forward": "all", **NEWER}
+        stages = [source, {"type": "filters.hag_minima"}, classifier, writer]
+        code, _, err = run_job(stages, "--tile", 20, "--workers", 0)
     else:
-        words = ["classify", source, out, "--model", model, "--filters.modelclassifier.ignore="]
-        words += [f"--writers.las.{k}={v}" for k, v in newer.items()]
-    code, _, err = run(capsys, *words)
+        words = ["--model", model, "--filters.modelclassifier.ignore="]
+        words += [f"--writers.las.{k}={v}" for k, v in NEWER.items()]
+        code, _, err = run("classify", source, out, *words)
     assert code == 0, err
     before, after = laspy.read(source), laspy.read(out)
     assert after.header.point_format.id == 6 and set(np.unique(after.classification)) == {2, 6}
-    same_flags(before, after)
-
-
-NEWER = {"minor_version": 4, "dataformat_id": 6}
-
-
-def all_flags(las):
-    return np.array([np.asarray(las[name]) for name in ("synthetic", "key_point", "withheld")])
+    assert np.array_equal(all_flags(before), all_flags(after))
 
 
 @pytest.mark.parametrize("wiring", ["plain", "pattern"])
-def test_old_and_new_files_together(tmp_path, capsys, write_las, wiring):
+def test_old_and_new_files_together(tmp_path, run_job, write_las, wiring):
     """Old PDAL reads the flags of one as bits of the class, of the other apart."""
     old = write_las(tmp_path / "a_old.las", flagged(), point_format=1)
     new = write_las(tmp_path / "b_new.las", flagged(2), point_format=6)
     out = {"type": "writers.las", "filename": str(tmp_path / "o.las"), **NEWER}
     heights = {"type": "filters.hag_minima", "ignore": "withheld"}
-    readers = {
-        "plain": [str(new), str(old)],
-        "pattern": [str(tmp_path / "*_*.las")],
-    }[wiring]
-    (tmp_path / "job.json").write_text(json.dumps([*readers, heights, out]))
-    code, _, err = run(capsys, "pipeline", tmp_path / "job.json")
+    readers = [new, old] if wiring == "plain" else [tmp_path / "*_*.las"]
+    code, _, err = run_job([*readers, heights, out])
     assert code == 0, err
     made, parts = laspy.read(tmp_path / "o.las"), [laspy.read(new), laspy.read(old)]
     if wiring == "pattern":
@@ -119,7 +84,7 @@ def test_old_and_new_files_together(tmp_path, capsys, write_las, wiring):
     assert not list(made.point_format.extra_dimension_names)
 
 
-def test_training_on_old_and_new_files(tmp_path, capsys, write_las):
+def test_training_on_old_and_new_files(tmp_path, run, write_las):
     """Withheld points teach nothing, of either kind."""
     models = []
     for point_formats in ((1, 6), (6, 6)):
@@ -128,7 +93,7 @@ def test_training_on_old_and_new_files(tmp_path, capsys, write_las):
         ]
         words = ["train", *files, "--model", tmp_path / "m.model", "--neighborhoods", "k8", "--count", 50]
         more = ["--writers.classifiermodel.trees=2", "--writers.classifiermodel.passes=1"]
-        code, _, err = run(capsys, *words, *more, "--writers.classifiermodel.threads=1")
+        code, _, err = run(*words, *more, "--writers.classifiermodel.threads=1")
         assert code == 0, err
         models.append(ps.load_model(tmp_path / "m.model").passes[0].arrays())
     assert all(np.array_equal(models[0][key], models[1][key]) for key in models[0])
@@ -139,9 +104,8 @@ def test_pdals_own_pipelines_write_what_pdal_writes(tmp_path, capsys, write_las,
     made = []
     for number, words in enumerate(([pdal_program], [sys.executable, "-m", "pdal_stages.cli"])):
         out = tmp_path / f"{number}.txt"
-        (tmp_path / "job.json").write_text(
-            json.dumps([str(source), {"type": "writers.text", "filename": str(out)}])
-        )
+        stages = [str(source), {"type": "writers.text", "filename": str(out)}]
+        (tmp_path / "job.json").write_text(json.dumps(stages))
         subprocess.run([*words, "pipeline", str(tmp_path / "job.json")], check=True)
         made.append(out.read_bytes())
     assert made[0] == made[1]
@@ -152,38 +116,27 @@ def test_where_sees_classes_without_flags(write_las, tmp_path, model):
     classes = []
     for point_format in (1, 6):
         source = write_las(tmp_path / f"{point_format}.las", flagged(), point_format=point_format)
-        stage = {
-            "type": "filters.modelclassifier",
-            "model": str(model),
-            "ignore": "",
-            "where": "Classification == 6",
-        }
+        stage = {"type": "filters.modelclassifier", "model": str(model), "ignore": ""}
+        stage["where"] = "Classification == 6"
         run_ = ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, stage])
         classes.append(run_.reports[-1][1][-1].figures["where"])
     assert classes[0] == classes[1] == np.count_nonzero(flagged()["Classification"] == 6)
 
 
-def test_writers_of_both_are_refused_before_work(tmp_path, capsys, write_las, model):
+def test_writers_of_both_are_refused_before_work(tmp_path, run_job, write_las, model):
     if pdal_env.splits_class_flags():
         pytest.skip("PDAL 2.6 and newer read flags as dimensions of their own")
     old = write_las(tmp_path / "old.las", flagged(), point_format=1)
     new = {"type": "writers.las", "filename": str(tmp_path / "o4.las"), **NEWER}
-    stages = [
-        str(old),
-        {**new, "filename": str(tmp_path / "o2.las"), "minor_version": 2, "dataformat_id": 1},
-        new,
-    ]
-    (tmp_path / "job.json").write_text(json.dumps(stages))
-    code, _, err = run(capsys, "pipeline", tmp_path / "job.json")
+    older = {**new, "filename": str(tmp_path / "o2.las"), "minor_version": 2, "dataformat_id": 1}
+    code, _, err = run_job([old, older, new])
     assert code == 1 and "flags" in err and "dataformat_id" in err
-    convert = [str(old), {**new, "filename": str(tmp_path / "c.las"), "forward": "all"}]
-    (tmp_path / "convert.json").write_text(json.dumps(convert))
-    assert run(capsys, "pipeline", tmp_path / "convert.json")[0] == 0
-    same_flags(laspy.read(old), laspy.read(tmp_path / "c.las"))
+    assert run_job([old, {**new, "filename": str(tmp_path / "c.las"), "forward": "all"}])[0] == 0
+    assert np.array_equal(all_flags(laspy.read(old)), all_flags(laspy.read(tmp_path / "c.las")))
 
 
 @pytest.mark.parametrize("tiles", [False, True])
-def test_all_extra_dimensions_of_a_new_file(tmp_path, capsys, write_las, tiles):
+def test_all_extra_dimensions_of_a_new_file(tmp_path, run_job, write_las, tiles):
     arrays = flagged() | {"Amplitude": np.arange(900, dtype="f4"), "Linearity": np.arange(900, dtype="f8")}
     source = write_las(tmp_path / "in.laz", arrays, point_format=7)
     stages = [
@@ -192,26 +145,24 @@ def test_all_extra_dimensions_of_a_new_file(tmp_path, capsys, write_las, tiles):
         {"type": "filters.hag_minima"},
         {"type": "writers.las", "filename": str(tmp_path / "o.las"), "extra_dims": "all", **NEWER},
     ]
-    (tmp_path / "job.json").write_text(json.dumps(stages))
-    words = ["--tile", 20, "--workers", 0] if tiles else []
-    code, _, err = run(capsys, "pipeline", tmp_path / "job.json", *words)
+    code, _, err = run_job(stages, *(["--tile", 20, "--workers", 0] if tiles else []))
     assert code == 0, err
     made = laspy.read(tmp_path / "o.las")
     names = [name for name in made.point_format.extra_dimension_names if name != "ClassFlags"]  # of old PDAL
     assert names == ["Red", "Green", "Blue", "Amplitude", "Linearity", "Reference", "HeightAboveGround"]
     assert np.array_equal(made.Amplitude, arrays["Amplitude"])
-    same_flags(laspy.read(source), made)
+    assert np.array_equal(all_flags(laspy.read(source)), all_flags(made))
 
 
-def test_kept_codes_that_do_not_fit_are_refused(tmp_path, capsys, write_las, model):
-    arrays = scene()
+def test_kept_codes_that_do_not_fit_are_refused(tmp_path, run, write_las, model):
+    arrays = ground_and_block(900)
     arrays["Classification"][:7] = 65
     source = write_las(tmp_path / "in.las", arrays, point_format=6)
     words = ["--model", model, "--where", "Classification < 60"]
     old = ["--writers.las.minor_version=2", "--writers.las.dataformat_id=1"]
-    code, _, err = run(capsys, "classify", source, tmp_path / "o.las", *words, *old)
+    code, _, err = run("classify", source, tmp_path / "o.las", *words, *old)
     assert code == 1 and "code 65" in err and "minor_version" in err
-    assert run(capsys, "classify", source, tmp_path / "o.las", *words)[0] == 0
+    assert run("classify", source, tmp_path / "o.las", *words)[0] == 0
     assert np.count_nonzero(np.asarray(laspy.read(tmp_path / "o.las").classification) == 65) == 7
 
 
@@ -219,9 +170,9 @@ def test_kept_codes_that_do_not_fit_are_refused(tmp_path, capsys, write_las, mod
 
 
 @pytest.mark.parametrize("point_format", [1, 6])
-def test_noise_and_withheld_points_are_not_there(tmp_path, capsys, write_las, model, point_format):
+def test_noise_and_withheld_points_are_not_there(tmp_path, run, write_las, model, point_format):
     """The others are classified as in a file without them; these keep their class."""
-    clean = scene()
+    clean = ground_and_block(900)
     n = len(clean["X"])
     rng = np.random.default_rng(3)
     bad = {name: np.concatenate([v, v[:120]]) for name, v in clean.items()}
@@ -231,7 +182,7 @@ def test_noise_and_withheld_points_are_not_there(tmp_path, capsys, write_las, mo
     out = {}
     for name, arrays in (("clean", clean), ("bad", bad)):
         source = write_las(tmp_path / f"{name}.las", arrays, point_format=point_format)
-        code, said, err = run(capsys, "classify", source, tmp_path / "o.las", "--model", model)
+        code, said, err = run("classify", source, tmp_path / "o.las", "--model", model)
         assert code == 0, err
         out[name] = laspy.read(tmp_path / "o.las")
     assert "left out: noise, withheld (ignore)" in said and "120" in said
@@ -241,14 +192,14 @@ def test_noise_and_withheld_points_are_not_there(tmp_path, capsys, write_las, mo
     assert np.abs(out["bad"].HeightAboveGround[n:]).max() > 1  # they still have heights
 
 
-def test_overlap_is_a_neighbor_and_keeps_its_class(tmp_path, capsys, write_las, model):
-    arrays = scene()
+def test_overlap_is_a_neighbor_and_keeps_its_class(tmp_path, run, write_las, model):
+    arrays = ground_and_block(900)
     truth = arrays["Classification"].copy()
     arrays["Classification"][::3] = 12
     source = write_las(tmp_path / "in.las", arrays, point_format=1)
     reliability = {}
     for words in ((), ("--filters.modelclassifier.keep=",)):
-        code, said, err = run(capsys, "classify", source, tmp_path / "o.las", "--model", model, *words)
+        code, said, err = run("classify", source, tmp_path / "o.las", "--model", model, *words)
         assert code == 0, err
         out = laspy.read(tmp_path / "o.las")
         assert np.array_equal(
@@ -262,7 +213,7 @@ def test_overlap_is_a_neighbor_and_keeps_its_class(tmp_path, capsys, write_las, 
 
 
 def test_features_and_training_without_unwanted_points(tmp_path, capsys, write_las):
-    clean = scene(n=300)
+    clean = ground_and_block(300)
     bad = {name: np.concatenate([v, v[:60]]) for name, v in clean.items()}
     bad["Z"][300:] += 1.0
     bad["Classification"][300:330] = 7
@@ -270,37 +221,26 @@ def test_features_and_training_without_unwanted_points(tmp_path, capsys, write_l
     features, models = [], []
     for name, arrays in (("clean", clean), ("bad", bad)):
         source = write_las(tmp_path / f"{name}.las", arrays, point_format=6)
-        made = ps.run_pipeline(
-            [
-                str(source),
-                {"type": "filters.multiscalefeatures", "neighborhoods": "k5", "feature_set": "covariance"},
-            ]
-        )
+        planarity = {"type": "filters.multiscalefeatures", "neighborhoods": "k5", "feature_set": "covariance"}
+        made = ps.run_pipeline([str(source), planarity])
         features.append(made.arrays[0]["Planarity_k5"])
-        train = {
-            "type": "writers.classifiermodel",
-            "filename": str(tmp_path / "m.model"),
-            "neighborhoods": "k5",
-            "passes": 1,
-            "trees": 2,
-            "count": 50,
-            "threads": 1,
-        }
-        ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, train])
+        writer = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "threads": 1}
+        few = {"neighborhoods": "k5", "passes": 1, "trees": 2, "count": 50}
+        ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, {**writer, **few}])
         models.append(ps.load_model(tmp_path / "m.model").passes[0].arrays())
     assert np.array_equal(features[0], features[1][:300]) and not features[1][300:].any()
     assert all(np.array_equal(models[0][key], models[1][key]) for key in models[0])
 
 
-def test_withheld_points_are_not_scored(tmp_path, capsys, write_las):
-    arrays = scene()
+def test_withheld_points_are_not_scored(tmp_path, run, write_las):
+    arrays = ground_and_block(900)
     arrays["Withheld"] = (np.arange(900) < 100).astype(np.uint8)
     reference = write_las(tmp_path / "reference.las", arrays, point_format=1)
     arrays["Classification"][:100] = 9
     judged = write_las(tmp_path / "judged.las", arrays, point_format=1)
     for words, compared, right in (((), 800, 1.0), (("--filters.accuracy.ignore=",), 900, 8 / 9)):
         out = tmp_path / "a.json"
-        code, _, err = run(capsys, "accuracy", judged, "--reference", reference, "--json", out, *words)
+        code, _, err = run("accuracy", judged, "--reference", reference, "--json", out, *words)
         assert code == 0, err
         figures = json.loads(out.read_text())
         assert figures["points"] == compared and figures["overall_accuracy"] == pytest.approx(right)
@@ -309,7 +249,7 @@ def test_withheld_points_are_not_scored(tmp_path, capsys, write_las):
 @pytest.mark.parametrize("type_name", ["filters.hag_minima", "filters.hag_morphological"])
 def test_points_outside_where_have_heights(tmp_path, write_las, type_name):
     """They do not form the ground, but 0 would be a height too."""
-    arrays = scene()
+    arrays = ground_and_block(900)
     arrays["Classification"][::5] = 7
     arrays["Z"][::5] -= 20
     source = str(write_las(tmp_path / "in.las", arrays, point_format=1))

@@ -39,9 +39,7 @@ def folder(tmp_path_factory):
     for number in range(4):
         mine = (las.x >= 500_050) == number % 2
         mine &= (las.y >= 5_400_050) == number // 2
-        part = laspy.LasData(las.header)
-        part.points = las.points[mine]
-        part.write(folder / "parts" / f"{number}.laz")
+        las[mine].write(folder / "parts" / f"{number}.laz")
     return folder
 
 
@@ -158,9 +156,7 @@ def test_larger_cells_where_points_are_few(folder, tmp_path, capsys):
     las.write(tmp_path / "thin.laz")
     west = np.asarray(las.x) < 500_050
     for name, mine in (("west", west), ("east", ~west)):
-        part = laspy.LasData(las.header)
-        part.points = las.points[mine]
-        part.write(tmp_path / f"{name}.laz")
+        las[mine].write(tmp_path / f"{name}.laz")
 
     def run(name, files, *words):
         target = tmp_path / f"{name}.gpkg"

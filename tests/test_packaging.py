@@ -62,17 +62,7 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
     wheels = tmp_path / "wheels"
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--no-deps",
-        "-q",
-        "-w",
-        wheels,
-        source,
-    ]
+    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", wheels, source]
     built = subprocess.run(command, capture_output=True, text=True, check=False)
     if built.returncode and re.search("No matching distribution|connection", built.stderr):
         pytest.skip("pip's index has no setuptools to build with")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import laspy
 import numpy as np
@@ -48,51 +48,30 @@ def model(tmp_path_factory, write_las):
     folder = tmp_path_factory.mktemp("model")
     source = write_las(folder / "train.las", scene(seed=9), point_format=3)
     path = folder / "small.model"
-    ps.run_pipeline(
-        [
-            str(source),
-            {"type": "filters.hag_minima"},
-            {
-                "type": "writers.classifiermodel",
-                "filename": str(path),
-                "neighborhoods": "c1,s2",
-                "feature_set": "covariance,geometric",
-                "count": 300,
-                "trees": 10,
-            },
-        ]
-    )
+    writer = {"type": "writers.classifiermodel", "filename": str(path), "count": 300, "trees": 10}
+    features = {"neighborhoods": "c1,s2", "feature_set": "covariance,geometric"}
+    ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, {**writer, **features}])
     return path
-
-
-def read(path):
-    return laspy.read(path)
 
 
 # ---- the three doors -------------------------------------------------------------------------------------
 
 
 def expected_heights(path):
-    las = read(path)
+    las = laspy.read(path)
     return hag_minima(np.asarray(las.x), np.asarray(las.y), np.asarray(las.z))
 
 
 def test_door_1_expanded_runs_in_stock_pdal(cloud, tmp_path, pdal_program):
     out = tmp_path / "out.las"
-    pipeline = ps.Pipeline(
-        [
-            str(cloud),
-            {"type": "filters.hag_minima"},
-            {"type": "writers.las", "filename": str(out), "extra_dims": "all"},
-        ]
-    )
+    writer = {"type": "writers.las", "filename": str(out), "extra_dims": "all"}
+    pipeline = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}, writer])
     (tmp_path / "plain.json").write_text(pipeline.json)
     assert "from pdal_stages import run_stage" in pipeline.json
-    done = subprocess.run(
-        [pdal_program, "pipeline", str(tmp_path / "plain.json")], capture_output=True, text=True
-    )
+    command = [pdal_program, "pipeline", str(tmp_path / "plain.json")]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert np.allclose(read(out)["HeightAboveGround"], expected_heights(cloud))
+    assert np.allclose(laspy.read(out)["HeightAboveGround"], expected_heights(cloud))
 
 
 def test_door_2_python_objects(cloud, pdal_module, model):
@@ -134,29 +113,6 @@ def test_door_3_filters_python_by_hand(cloud, pdal_module):
 # ---- class codes that do not fit -------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def wide_model(tmp_path_factory, write_las):
-    folder = tmp_path_factory.mktemp("wide")
-    source = write_las(folder / "train.las", scene(seed=3), point_format=3)
-    path = folder / "wide.model"
-    ps.run_pipeline(
-        [
-            str(source),
-            {
-                "type": "writers.classifiermodel",
-                "filename": str(path),
-                "neighborhoods": "c1",
-                "dimensions": [],
-                "feature_set": "geometric",
-                "classes": {"2": 2, "6": "64 Shed"},
-                "count": 100,
-                "trees": 5,
-            },
-        ]
-    )
-    return path
-
-
 def test_codes_above_31_need_las_14(cloud, tmp_path, wide_model):
     out = tmp_path / "out.las"
     stages = [str(cloud), {"type": "filters.modelclassifier", "model": str(wide_model)}]
@@ -165,7 +121,7 @@ def test_codes_above_31_need_las_14(cloud, tmp_path, wide_model):
     ps.run_pipeline(
         [*stages, {"type": "writers.las", "filename": str(out), "minor_version": 4, "dataformat_id": 7}]
     )
-    assert set(np.unique(read(out).classification)) == {2, 64}
+    assert set(np.unique(laspy.read(out).classification)) == {2, 64}
 
 
 @pytest.mark.parametrize("tiles", [None, "file"])
@@ -174,10 +130,8 @@ def test_codes_above_31_in_laz_14(tmp_path, write_las, wide_model, tiles):
     arrays = scene() | {"Withheld": (np.arange(3000) == 7).astype(np.uint8)}
     arrays["Classification"] = np.where(arrays["Withheld"], 65, arrays["Classification"]).astype(np.uint8)
     source, out = write_las(tmp_path / "in.laz", arrays, point_format=7), tmp_path / "out_#.laz"
-    heights, last = (
-        {"type": "filters.hag_minima"},
-        {"type": "writers.las", "filename": str(out), "forward": "all"},
-    )
+    heights = {"type": "filters.hag_minima"}
+    last = {"type": "writers.las", "filename": str(out), "forward": "all"}
     for model in ([], [{"type": "filters.modelclassifier", "model": str(wide_model)}]):
         stages = [str(source), heights, *model, last]
         if tiles:
@@ -185,14 +139,14 @@ def test_codes_above_31_in_laz_14(tmp_path, write_las, wide_model, tiles):
         else:
             ps.run_pipeline(stages)
         (made,) = tmp_path.glob("out_*.laz")
-        las = read(made)
+        las = laspy.read(made)
         assert las.header.point_format.id == 7 and las.header.are_points_compressed
         assert np.flatnonzero(las.classification == 65).tolist() == [7] and las.withheld[7]
         if model:
             assert set(np.unique(las.classification)) == {2, 64, 65}
         else:
             assert np.array_equal(las.classification, arrays["Classification"])
-        assert np.array_equal(las.gps_time, read(source).gps_time)
+        assert np.array_equal(las.gps_time, laspy.read(source).gps_time)
         made.unlink()
     assert [path.name for path in tmp_path.iterdir() if path.name[0] == "."] in ([], [".pdal-stages"])
 
@@ -216,14 +170,9 @@ def test_points_of_two_readers_see_each_other(tmp_path, write_las):
 
 
 def test_split_views_stay_apart(cloud, tmp_path):
-    pipeline = ps.run_pipeline(
-        [
-            str(cloud),
-            {"type": "filters.splitter", "length": 30, "origin_x": 500000, "origin_y": 5400000},
-            {"type": "filters.hag_minima"},
-            {"type": "writers.las", "filename": str(tmp_path / "tile_#.las")},
-        ]
-    )
+    squares = {"type": "filters.splitter", "length": 30, "origin_x": 500000, "origin_y": 5400000}
+    writer = {"type": "writers.las", "filename": str(tmp_path / "tile_#.las")}
+    pipeline = ps.run_pipeline([str(cloud), squares, {"type": "filters.hag_minima"}, writer])
     assert len(list(tmp_path.glob("tile_*.las"))) == 4
     assert len(pipeline.reports[0][1]) == 4
     assert not list(tmp_path.glob(".*partial*"))
@@ -231,16 +180,10 @@ def test_split_views_stay_apart(cloud, tmp_path):
 
 def test_where_leaves_the_others_alone(cloud, model):
     stages = [str(cloud), {"type": "filters.hag_minima"}]
-    everything = ps.run_pipeline([*stages, {"type": "filters.modelclassifier", "model": str(model)}]).arrays[
-        0
-    ]
-    part = ps.run_pipeline(
-        [
-            *stages,
-            {"type": "filters.assign", "assignment": "Classification[:]=9"},
-            {"type": "filters.modelclassifier", "model": str(model), "where": "X < 500030 && Z > 0"},
-        ]
-    ).arrays[0]
+    classifier = {"type": "filters.modelclassifier", "model": str(model)}
+    everything = ps.run_pipeline([*stages, classifier]).arrays[0]
+    nine = {"type": "filters.assign", "assignment": "Classification[:]=9"}
+    part = ps.run_pipeline([*stages, nine, {**classifier, "where": "X < 500030 && Z > 0"}]).arrays[0]
     inside = part["X"] < 500_030
     assert np.array_equal(part["Classification"][inside], everything["Classification"][inside])
     assert (part["Classification"][~inside] == 9).all()
@@ -253,57 +196,31 @@ def test_where_leaves_the_others_alone(cloud, model):
 def test_a_missing_dimension_names_the_stage_that_makes_it(cloud, tmp_path, model):
     out = tmp_path / "out.laz"
     out.write_bytes(b"older result")
-    with pytest.raises(
-        DimensionError, match=r"filters\.modelclassifier \(tag 'c'\).*HeightAboveGround.*filters\.hag_minima"
-    ):
-        ps.run_pipeline(
-            [str(cloud), {"type": "filters.modelclassifier", "model": str(model), "tag": "c"}, str(out)]
-        )
+    classifier = {"type": "filters.modelclassifier", "model": str(model), "tag": "c"}
+    says = r"filters\.modelclassifier \(tag 'c'\).*HeightAboveGround.*filters\.hag_minima"
+    with pytest.raises(DimensionError, match=says):
+        ps.run_pipeline([str(cloud), classifier, str(out)])
     assert out.read_bytes() == b"older result"
     assert not list(tmp_path.glob(".*partial*"))
 
 
 def test_too_many_features_for_one_las_record(cloud, tmp_path):
-    writer = {
-        "type": "writers.las",
-        "filename": str(tmp_path / "o.las"),
-        "minor_version": 4,
-        "extra_dims": "all",
-    }
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o.las")}
+    many = {"type": "filters.multiscalefeatures", "neighborhoods": "blomley2016,s1,s2", "feature_set": "all"}
     with pytest.raises(DimensionError, match="extra dimensions"):
-        ps.Pipeline(
-            [
-                str(cloud),
-                {
-                    "type": "filters.multiscalefeatures",
-                    "neighborhoods": "blomley2016,s1,s2",
-                    "feature_set": "all",
-                },
-                writer,
-            ]
-        )
+        ps.Pipeline([str(cloud), many, {**writer, "minor_version": 4, "extra_dims": "all"}])
 
 
 # ---- threads ---------------------------------------------------------------------------------------------
 
 
 def test_pipelines_run_in_threads(cloud):
-    results: dict[int, np.ndarray] = {}
+    features = {"type": "filters.multiscalefeatures", "neighborhoods": "c1,s2"}
 
-    def work(number):
-        pipeline = ps.run_pipeline(
-            [
-                str(cloud),
-                {"type": "filters.hag_minima"},
-                {"type": "filters.multiscalefeatures", "neighborhoods": "c1,s2"},
-            ]
-        )
-        results[number] = pipeline.arrays[0]["Linearity_s2"]
+    def work(_):
+        pipeline = ps.run_pipeline([str(cloud), {"type": "filters.hag_minima"}, features])
+        return pipeline.arrays[0]["Linearity_s2"]
 
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-    for t in threads:
-        t.start()
-    for t in threads:
-        t.join()
-    assert len(results) == 4
-    assert all(np.array_equal(results[0], r) for r in results.values())
+    with ThreadPoolExecutor(4) as threads:
+        results = list(threads.map(work, range(4)))
+    assert all(np.array_equal(results[0], result) for result in results)

@@ -86,11 +86,6 @@ def python(environment):
     return run
 
 
-@pytest.fixture
-def town(ready_town):
-    return ready_town
-
-
 def with_words(name, *words):
     """A ready pipeline with overrides."""
     stages = json.loads(next(path for path in PIPELINES if path.stem == name).read_text())
@@ -138,22 +133,23 @@ EVERY = [
 ]
 
 
-def test_all_stages_give_the_same_bytes(pipeline, town, tmp_path):
+def test_all_stages_give_the_same_bytes(pipeline, ready_town, tmp_path):
     """The others are in ready pipelines; filters.polygons, of a vector file, is not compared."""
     ready = {stage["type"] for path in PIPELINES for stage in json.loads(path.read_text())}
     tested = {stage["type"] for stage in EVERY} | ready | {"writers.objects", "filters.polygons"}
     assert set(stage_types()) <= tested
-    pipeline(las([str(town), *EVERY], tmp_path / "stock.las"))
-    ps.Pipeline(las([str(town), *EVERY], tmp_path / "ours.las")).execute()
+    pipeline(las([str(ready_town), *EVERY], tmp_path / "stock.las"))
+    ps.Pipeline(las([str(ready_town), *EVERY], tmp_path / "ours.las")).execute()
     assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
 
 
-def test_objects_are_written(pipeline, town, tmp_path):
+def test_objects_are_written(pipeline, ready_town, tmp_path):
     """The program of PDAL 2.2 has another GEOS and GDAL than Shapely and pyogrio bring: they work in a process apart."""
     pytest.importorskip("pyogrio")
     heights = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
     for name, run in (("stock", pipeline), ("ours", lambda stages: ps.Pipeline(stages).execute())):
-        run([str(town), heights, {"type": "writers.objects", "filename": str(tmp_path / f"{name}.geojson")}])
+        writer = {"type": "writers.objects", "filename": str(tmp_path / f"{name}.geojson")}
+        run([str(ready_town), heights, writer])
     layers = sorted(path.name.removeprefix("ours") for path in tmp_path.glob("ours*.geojson"))
     assert "_buildings.geojson" in layers
     for layer in layers:
@@ -172,11 +168,11 @@ READY = {
 
 @pytest.mark.parametrize("name", READY)
 def test_a_ready_pipeline_gives_the_same_bytes(
-    pipeline, town, quick, ready_halves, ready_models, tmp_path, name, monkeypatch
+    pipeline, ready_town, quick, ready_halves, ready_models, tmp_path, name, monkeypatch
 ):
     for door in ("stock", "ours"):
         (tmp_path / door).mkdir()
-        source = ready_halves / "*.laz" if name == "tiles-to-tiles" else town
+        source = ready_halves / "*.laz" if name == "tiles-to-tiles" else ready_town
         words = [f"--stage.input.filename={source}", *READY[name], *(quick if name == "train" else ())]
         model = str(ready_models / "classes.model")
         stages = with_words(name, *(one.replace("MODEL", model) for one in words))
@@ -212,18 +208,18 @@ def test_points_of_several_readers_see_each_other(pipeline, ready_halves, tmp_pa
 # ---- options, metadata, log --------------------------------------------------------------------------------
 
 
-def test_options_of_every_pdal_stage(pipeline, town, tmp_path):
+def test_options_of_every_pdal_stage(pipeline, ready_town, tmp_path):
     log = tmp_path / "log.txt"
     stage = {"type": "filters.hag_minima", "cell": 10, "where": "X > 500030"}
     stage |= {"user_data": {"a": [1]}, "log": str(log)}
-    pipeline(las([str(town), stage], tmp_path / "stock.las"), "--verbose=4")
-    ps.Pipeline(las([str(town), {**stage}], tmp_path / "ours.las")).execute()
+    pipeline(las([str(ready_town), stage], tmp_path / "stock.las"), "--verbose=4")
+    ps.Pipeline(las([str(ready_town), {**stage}], tmp_path / "ours.las")).execute()
     assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
     assert log.exists()
 
 
-def test_metadata_is_the_report(pipeline, town, tmp_path):
-    stages = [str(town), {"type": "filters.hag_minima", "cell": 10}, {"type": "writers.null"}]
+def test_metadata_is_the_report(pipeline, ready_town, tmp_path):
+    stages = [str(ready_town), {"type": "filters.hag_minima", "cell": 10}, {"type": "writers.null"}]
     pipeline(stages, f"--metadata={tmp_path / 'm.json'}")
     said = json.loads((tmp_path / "m.json").read_text())["stages"]
     assert "filters.python" not in said
@@ -232,14 +228,14 @@ def test_metadata_is_the_report(pipeline, town, tmp_path):
     assert said["filters.hag_minima"] == done.metadata["metadata"]["filters.hag_minima"]
 
 
-def test_an_empty_list_is_none(pipeline, town, tmp_path):
+def test_an_empty_list_is_none(pipeline, ready_town, tmp_path):
     """PDAL cannot tell an empty list from none given; null is one."""
     files = tmp_path / "stock.txt", tmp_path / "ours.txt"
     for given, run, file in zip(
         (None, []), (pipeline, lambda s: ps.Pipeline(s).execute()), files, strict=True
     ):
         stage = {"type": "filters.hag_minima", "ignore": given}
-        run([str(town), stage, {"type": "writers.text", "filename": str(file)}])
+        run([str(ready_town), stage, {"type": "writers.text", "filename": str(file)}])
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
@@ -254,27 +250,24 @@ def test_an_empty_list_is_none(pipeline, town, tmp_path):
         ({"option_file": "nowhere.json"}, "there is no option 'option_file'"),
     ],
 )
-def test_wrong_options(pipeline, town, tmp_path, options, says):
+def test_wrong_options(pipeline, ready_town, tmp_path, options, says):
     out = tmp_path / "o.laz"
-    done = pipeline(las([str(town), {"type": "filters.hag_minima", "tag": "h", **options}], out), code=1)
+    heights = {"type": "filters.hag_minima", "tag": "h", **options}
+    done = pipeline(las([str(ready_town), heights], out), code=1)
     assert says in done.stderr
     assert done.stderr.startswith("PDAL: filters.hag_minima")
     assert not out.exists()
     assert "array" not in done.stderr and "Traceback" not in done.stderr
 
 
-def test_errors_of_the_work(pipeline, town, ready_models, tmp_path):
+def test_errors_of_the_work(pipeline, ready_town, ready_models, tmp_path):
     out = tmp_path / "o.laz"
-    missing = pipeline(
-        las(
-            [str(town), {"type": "filters.modelclassifier", "model": str(ready_models / "classes.model")}],
-            out,
-        ),
-        code=1,
-    ).stderr
+    classifier = {"type": "filters.modelclassifier"}
+    model = {"model": str(ready_models / "classes.model")}
+    missing = pipeline(las([str(ready_town), {**classifier, **model}], out), code=1).stderr
     assert missing.startswith("PDAL: filters.modelclassifier: ")
     assert "filters.hag_morphological" in missing  # the stage that makes it
-    required = pipeline(las([str(town), {"type": "filters.modelclassifier"}], out), code=1).stderr
+    required = pipeline(las([str(ready_town), classifier], out), code=1).stderr
     assert "option 'model' is required" in required
     nan = tmp_path / "nan.txt"
     nan.write_text("X,Y,Z\n1,1,1\nnan,2,2\n")
@@ -285,9 +278,9 @@ def test_errors_of_the_work(pipeline, town, ready_models, tmp_path):
     assert not out.exists()
 
 
-def test_a_package_that_is_missing(pipeline, environment, town, tmp_path):
+def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
     """Without the package, and where it cannot be imported: the cure, not a crash."""
-    stages = las([str(town), {"type": "filters.hag_minima"}], tmp_path / "o.laz")
+    stages = las([str(ready_town), {"type": "filters.hag_minima"}], tmp_path / "o.laz")
     path = tmp_path / "job.json"
     path.write_text(json.dumps(stages))
 
@@ -329,10 +322,10 @@ def test_a_plugin_of_another_version():
     assert "plugin --install" in leaf["value"]
 
 
-def test_without_filters_python(plugin, pdal_program, town, tmp_path):
+def test_without_filters_python(plugin, pdal_program, ready_town, tmp_path):
     """PDAL that has our plugin but not what runs it."""
     path = tmp_path / "job.json"
-    path.write_text(json.dumps(las([str(town), {"type": "filters.hag_minima"}], tmp_path / "o.laz")))
+    path.write_text(json.dumps(las([str(ready_town), {"type": "filters.hag_minima"}], tmp_path / "o.laz")))
     done = subprocess.run(
         [pdal_program, "pipeline", str(path)],
         env={**os.environ, "PDAL_DRIVER_PATH": str(plugin)}, capture_output=True, text=True, check=False,
@@ -344,10 +337,10 @@ def test_without_filters_python(plugin, pdal_program, town, tmp_path):
 # ---- python-pdal, repeated, at the same time ---------------------------------------------------------------
 
 
-def test_objects_of_python_pdal(python, town):
+def test_objects_of_python_pdal(python, ready_town):
     said = python(
         "import sys, pdal, numpy as np, pdal_stages as ps\n"
-        f"read = pdal.Reader.las({str(town)!r})\n"
+        f"read = pdal.Reader.las({str(ready_town)!r})\n"
         "job = read | pdal.Filter.hag_minima(cell=10) | pdal.Filter.hag_morphological(openings=[5, 17])\n"
         "print(job.execute())\n"
         "ours = read | ps.Filter.hag_minima(cell=10) | ps.Filter.hag_morphological(openings=[5, 17])\n"
@@ -361,11 +354,11 @@ def test_objects_of_python_pdal(python, town):
     assert "coarse" in said
 
 
-def test_a_notebook_survives_failures(python, town):
+def test_a_notebook_survives_failures(python, ready_town):
     """Failures, each an ordinary exception with our message, then a run that succeeds."""
     said = python(
         "import gc, pdal\n"
-        f"read = pdal.Reader.las({str(town)!r})\n"
+        f"read = pdal.Reader.las({str(ready_town)!r})\n"
         "for n in range(10):\n"
         "    job = read | (pdal.Filter.hag_minima(cell=-1) if n % 2 else pdal.Filter.modelclassifier(model='standard'))\n"
         "    try:\n"
@@ -382,10 +375,10 @@ def test_a_notebook_survives_failures(python, town):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_ctrl_c_ends_pdal_at_once(environment, pdal_program, town, tmp_path):
+def test_ctrl_c_ends_pdal_at_once(environment, pdal_program, ready_town, tmp_path):
     out = tmp_path / "o.laz"
     stages = [
-        str(town),
+        str(ready_town),
         {"type": "filters.hag_minima", "cell": 10},
         {"type": "filters.python", "module": "slow", "function": "f",
          "source": "def f(ins, outs):\n    import sys, time\n    print('here', file=sys.__stderr__, flush=True)\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -170,19 +169,18 @@ def test_what_is_wrong_is_said_before_any_work(tmp_path):
 
 
 @pytest.mark.pdal
-def test_in_tiles_as_in_one_piece(tmp_path, write_las, capfd):
+def test_in_tiles_as_in_one_piece(tmp_path, write_las, run_job):
     """Polygons that lie elsewhere are told once of all tiles; a map is no output."""
     path, out = write(tmp_path / "lakes.gpkg", [LAKE]), tmp_path / "out.las"
     elsewhere = write(tmp_path / "elsewhere.gpkg", [shapely.box(1000, 1000, 1010, 1010)])
     source = write_las(tmp_path / "in.las", cloud(), point_format=1)
     lay = {"type": "filters.polygons", "polygons": [f"{path}=9", f"{elsewhere}=9:all"]}
-    (tmp_path / "job.json").write_text(json.dumps([str(source), lay, str(out)]))
     found = []
     for words in ([], ["--tile", "30", "--workers", "0", "--no-progress"]):
-        assert main(["pipeline", str(tmp_path / "job.json"), *words]) == 0
+        code, _, err = run_job([source, lay, out], *words)
         found.append(np.asarray(laspy.read(out).classification))
-        said = [line for line in capfd.readouterr().err.splitlines() if "no polygon is where" in line]
-        assert len(said) == 1 and "elsewhere.gpkg" in said[0]
+        said = [line for line in err.splitlines() if "no polygon is where" in line]
+        assert code == 0 and len(said) == 1 and "elsewhere.gpkg" in said[0]
     assert np.array_equal(*found) and (found[0] == 9).sum() > 300
     with pytest.raises(StageError):
         ps.Pipeline([str(source), lay, {"type": "writers.las", "filename": path}]).execute()

@@ -273,26 +273,11 @@ def session(around, profile):
     return run
 
 
-@pytest.fixture
-def town(ready_town):
-    return ready_town
-
-
 @needs_qgis
 def test_algorithms_are_listed(qgis):
     said = qgis("list")
-    for name in (
-        "classify",
-        "classifysurvey",
-        "heights",
-        "terrainmodels",
-        "train",
-        "accuracy",
-        "review",
-        "corrections",
-        "objects",
-        "check",
-    ):
+    names = "classify classifysurvey heights terrainmodels train accuracy review corrections objects check"
+    for name in names.split():
         assert f"pdalstages:{name}\t" in said
 
 
@@ -332,25 +317,23 @@ def algorithm(qgis):
 
 @pytest.mark.pdal
 @needs_qgis
-def test_the_way_of_a_tile(algorithm, session, town, tmp_path):
+def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     """Classified, with heights, as rasters, as objects, judged: the same bytes as the commands give."""
     out = tmp_path / "with blanks ü"
     out.mkdir()
     cloud, heights = out / "c.laz", out / "h.laz"
-    said = algorithm("classify", INPUT=town, OUTPUT=cloud, MAP=out / "c.tif", NOISE=0)
+    said = algorithm("classify", INPUT=ready_town, OUTPUT=cloud, MAP=out / "c.tif", NOISE=0)
     assert "pdal-stages classify --no-noise" in said and "6 Building" in said
-    assert main(["classify", str(town), str(tmp_path / "c.laz"), "--no-noise"]) == 0
+    assert main(["classify", str(ready_town), str(tmp_path / "c.laz"), "--no-noise"]) == 0
     assert cloud.read_bytes() == (tmp_path / "c.laz").read_bytes()
-    algorithm("heights", INPUT=town, OUTPUT=heights, MAP=out / "h.tif", WINDOW=40)
-    job = [str(town), {"type": "filters.hag_morphological", "window": 40}, str(tmp_path / "h.laz")]
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    kept = ["--writers.las.extra_dims=all", "--writers.las.forward=all"]
-    assert main(["pipeline", str(tmp_path / "job.json"), *kept]) == 0
+    algorithm("heights", INPUT=ready_town, OUTPUT=heights, MAP=out / "h.tif", WINDOW=40)
+    job = [str(ready_town), {"type": "filters.hag_morphological", "window": 40}, str(tmp_path / "h.laz")]
+    assert run_job(job, "--writers.las.extra_dims=all", "--writers.las.forward=all")[0] == 0
     ours, theirs = (laspy.read(path)["HeightAboveGround"] for path in (tmp_path / "h.laz", heights))
     assert np.array_equal(ours, theirs) and ours.max() > 3
     rasters = {"TERRAIN": out / "t.tif", "SURFACE": out / "s.tif", "HEIGHTS": out / "a.tif"}
     algorithm("terrainmodels", INPUT=cloud, GROUND_FROM=1, **rasters)
-    said = algorithm("accuracy", INPUT=cloud, REFERENCE=town, PAGE=out / "a.html")
+    said = algorithm("accuracy", INPUT=cloud, REFERENCE=ready_town, PAGE=out / "a.html")
     assert "Overall accuracy" in said and (out / "a.html").read_text().startswith("<!")
     pytest.importorskip("pyogrio")
     assert " buildings, " in algorithm("objects", INPUTS=cloud, OUTPUT=out / "o.gpkg")
@@ -360,11 +343,11 @@ def test_the_way_of_a_tile(algorithm, session, town, tmp_path):
     assert shown["layers"]["buildings"] == "categorizedSymbol"
     said = algorithm("review", INPUTS=cloud, OUTPUT=out / "r.gpkg", PAGE=out / "r.html")
     assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), said
-    marked = {"BEFORE": cloud, "AFTER": town, "OUTPUT": out / "k.laz", "AROUND": 2}
+    marked = {"BEFORE": cloud, "AFTER": ready_town, "OUTPUT": out / "k.laz", "AROUND": 2}
     said = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
     assert "no patch is marked as looked at" in said and not (out / "k.laz").exists()
     said = algorithm("corrections", **marked)
-    words = ["corrections", str(cloud), str(town), "--around", "2"]
+    words = ["corrections", str(cloud), str(ready_town), "--around", "2"]
     assert main([*words, "--out", str(tmp_path / "k.laz")]) == 0
     assert (out / "k.laz").read_bytes() == (tmp_path / "k.laz").read_bytes()
     assert np.count_nonzero(laspy.read(out / "k.laz")["Checked"]), said
@@ -372,13 +355,13 @@ def test_the_way_of_a_tile(algorithm, session, town, tmp_path):
 
 @pytest.mark.pdal
 @needs_qgis
-def test_many_files_and_training(algorithm, ready_halves, town, tmp_path):
+def test_many_files_and_training(algorithm, ready_halves, ready_town, tmp_path):
     out, model = tmp_path / "out", tmp_path / "m.model"
     said = algorithm("classifysurvey", FOLDER=ready_halves, OUTPUT=out, REPORT=tmp_path / "r.html", WORKERS=0)
     assert sorted(path.name for path in out.glob("*.laz")) == ["east.laz", "west.laz"], said
     assert (tmp_path / "r.html").is_file()
     few = {"COUNT": 50, "TREES": 5, "NEIGHBORHOODS": "k10"}
-    algorithm("train", INPUTS=town, MODEL=model, PAGE=tmp_path / "m.html", **few)
+    algorithm("train", INPUTS=ready_town, MODEL=model, PAGE=tmp_path / "m.html", **few)
     assert (tmp_path / "m.html").is_file()
-    algorithm("classify", INPUT=town, MODEL=model, OUTPUT=tmp_path / "m.laz")
+    algorithm("classify", INPUT=ready_town, MODEL=model, OUTPUT=tmp_path / "m.laz")
     assert (tmp_path / "m.laz").is_file()

@@ -20,16 +20,6 @@ FOLDER = Path(__file__).resolve().parent.parent / "pipelines"
 FILES = sorted(FOLDER.glob("*.json"))
 
 
-@pytest.fixture
-def town(ready_town):
-    return ready_town
-
-
-@pytest.fixture
-def models(ready_models):
-    return ready_models
-
-
 def run(name, *words):
     overrides, rest = parse_overrides(words)
     assert not rest
@@ -50,16 +40,16 @@ def test_none_is_forgotten():
 
 
 @pytest.mark.parametrize("name", ["classify", "classify-with-rejection", "classify-on-smrf-ground"])
-def test_classify(town, models, tmp_path, name):
+def test_classify(ready_town, ready_models, tmp_path, name):
     out = tmp_path / "o.laz"
-    model = models / ("smrf.model" if "smrf" in name else "classes.model")
+    model = ready_models / ("smrf.model" if "smrf" in name else "classes.model")
     run(
         name,
-        f"--stage.input.filename={town}",
+        f"--stage.input.filename={ready_town}",
         f"--stage.classifier.model={model}",
         f"--stage.output.filename={out}",
     )
-    before, after = laspy.read(town), laspy.read(out)
+    before, after = laspy.read(ready_town), laspy.read(out)
     sure = np.isin(before.classification, [2, 5, 6]) & (np.asarray(after["Reliability"]) > 0.5)
     assert np.mean(np.asarray(after.classification)[sure] == np.asarray(before.classification)[sure]) > 0.85
     if name == "classify-with-rejection":
@@ -69,8 +59,8 @@ def test_classify(town, models, tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["noise", "normalize", "features", "features-for-viewers", "copc-to-tiles"])
-def test_those_that_need_no_model_of_their_own(town, ready_models, tmp_path, name):
-    source = Path(__file__).parent / "data" / "town.copc.laz" if name.startswith("copc") else town
+def test_those_that_need_no_model_of_their_own(ready_town, ready_models, tmp_path, name):
+    source = Path(__file__).parent / "data" / "town.copc.laz" if name.startswith("copc") else ready_town
     words = [f"--stage.input.filename={source}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
     if '"classifier"' in (FOLDER / f"{name}.json").read_text():
         words.append(f"--stage.classifier.model={ready_models / 'classes.model'}")
@@ -81,17 +71,8 @@ def test_those_that_need_no_model_of_their_own(town, ready_models, tmp_path, nam
 
 def test_tile_index_to_tiles(ready_halves, ready_models, tmp_path):
     index = tmp_path / "survey.gpkg"
-    command = [
-        pdal_env.program(),
-        "tindex",
-        "create",
-        str(index),
-        "--stdin",
-        "-f",
-        "GPKG",
-        "--lyr_name",
-        "pdal",
-    ]
+    command = [pdal_env.program(), "tindex", "create", str(index)]
+    command += ["--stdin", "-f", "GPKG", "--lyr_name", "pdal"]
     files = "\n".join(map(str, ready_halves.glob("*.laz")))
     subprocess.run(command, input=files, text=True, check=True, capture_output=True)
     words = [f"--stage.input.filename={index}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
@@ -99,11 +80,11 @@ def test_tile_index_to_tiles(ready_halves, ready_models, tmp_path):
     assert list(tmp_path.glob("o_*.laz"))
 
 
-def test_evaluate(town, models, tmp_path):
+def test_evaluate(ready_town, ready_models, tmp_path):
     pipeline = run(
         "evaluate",
-        f"--stage.input.filename={town}",
-        f"--stage.classifier.model={models / 'classes.model'}",
+        f"--stage.input.filename={ready_town}",
+        f"--stage.classifier.model={ready_models / 'classes.model'}",
         f"--stage.output.filename={tmp_path / 'o.laz'}",
         f"--stage.accuracy.json={tmp_path / 'a.json'}",
         f"--stage.accuracy.html={tmp_path / 'a.html'}",
@@ -115,17 +96,17 @@ def test_evaluate(town, models, tmp_path):
     assert "<html" in (tmp_path / "a.html").read_text()
 
 
-def test_tiles_to_tiles(town, ready_halves, models, tmp_path):
+def test_tiles_to_tiles(ready_town, ready_halves, ready_models, tmp_path):
     run(
         "tiles-to-tiles",
         f"--stage.input.filename={ready_halves}/*.laz",
-        f"--stage.classifier.model={models / 'classes.model'}",
+        f"--stage.classifier.model={ready_models / 'classes.model'}",
         f"--stage.output.filename={tmp_path}/classified_#.laz",
         "--stage.tiles.length=40",
     )
     parts = [laspy.read(p) for p in sorted(tmp_path.glob("classified_*.laz"))]
     assert len(parts) == 4
-    assert sum(len(p) for p in parts) == len(laspy.read(town))
+    assert sum(len(p) for p in parts) == len(laspy.read(ready_town))
     corners = set()
     for part in parts:  # tiles of one grid, none a sliver of half a meter
         cells = {axis: set(np.unique(np.asarray(part[axis]) // 40)) for axis in "xy"}
@@ -134,11 +115,11 @@ def test_tiles_to_tiles(town, ready_halves, models, tmp_path):
     assert len(corners) == 4
 
 
-def test_raw_to_footprints(town, tmp_path):
+def test_raw_to_footprints(ready_town, tmp_path):
     pyogrio = pytest.importorskip("pyogrio")
     run(
         "raw-to-footprints",
-        f"--stage.input.filename={town}",
+        f"--stage.input.filename={ready_town}",
         f"--stage.output.filename={tmp_path / 'o.gpkg'}",
     )
     names = [name for name, _ in pyogrio.list_layers(tmp_path / "o.gpkg")]
@@ -146,7 +127,7 @@ def test_raw_to_footprints(town, tmp_path):
     assert pyogrio.read_info(tmp_path / "o.gpkg", layer="buildings")["features"] > 0
 
 
-def test_terrain_and_surface_of_a_survey_show_no_tiles(town, ready_halves, tmp_path):
+def test_terrain_and_surface_of_a_survey_show_no_tiles(ready_town, ready_halves, tmp_path):
     (tmp_path / "classified").mkdir()
     writer = {"type": "writers.las", "filename": "", "forward": "all", "extra_dims": "all"}
     heights = {"type": "filters.hag_morphological", "window": 20}
@@ -155,7 +136,7 @@ def test_terrain_and_surface_of_a_survey_show_no_tiles(town, ready_halves, tmp_p
         [str(ready_halves / "*.laz"), heights, writer], 25, workers=0, progress=False
     ).failures
     writer["filename"] = str(tmp_path / "whole.laz")
-    Pipeline([str(town), heights, writer]).execute()
+    Pipeline([str(ready_town), heights, writer]).execute()
     rasters = {}
     for kind, source in (("files", tmp_path / "classified" / "*.laz"), ("whole", tmp_path / "whole.laz")):
         words = [f"--stage.input.filename={source}"]

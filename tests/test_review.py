@@ -79,9 +79,7 @@ def folder(ready_town, tmp_path_factory):
     las["Reliability"] = np.where(unsure, 0.5, 0.99).astype(np.float32)
     (folder / "parts").mkdir()
     for name, mine in (("east", east), ("west", ~east)):
-        part = laspy.LasData(las.header)
-        part.points = las.points[mine]
-        part.write(folder / "parts" / f"{name}.laz")
+        las[mine].write(folder / "parts" / f"{name}.laz")
     las.write(folder / "whole.laz")
     return folder
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.cli import main
 
 pytestmark = pytest.mark.pdal
 
@@ -23,36 +22,23 @@ def cloud(tmp_path, write_las):
     return write_las(tmp_path / "cloud.las", arrays, point_format=1)
 
 
-@pytest.fixture()
-def run(tmp_path, capsys):
-    """Write a pipeline and run a command on it: (exit code, standard output, standard error)."""
-
-    def go(stages, *words, command="pipeline"):
-        path = tmp_path / "job.json"
-        path.write_text(json.dumps([str(s) if not isinstance(s, dict) else s for s in stages]))
-        code = main([command, str(path), *map(str, words)])
-        return code, *capsys.readouterr()
-
-    return go
-
-
 @pytest.mark.parametrize("tiles", [(), ("--tile", 20, "--workers", 0, "--buffer", 5)])
-def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run, tiles):
+def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run_job, tiles):
     """filters.hag_nn warns of ground points that are not there."""
     smrf = {"type": "filters.smrf", "cell": 20}
     stages = [cloud, smrf, {"type": "filters.hag_minima"}, {"type": "filters.hag_minima", "tag": "b"}]
-    code, _, err = run([*stages, tmp_path / "o.las"], *tiles)
+    code, _, err = run_job([*stages, tmp_path / "o.las"], *tiles)
     assert code == 0, err
     assert err.count("small number of cells") == 1 and "pypipeline" not in err
     assert err.count("no spatial reference") == 1
 
 
-def test_a_log_file(cloud, tmp_path, run):
+def test_a_log_file(cloud, tmp_path, run_job):
     log = tmp_path / "run.log"
     out, meta = tmp_path / "o.las", tmp_path / "m.json"
-    assert run([cloud, {"type": "filters.hag_minima"}, out], "--log", log, "--metadata", meta)[0] == 0
+    assert run_job([cloud, {"type": "filters.hag_minima"}, out], "--log", log, "--metadata", meta)[0] == 0
     assert json.loads(meta.read_text())["metadata"]["writers.las"]["filename"] == [str(out)]
-    assert run([cloud, {"type": "filters.hag_minima", "cell": -1}, tmp_path / "o.las"], "--log", log)[0] == 1
+    assert run_job([cloud, {"type": "filters.hag_minima", "cell": -1}, out], "--log", log)[0] == 1
     lines = log.read_text().splitlines()
     assert "pipeline" in lines[0] and "--log" in lines[0] and lines[0][:4].isdigit()
     assert any("meters were assumed" in line for line in lines)
@@ -63,28 +49,28 @@ def test_a_log_file(cloud, tmp_path, run):
     ]
 
 
-def test_the_log_hears_the_workers_of_tiles_and_the_summary(cloud, tmp_path, run):
+def test_the_log_hears_the_workers_of_tiles_and_the_summary(cloud, tmp_path, run_job):
     """What libraries print in the workers' processes is in the log, and what goes to standard output."""
     says = "import os\ndef f(ins, outs):\n    os.write(2, b'said by a worker\\n')\n    return True\n"
     script = {"type": "filters.python", "source": says, "function": "f", "module": "m"}
     log, stages = tmp_path / "run.log", [cloud, {"type": "filters.hag_minima"}, script, tmp_path / "o.las"]
-    assert run(stages, "--log", log, "--tile", 100, "--workers", 2, "--buffer", 0)[0] == 0
+    assert run_job(stages, "--log", log, "--tile", 100, "--workers", 2, "--buffer", 0)[0] == 0
     lines = log.read_text().splitlines()
     assert any(line.endswith("said by a worker") for line in lines)
     assert any(" tiles done; " in line or " tile done; " in line for line in lines)
     assert all(line[:2] == "20" and line[10] == " " for line in lines) and "exit code 0" in lines[-1]
 
 
-def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run):
+def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run_job):
     stages = [
         {"type": "readers.las", "filename": str(cloud)},
         {"type": "filters.hag_minima"},
         tmp_path / "o.las",
     ]
-    code, _, err = run(stages)
+    code, _, err = run_job(stages)
     assert code == 0 and "Amplitude" in err and "use_eb_vlr" in err
     stages[0]["use_eb_vlr"] = True
-    assert "Amplitude" not in run(stages)[2]
+    assert "Amplitude" not in run_job(stages)[2]
 
 
 @pytest.mark.parametrize(
@@ -97,32 +83,32 @@ def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run
         ("degrees", "degrees"),
     ],
 )
-def test_what_cannot_run_is_not_valid(cloud, tmp_path, run, stage, says):
+def test_what_cannot_run_is_not_valid(cloud, tmp_path, run_job, stage, says):
     stages = [cloud, stage, tmp_path / "o.las"]
     if stage == "degrees":
         turned = {"type": "filters.reprojection", "in_srs": "EPSG:32632", "out_srs": "EPSG:4326"}
         stages[1:2] = [turned, {"type": "filters.hag_minima"}]
     for command, words in (("pipeline", ["--validate"]), ("validate", [])):
-        code, out, err = run(stages, *words, command=command)
+        code, out, err = run_job(stages, *words, command=command)
         verdict = json.loads(out)
         assert code == 1 and verdict["valid"] is False and verdict["error_detail"].strip() in err
         assert any(word in err for word in says.split("|")) and not (tmp_path / "o.las").exists()
 
 
-def test_dimensions_that_a_file_or_a_stage_brings_are_valid(tmp_path, run, write_las):
+def test_dimensions_that_a_file_or_a_stage_brings_are_valid(tmp_path, run_job, write_las):
     xyz = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 9, (3, 50)), strict=True))
     mine = write_las(tmp_path / "mine.las", {**xyz, "Reference": np.full(50, 2, "u1")}, point_format=6)
     plain = write_las(tmp_path / "plain.las", xyz, point_format=6)
     ferry = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
     for stages in ([mine], [plain, ferry]):
-        assert run([*stages, {"type": "filters.accuracy"}], command="validate")[0] == 0
-    assert run([plain, {"type": "filters.accuracy"}], command="validate")[0] == 1
+        assert run_job([*stages, {"type": "filters.accuracy"}], command="validate")[0] == 0
+    assert run_job([plain, {"type": "filters.accuracy"}], command="validate")[0] == 1
 
 
-def test_errors_of_others_are_told_as_such(cloud, tmp_path, run):
+def test_errors_of_others_are_told_as_such(cloud, tmp_path, run_job):
     script = "def f(ins, outs):\n    raise ValueError('my own problem')\n"
     theirs = {"type": "filters.python", "module": "x", "function": "f", "source": script}
-    code, _, err = run([cloud, theirs, {"type": "filters.hag_minima"}, tmp_path / "o.las"])
+    code, _, err = run_job([cloud, theirs, {"type": "filters.hag_minima"}, tmp_path / "o.las"])
     assert code == 1 and "ValueError: my own problem" in err and "line 2" in err
     assert "Traceback" not in err and "internal error" not in err
 

@@ -186,14 +186,8 @@ def test_pdal_reads_the_file_back(tmp_path, pdal_program):
     write_town(t, path)
     las = laspy.read(path)
     assert np.array_equal(np.round(las.xyz, 3), t.xyz)
-    for name in (
-        "classification",
-        "intensity",
-        "return_number",
-        "number_of_returns",
-        "point_source_id",
-        "gps_time",
-    ):
+    names = "classification intensity return_number number_of_returns point_source_id gps_time"
+    for name in names.split():
         assert np.array_equal(np.asarray(las[name]), getattr(t, name)), name
     assert np.abs(las["scan_angle"] * 0.006 - t.scan_angle).max() <= 0.004
     command = [pdal_program, "info", "--metadata", path]

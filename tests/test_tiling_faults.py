@@ -65,18 +65,8 @@ def pipeline(folder: Path, output: Path, *own: dict) -> list:
 
 def command(job: Path, stages: list, *flags: str, tile: int = 20, **popen) -> subprocess.Popen:
     job.write_text(json.dumps(stages))
-    words = [
-        sys.executable,
-        "-m",
-        "pdal_stages.cli",
-        "pipeline",
-        str(job),
-        "--tile",
-        str(tile),
-        "--buffer",
-        "0",
-        *flags,
-    ]
+    words = [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(job)]
+    words += ["--tile", str(tile), "--buffer", "0", *flags]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen)
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
+from block_scene import QUICK_TRAINING
 
 import pdal_stages as ps
 from pdal_stages.base.errors import DimensionError
@@ -13,6 +12,7 @@ from pdal_stages.classifier import foresttraining
 from pdal_stages.cli import main
 
 QUICK = {"feature_set": "Linearity,HeightRange", "trees": 8, "passes": 1, "dimensions": ""}
+QUICK_WORDS = [*QUICK_TRAINING, "--writers.classifiermodel.dimensions="]
 
 
 def scene(seed, x0=0.0, n=900):
@@ -23,24 +23,16 @@ def scene(seed, x0=0.0, n=900):
     return {"X": x + x0, "Y": y, "Z": z, "Classification": np.where(block, 6, 2).astype("u1")}
 
 
+def words(tmp_path, *files):
+    return ["train", *map(str, files), "--model", str(tmp_path / "m.model"), *QUICK_WORDS]
+
+
 @pytest.mark.pdal
 def test_train_takes_folders_and_says_an_honest_score_first(tmp_path, write_las, capsys):
     (tmp_path / "in").mkdir()
     for number in range(2):
         write_las(tmp_path / "in" / f"t{number}.laz", scene(number, 60.0 * number), point_format=1)
-    words = [
-        "train",
-        tmp_path / "in",
-        "--model",
-        tmp_path / "m.model",
-        "--count",
-        200,
-        "--neighborhoods",
-        "k8",
-    ]
-    words += ["--trees", 8, "--feature-set", "Linearity,HeightRange", "--no-progress"]
-    more = [f"--writers.classifiermodel.{k}={v}" for k, v in QUICK.items() if k in ("passes", "dimensions")]
-    assert main([*map(str, words), *more]) == 0
+    assert main(words(tmp_path, tmp_path / "in")) == 0
     out, err = capsys.readouterr()
     assert out.startswith("files held out")
     assert "files held out" not in err  # once is enough
@@ -50,23 +42,11 @@ def test_train_takes_folders_and_says_an_honest_score_first(tmp_path, write_las,
 
 
 @pytest.mark.pdal
-def test_training_by_pipeline_prints_its_score(tmp_path, write_las, capsys):
+def test_training_by_pipeline_prints_its_score(tmp_path, write_las, run_job):
     write_las(tmp_path / "a.laz", scene(1), point_format=1)
     writer = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "neighborhoods": "k8"}
-    stages = [str(tmp_path / "a.laz"), {**writer, "count": 100, **QUICK}]
-    (tmp_path / "job.json").write_text(json.dumps(stages))
-    assert main(["pipeline", str(tmp_path / "job.json")]) == 0
-    assert "blocks held out" in capsys.readouterr().err
-
-
-QUICK_WORDS = [
-    *("--count", "200", "--neighborhoods", "k8", "--trees", "8", "--feature-set", "Linearity,HeightRange"),
-    *("--no-progress", "--writers.classifiermodel.passes=1", "--writers.classifiermodel.dimensions="),
-]
-
-
-def words(tmp_path, *files):
-    return ["train", *map(str, files), "--model", str(tmp_path / "m.model"), *QUICK_WORDS]
+    code, _, err = run_job([tmp_path / "a.laz", {**writer, "count": 100, **QUICK}])
+    assert code == 0 and "blocks held out" in err
 
 
 @pytest.mark.pdal
@@ -100,15 +80,14 @@ def test_a_class_in_one_file_alone(tmp_path, write_las, capsys):
 
 
 @pytest.mark.pdal
-def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, capsys):
+def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, run_job):
     points = scene(3)
     points["PointSourceId"] = (points["X"] // 15 + 40).astype("u2")
     cloud = write_las(tmp_path / "a.laz", points, point_format=1)
     writer = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "neighborhoods": "k8"}
     writer |= {"count": 100, "groups": "PointSourceId", **QUICK}
-    (tmp_path / "job.json").write_text(json.dumps([str(cloud), writer]))
-    assert main(["pipeline", str(tmp_path / "job.json")]) == 0
-    assert "PointSourceId held out" in capsys.readouterr().err
+    code, _, err = run_job([cloud, writer])
+    assert code == 0 and "PointSourceId held out" in err
     found = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
     assert (found["groups"], found["folds"], found["gap"]) == ("PointSourceId", 4, 0.0)
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from block_scene import ground_and_block
 
 HAG = {"type": "filters.hag_minima"}
 
@@ -100,18 +101,9 @@ def las(path: Path, **more: object) -> dict[str, object]:
     return {"type": "writers.las", "filename": str(path), "extra_dims": "all", "forward": "all", **more}
 
 
-def scene(n: int = 600, seed: int = 1, size: float = 30.0) -> dict[str, np.ndarray]:
+def scene(n: int = 600, seed: int = 1) -> dict[str, np.ndarray]:
     """Ground with a block on it, in coordinates of a national grid."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0, size, (2, n)).round(2)
-    block = (x > size / 2) & (y > size / 2)
-    z = np.where(block, 5.0, 0.0) + rng.normal(0, 0.02, n).round(2)
-    return {
-        "X": x + 500_000,
-        "Y": y + 5_400_000,
-        "Z": z + 100,
-        "Classification": np.where(block, 6, 2).astype(np.uint8),
-    }
+    return ground_and_block(n, seed, at=(500_000, 5_400_000, 100))
 
 
 def repack(path: Path, target: Path, edit: Callable[[dict, dict], object]) -> Path:

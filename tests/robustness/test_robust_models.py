@@ -121,18 +121,7 @@ def test_units_of_training_points_stay_there(command, tmp_path, write_las, cloud
 
 def test_the_label_as_a_dimension_and_more_samples_than_points(command, tmp_path, cloud):
     target = tmp_path / "m.model"
-    words = [
-        "train",
-        cloud,
-        "--model",
-        target,
-        "--neighborhoods",
-        "c1",
-        "--trees",
-        "3",
-        "--count",
-        "99999999",
-    ]
+    words = ["train", cloud, "--model", target, "--neighborhoods", "c1", "--trees", 3, "--count", 99999999]
     command.refused(
         [*words, "--writers.classifiermodel.dimensions=Classification"], "the label itself", "Leave it out"
     )
