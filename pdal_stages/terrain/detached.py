@@ -209,17 +209,11 @@ def _small(
     number, weak ones joined as well, -1 where it is wider than `extent`, in voxels."""
     keys, number = voxels.keys, len(voxels.keys)
     strong = voxels.counts > (WEAK * usual).astype(np.int64)
-    above = np.flatnonzero(np.diff(keys) == 1)
-    pairs = [[above, above + 1]]
-    for dj, di in ((0, 1), (1, -1), (1, 0), (1, 1)):  # columns ahead
-        wanted = keys + ((dj * voxels.width + di) << BITS) - 1
-        at = np.searchsorted(keys, wanted)
-        for _level in range(3):  # the next one's place is the same, or one farther
-            at = np.minimum(at, number - 1)
-            touching = keys[at] == wanted
-            pairs.append([np.flatnonzero(touching), at[touching]])
-            at, wanted = at + touching, wanted + 1
-    one, other = np.concatenate(pairs, axis=1)
+    ahead = np.array([(dj * voxels.width + di) << BITS for dj, di in ((0, 1), (1, -1), (1, 0), (1, 1))])
+    spans = np.array([[1, 1], *zip(ahead - 1, ahead + 1, strict=True)])  # above, and in columns ahead
+    pairs = np.empty((2, _touching(keys, spans, np.empty((2, 0), np.int64))), np.int64)
+    _touching(keys, spans, pairs)
+    one, other = pairs
     both = strong[one] & strong[other]
     label = np.empty(number, np.int64)
     count = number_sets(one[both], other[both], label)
@@ -235,6 +229,27 @@ def _small(
     whole = np.empty(number, np.int64)
     sides = longest_sides(whole, voxels.places[:2], number_sets(one, other, whole))
     return small, size[label], np.where(sides[whole] < extent, whole, -1)
+
+
+@njit
+def _touching(keys, spans, pairs):
+    """Fill `pairs` (2, n), where there is room, with numbers of voxels and of those whose keys are in the spans beyond.
+
+    How many there are.
+    """
+    count, room = 0, pairs.shape[1]
+    for first, last in spans:
+        start = 0
+        for k in range(len(keys)):
+            while start < len(keys) and keys[start] < keys[k] + first:
+                start += 1
+            other = start
+            while other < len(keys) and keys[other] <= keys[k] + last:
+                if count < room:
+                    pairs[0, count], pairs[1, count] = k, other
+                count += 1
+                other += 1
+    return count
 
 
 def small_clusters(
