@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import places_among
 from ..base.errors import StageError
+from ..base.jit import njit
 from ..base.las import NOISE, by_height
 
 #: Rules in the order in which they are applied, and how many voxels to each side they look.
@@ -127,10 +128,8 @@ class _Voxels:
         voxels, at = np.unique(self.voxel[points], return_inverse=True)
         before = np.insert(self.counts(kind).cumsum(axis=0), 0, 0, axis=0)
         total = np.zeros((len(voxels), 4), np.int64)
-        for step in product((-1, 0, 1), repeat=2):  # the three of a column follow each other
-            middle = self.keys[voxels] + np.dot(step, self.strides[:2])
-            total += before[np.searchsorted(self.keys, middle + 1, "right")]
-            total -= before[np.searchsorted(self.keys, middle - 1)]
+        steps = np.array(list(product((-1, 0, 1), repeat=2))) @ self.strides[:2]
+        _add_columns(self.keys, self.keys[voxels], steps, before, total)
         return total[at]
 
     def vegetation_near(self, points: NDArray, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -174,3 +173,17 @@ class _Voxels:
         row, total = np.arange(len(alone)), around.sum(axis=1)
         against = (around[row, own] == 1) & (total > ENOUGH) & (around[row, other] >= SHARE * total)
         return alone[against], other[against]
+
+
+@njit
+def _add_columns(keys, asked, steps, before, total):
+    """Add to `total` (n, 4) the points in three voxels, one above the other, at steps from those asked for, in order."""
+    for step in steps:
+        first = end = 0
+        for k in range(len(asked)):
+            while first < len(keys) and keys[first] < asked[k] + step - 1:
+                first += 1
+            while end < len(keys) and keys[end] <= asked[k] + step + 1:
+                end += 1
+            for kind in range(4):
+                total[k, kind] += before[end, kind] - before[first, kind]
