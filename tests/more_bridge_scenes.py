@@ -141,8 +141,14 @@ def parking_roof(seed=0, turn=0.8):
         slabs.append(Slab(0, 60, low, high, lambda s: 7.0 + 0 * s, 1.0, BUILDING))
     slabs.append(Slab(-50, 0.2, 2, 6, lambda s: np.clip(6.0 + 0.12 * s, 0, 6), 6.0, BUILDING))
     _cars(slabs, rng, 5, 50, (-18.0, -8.0, 12.0), lambda s: 6.0 + 0 * s, 7.0)
-    flat = lambda s, t: (0.02 * np.sin(s / 7), np.full(len(s), GROUND))  # noqa: E731
-    return Scene(flat, slabs, [], turn, 160.0, 110.0)
+    return Scene(_flat, slabs, [], turn, 160.0, 110.0)
+
+
+def roof_beside_roofs(seed=0, turn=0.6):
+    """A hall that the cloud's rim cuts; at its other end a lower roof of a quarter of its width, between higher ones."""
+    roofs = [(-80, 10, -14, 14, 4.5), (10, 30, -6, 0, 4.2), (10, 40, 0, 8, 9.0), (30, 40, -12, 8, 9.0)]
+    slabs = [Slab(*place, lambda s, z=z: z + 0 * s, z, BUILDING) for *place, z in roofs]
+    return Scene(_flat, slabs, [], turn, 120.0, 90.0)
 
 
 def levee(seed=0, turn=0.5):
@@ -202,5 +208,6 @@ UPRIGHT_SCENES = {
 TRAPS = {
     "terraces": terraces,
     "parking on a roof, with a ramp": parking_roof,
+    "roof beside roofs, at the rim": roof_beside_roofs,
     "dike and mole": levee,
 }

@@ -1,9 +1,10 @@
 """Bridge decks: surfaces one can walk on, with drops at both sides, that lead on to land at two opposite ends.
 
 To both sides, at most `WIDEST` meters apart, the way (:mod:`.walkable`) ends at a drop, or at water. Such cells that hang
-together are a deck if their rim is drops for the most part, and if at two ends, opposite each other, one walks on to land
-whose own rim is no drop, as a roof's is, or the cloud ends at one of them. Of what is longer than `LONGEST`, such as a
-viaduct, each block is judged by the rim around it, and land at one end is enough. Near walls (:mod:`.deckwalls`) is none.
+together are a deck if both their sides are drops for the most part, and if at two ends, opposite each other, all their width
+leads on to land, or the cloud ends at one of them. On land the way goes on ahead and to both sides of that; on the next
+roof it ends at a drop. Of what is longer than `LONGEST`, such as a viaduct, each block is judged by the rim around it, and
+land at one end is enough. Near walls (:mod:`.deckwalls`) is none.
 The rule of Sithole and Vosselman [S06],
 raised in a profile across and level with the ground in the profile along, is applied to the surface instead of to profiles.
 
@@ -63,15 +64,12 @@ WIDEST, LONGEST, SMALLEST = 60, 250, 20
 _FILLS = 2
 #: Cells across which one walks on from a deck to land, and across which parts of a deck belong together.
 LINK = 2
-#: For each cell of a rim at a drop, at most so many lead on, more across water, where bridges are short; for each way that
-#: ends at a drop, at most so many end at something else.
-OUTWARD, OUTWARD_ACROSS, WALLS = 0.7, 1.75, 0.7
-#: Such a share of what leads on at an end, leads on to land: there is no drop as far ahead as decks are wide.
-LAND = 0.5
+#: For each way that ends at a drop, at most so many end at something else.
+WALLS = 0.7
+#: For each meter of a deck's width, so many cells lead on to land at an end, or half as many ways end at the cloud's rim.
+END = 1.5
 #: At its sides, so much more aside than along, more cells are at a drop than lead on.
 SIDE = 1.5
-#: The cloud cuts an end in so many ways at least.
-CUT = 8
 #: Blocks in which long decks are judged, cells, and how many blocks away land must be seen.
 BLOCK, FAR_ENDS = 64, 3
 #: How far away cells matter: blocks of a deck, its rim and the land at its ends, how far one walks and sees from there.
@@ -121,16 +119,13 @@ def _judged(z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing
     one, other = _beside(z, start, h, w, kind, deck)
     both, part = deck[other], np.empty(len(level), np.int64)
     number_sets(number[one[both]], number[other[both]], part)
-    # Where one walks on to what is no deck, and to land.
+    # Where one walks on to what is no deck, and to land: from there, ahead and to both sides of that.
     one, other = one[~both], other[~both]
-    turn = (
-        np.rint(np.arctan2(row[other] - row[one], column[other] - column[one]) / (np.pi / 4)).astype(int) % 8
-    )
-    on, to_land = (
-        np.bincount(some, minlength=len(z))[level] > 0 for some in (one, one[goes_on[other, turn]])
-    )
+    turn = np.rint(np.arctan2(row[other] - row[one], column[other] - column[one]) / (np.pi / 4)).astype(int)
+    land = goes_on[other[:, None], (turn[:, None] + (-1, 0, 1)) % 8].all(axis=1)
+    on, to_land = (np.bincount(some, minlength=len(z))[level] > 0 for some in (one, one[land]))
     row, column, end = row[level], column[level], end[level]
-    drop, across = (end == DOWN) | (end == ACROSS), (end == ACROSS).sum(axis=1)
+    drop = (end == DOWN) | (end == ACROSS)
     walled, cut = (end == WALLED).sum(axis=1), (end == NOTHING).sum(axis=1)
     if over_nothing:
         drop, cut = drop | (end == NOTHING), 0 * cut
@@ -141,9 +136,8 @@ def _judged(z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing
     def sums(values):
         return np.bincount(part, values, len(size))
 
-    most = np.where(2 * sums(across) > sums(down), OUTWARD_ACROSS, OUTWARD)
     good = (size >= SMALLEST) & (length <= LONGEST) & (length > (FAR if over_nothing else 0))
-    good &= (sums(walled) <= WALLS * sums(down)) & (sums(on) <= most * sums(rim))
+    good &= sums(walled) <= WALLS * sums(down)
     # The way along it is across its drops; from its middle, times the size: whole numbers, wherever the array begins.
     xx, xy, yy = (sums((drop * by).sum(axis=1)) for by in (RIGHT * RIGHT, RIGHT * UP, UP * UP))
     turn = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
@@ -153,8 +147,12 @@ def _judged(z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing
     half = np.zeros(len(size))
     np.maximum.at(half, part, np.abs(along))
     first, second = along < -0.5 * half[part], along > 0.5 * half[part]
-    lands = [sums(to_land & side) > LAND * sums(on & side) for side in (first, second)]
-    ends = [at_land | (sums(cut * side) >= CUT) for at_land, side in zip(lands, (first, second), strict=True)]
+    whole = END * size**2 / (2 * half + size)
+    lands = [sums(to_land & side) >= whole for side in (first, second)]
+    ends = [
+        at_land | (2 * sums(cut * side) >= whole)
+        for at_land, side in zip(lands, (first, second), strict=True)
+    ]
     good &= ends[0] & ends[1] & (lands[0] | lands[1])
     for flank in (aside > SIDE * np.abs(along), -aside > SIDE * np.abs(along)):
         good &= sums(rim & flank) >= sums(on & flank)
@@ -176,7 +174,7 @@ def _stretches(row, column, down, walled, rim, on, to_land) -> NDArray[np.bool_]
     for of, values in zip(sums, (down, walled, rim, on, to_land), strict=True):
         np.add.at(of, (b, a), values)
     downs, walls, drops, leads = (sums_around(of, 1) for of in sums[:4])
-    good = (downs > 0) & (walls <= WALLS * downs) & (leads <= OUTWARD * drops)
+    good = (downs > 0) & (walls <= WALLS * downs) & (leads <= drops)
     # Near land, or where it goes on to both sides as far as one looks: no roof is that long.
     good &= (sums_around(sums[4], FAR_ENDS) > 0) | _goes_on(sums[2] > 0) | _goes_on(sums[2].T > 0).T
     return good[b, a]
