@@ -9,7 +9,7 @@ The rule of Sithole and Vosselman [S06],
 raised in a profile across and level with the ground in the profile along, is applied to the surface instead of to profiles.
 
 Limits: a deck that the cloud cuts at both ends is none, nor is one hardly wider than 3 m of few points; parts of roofs as
-high as a deck that touch it, or that crowns link to it, may be taken for one.
+high as a deck that touch it, or that crowns link to it, may be taken for one, and roofs that the cloud cuts.
 
 The grid is anchored to absolute coordinates, all reaches are bounded (:data:`REACH`) and counts are whole numbers: the order
 of points does not matter, and a tile with its surroundings finds the decks of the whole cloud.
