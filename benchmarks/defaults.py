@@ -70,16 +70,8 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "40,000, own and around": {**FORMER, "count": 40_000},
         "40,000, around": {"count": 40_000},
     },
-    "voxel": {
-        "0.125 m": {},
-        "none": {"voxel": 0.0},
-        "0.25 m": {"voxel": 0.25},
-    },
-    "passes": {
-        "1": ONE,
-        "2": {},
-        "3": {"passes": 3},
-    },
+    "voxel": {"0.125 m": {}, "none": {"voxel": 0.0}, "0.25 m": {"voxel": 0.25}},
+    "passes": {"1": ONE, "2": {}, "3": {"passes": 3}},
     "context": {
         ",".join(tokens): {"context": tokens}
         for tokens in (
@@ -188,10 +180,7 @@ def run(
                 "f1": 100 * accuracy.mean_f1,
                 "classes": {str(code): 100 * value for code, value in accuracy.f1.items()},
             }
-        line["training"], line["classifying"] = (
-            seconds[name][0],
-            1e6 * seconds[name][1] / seconds[name][2],
-        )
+        line["training"], line["classifying"] = (seconds[name][0], 1e6 * seconds[name][1] / seconds[name][2])
         lines.append(line)
     return lines
 

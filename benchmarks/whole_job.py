@@ -77,9 +77,7 @@ def once(cloud: Path, model: str, out: Path) -> dict[str, float]:
     """Wall and CPU seconds of one run, and the most memory of it in MiB."""
     began = time.perf_counter()
     process = subprocess.Popen(
-        command("classify", cloud, out, "--model", model),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
+        command("classify", cloud, out, "--model", model), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
     assert process.stderr is not None
     said = process.stderr.read()

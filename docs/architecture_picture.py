@@ -30,11 +30,7 @@ COLUMNS = (
             ("Hand the points to the stage,", "in meters, class codes without flags", "pipeline/"),
             ("Heights above a terrain", "", "terrain/"),
             ("Features of many neighborhoods,", "block by block", "features/"),
-            (
-                "Forest or network; a second pass",
-                "reads what the first said all around",
-                "classifier/",
-            ),
+            ("Forest or network; a second pass", "reads what the first said all around", "classifier/"),
             ("Classes, reliability, margin", "", "classifier/"),
         ),
     ),

@@ -46,10 +46,7 @@ for _ignored, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", sign
 # A slow or busy machine is no failure. Continuous integration draws the same examples every time, so that a change is
 # judged by what it changed.
 settings.register_profile(
-    "any machine",
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-    derandomize="CI" in os.environ,
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize="CI" in os.environ
 )
 settings.load_profile("any machine")
 

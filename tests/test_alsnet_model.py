@@ -112,10 +112,7 @@ def test_order_of_points_threads_and_rows_do_not_matter():
     whole = model.predict(xyz, dimensions, threads=1, probabilities=True, margin=True)
     shuffled = np.random.default_rng(5).permutation(len(xyz))
     other = model.predict(
-        xyz[shuffled],
-        {k: v[shuffled] for k, v in dimensions.items()},
-        threads=2,
-        probabilities=True,
+        xyz[shuffled], {k: v[shuffled] for k, v in dimensions.items()}, threads=2, probabilities=True
     )
     assert np.array_equal(whole.probabilities[shuffled], other.probabilities)
     where = xyz[:, 0] < 7

@@ -151,12 +151,7 @@ def test_a_tiny_network_overfits_a_tiny_scene():
     """Without heights above ground: from the points' positions alone."""
     xyz, labels, _ = scene(1200, 12.0)
     model = fit(
-        [TrainingCloud(xyz, labels)],
-        dimensions=(),
-        points=600,
-        epochs=25,
-        learning_rate=0.01,
-        augment=False,
+        [TrainingCloud(xyz, labels)], dimensions=(), points=600, epochs=25, learning_rate=0.01, augment=False
     )
     found = model.predict(xyz, {})
     assert np.mean(found.classification == labels) > 0.97

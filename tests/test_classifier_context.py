@@ -48,9 +48,7 @@ def cloud(seed, n, kind="even"):
 
 @settings(max_examples=10, deadline=None)
 @given(
-    st.integers(0, 10**6),
-    st.sampled_from([1, 7, 200]),
-    st.sampled_from(["even", "copies", "corners", "far"]),
+    st.integers(0, 10**6), st.sampled_from([1, 7, 200]), st.sampled_from(["even", "copies", "corners", "far"])
 )
 def test_equals_the_reference(seed, n, kind):
     xyz, shares = cloud(seed, n, kind)

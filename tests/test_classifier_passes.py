@@ -203,12 +203,7 @@ def test_a_pass_may_come_from_elsewhere(two, other):
 
 
 def test_options():
-    for bad in (
-        {"passes": 4},
-        {"passes": 0},
-        {"passes": 2, "context": []},
-        {"context": "box3"},
-    ):
+    for bad in ({"passes": 4}, {"passes": 0}, {"passes": 2, "context": []}, {"context": "box3"}):
         with pytest.raises(OptionError):
             TrainingOptions(**bad)
 

@@ -391,8 +391,7 @@ def test_points_that_lie_alone_are_no_noise_and_many_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("spacing", "wires", "density"),
-    [(0.3, 1, 1.3), (2.0, 1, 0.2), (6.0, 1, 0.07), (1.7, 2, 8.0)],
+    ("spacing", "wires", "density"), [(0.3, 1, 1.3), (2.0, 1, 0.2), (6.0, 1, 0.07), (1.7, 2, 8.0)]
 )
 def test_wires_stay_however_thin_the_cloud(spacing, wires, density):
     rng = np.random.default_rng(1)

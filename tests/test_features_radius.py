@@ -157,13 +157,7 @@ def test_large_spheres_in_a_dense_cloud(rng):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(
-    "file",
-    [
-        "delft/train.laz",
-        "isprs_filter/samp11.laz",
-    ],
-)
+@pytest.mark.parametrize("file", ["delft/train.laz", "isprs_filter/samp11.laz"])
 def test_real_tiles(data_dir, file):
     laspy = pytest.importorskip("laspy")
     xyz = np.ascontiguousarray(laspy.read(data_dir / file).xyz)

@@ -5,12 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.features.neighborhoods import (
-    PRESETS,
-    Neighborhood,
-    parse_neighborhoods,
-    preset_dimensions,
-)
+from pdal_stages.features.neighborhoods import PRESETS, Neighborhood, parse_neighborhoods, preset_dimensions
 
 
 def tokens(spec):

@@ -39,10 +39,7 @@ def test_one_spelling():
         [given], [{**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": [7, "Withheld[1:1]"]}]
     )
     assert check(check([given])) == check([given])
-    both = [
-        {"type": "filters.smrf", "ignore": "Classification[7:7]"},
-        {"type": "filters.hag_nn"},
-    ]
+    both = [{"type": "filters.smrf", "ignore": "Classification[7:7]"}, {"type": "filters.hag_nn"}]
     assert check(both)[0]["ignore"] == ["Classification[7:7]"]
 
 

@@ -128,11 +128,7 @@ def test_what_is_missing_is_made_and_said(folder, tmp_path, capsys):
 @pytest.mark.pdal
 @pytest.mark.parametrize(
     ("words", "what"),
-    [
-        (["--share", "0"], "'--share'"),
-        (["--cell", "0.1"], "'--cell'"),
-        (["--workers", "0"], "--workers"),
-    ],
+    [(["--share", "0"], "'--share'"), (["--cell", "0.1"], "'--cell'"), (["--workers", "0"], "--workers")],
 )
 def test_what_cannot_be_is_refused(folder, tmp_path, words, what, capsys):
     assert cli.main(["review", str(folder / "whole.laz"), str(tmp_path / "r.gpkg"), *words]) == 1

@@ -14,15 +14,7 @@ from pdal_stages.features import compute_features
 from pdal_stages.features.bins import METRICS, ShapeBins
 from pdal_stages.features.engine import FeatureEngine
 from pdal_stages.features.plan import FeaturePlan
-from pdal_stages.features.shapes import (
-    PULLS,
-    ROOM,
-    draw,
-    make_work,
-    point_seeds,
-    shape_counts,
-    shape_values,
-)
+from pdal_stages.features.shapes import PULLS, ROOM, draw, make_work, point_seeds, shape_counts, shape_values
 
 f32 = np.float32
 

@@ -33,12 +33,7 @@ def survey(tmp_path_factory, write_las):
         "Classification": np.where(np.arange(keep.sum()) % 97, 1, 7).astype("u1"),
         "GpsTime": made.gps_time[keep],
     }
-    how = {
-        "point_format": 6,
-        "wkt": WKT,
-        "scale": 0.001,
-        "offset": (499_000.0, 5_399_000.0, 0.0),
-    }
+    how = {"point_format": 6, "wkt": WKT, "scale": 0.001, "offset": (499_000.0, 5_399_000.0, 0.0)}
     write_las(base / "town.laz", arrays, **how)
     (base / "in").mkdir()
     east, north = arrays["X"] >= 500_047.0, arrays["Y"] >= 5_400_041.0

@@ -49,12 +49,7 @@ def test_surveys_of_two_reference_systems_are_left_out_in_turn(tmp_path, write_l
     (heights,) = ps.load_model(tmp_path / "m.model").info["preparation"]  # as they were made
     assert heights["window"] == 20
 
-    grouped = [
-        *words,
-        *QUICK_WORDS,
-        "--surveys",
-        f"one={tmp_path}/t0.laz,{tmp_path}/t1.laz",
-    ]
+    grouped = [*words, *QUICK_WORDS, "--surveys", f"one={tmp_path}/t0.laz,{tmp_path}/t1.laz"]
     assert main(grouped) == 1  # of one survey must be of one reference system
     assert "reference systems" in capsys.readouterr().err
 

@@ -12,13 +12,7 @@ from pdal_stages.classifier.clouds import TiledCloud
 from pdal_stages.classifier.foresttraining import SHORT
 from pdal_stages.classifier.training import reach
 
-QUICK = {
-    "count": 120,
-    "trees": 4,
-    "threads": 1,
-    "voxel": 0.25,
-    "dimensions": ("Intensity",),
-}
+QUICK = {"count": 120, "trees": 4, "threads": 1, "voxel": 0.25, "dimensions": ("Intensity",)}
 
 
 def scene(n=6000, size=60.0, seed=0, **more):

@@ -176,13 +176,7 @@ def test_a_corridor(data_dir):
     assert (wire & ~np.isin(codes, (14, 15))).sum() < 0.001 * len(codes)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "isprs_filter/samp31.laz",
-        "seville/plazanueva.laz",
-    ],
-)
+@pytest.mark.parametrize("name", ["isprs_filter/samp31.laz", "seville/plazanueva.laz"])
 def test_clouds_without_wires(name, data_dir):
     las = laspy.read(data_dir / name)
     height = filtered_ground(las.xyz)["HeightAboveGround"]

@@ -40,11 +40,7 @@ def count(data: Path, survey: str, model: Model) -> dict[str, Any]:
     deck = (made["Deck"] != 0) & seen
     codes[deck] = BRIDGE
     after, changed = consistent(
-        xyz,
-        codes,
-        height=made["HeightAboveGround"],
-        ground=made["Ground"],
-        mask=seen,
+        xyz, codes, height=made["HeightAboveGround"], ground=made["Ground"], mask=seen
     )
     truth = true_classes(known, xyz[:, 0], xyz[:, 1], label, made["HeightAboveGround"])
     known_class = (truth > 0) & seen & ~deck

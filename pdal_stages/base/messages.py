@@ -135,30 +135,17 @@ class Progress(AbstractContextManager):
 
 @dataclass
 class Report:
-    """What a stage, a prediction or a feature engine reports beside its results.
+    """What a stage, a prediction or a feature engine reports beside its results."""
 
-    Attributes
-    ----------
-    figures : dict
-        Counts and other JSON-able values by name, e.g. ``points`` or ``classes``.
-    notes : list of str
-        What the user should know; nothing is wrong.
-    warnings : list of str
-        What is likely wrong, and the cure.
-    beyond_halo : dict of str to int
-        By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile of that halo their
-        values may differ from those of the whole cloud.
-    reach : float
-        How far away the farthest of these lay, in meters; not in the metadata.
-    codes : dict of str to int or None
-        The points of each class code after a stage that gives classes, whichever it looked at; not in the metadata.
-    """
-
+    #: counts and other JSON-able values by name, e.g. ``points`` or ``classes``
     figures: dict[str, Any] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  #: what the user should know; nothing is wrong
+    warnings: list[str] = field(default_factory=list)  #: what is likely wrong, and the cure
+    #: By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile of that halo their
+    #: values may differ from those of the whole cloud.
     beyond_halo: dict[str, int] = field(default_factory=dict)
-    reach: float = 0.0
+    reach: float = 0.0  #: how far away the farthest of these lay, in meters; not in the metadata
+    #: the points of each class code after a stage that gives classes, whichever it looked at; not in the metadata
     codes: dict[str, int] | None = None
 
     def merge(self, other: Report) -> None:

@@ -14,24 +14,14 @@ from .bins import ShapeBins
 
 @dataclass
 class FeatureTable:
-    """Features of queries: an array with names, which NumPy and scikit-learn take as it is.
+    """Features of queries: an array with names, which NumPy and scikit-learn take as it is."""
 
-    Attributes
-    ----------
-    values : (m, F) float32 array
-    names : tuple of str
-        Of the columns.
-    bins, copt_threshold
-        As given or fitted; hand them to another call to get comparable features.
-    report : Report
-        See :class:`FeatureEngine`.
-    """
-
-    values: np.ndarray
-    names: tuple[str, ...]
+    values: np.ndarray  #: (m, F) float32
+    names: tuple[str, ...]  #: of the columns
+    #: As given or fitted, both; hand them to another call to get comparable features.
     bins: ShapeBins | None = None
     copt_threshold: float | None = None
-    report: Report = field(default_factory=Report)
+    report: Report = field(default_factory=Report)  #: see :class:`FeatureEngine`
 
     def __len__(self) -> int:
         return len(self.values)

@@ -95,19 +95,11 @@ def kind_of_code(classes: Mapping[Kind, Sequence[int]]) -> NDArray[np.int8]:
 
 @dataclass
 class Cells:
-    """Records of cells, sorted by key.
+    """Records of cells, sorted by key."""
 
-    Attributes
-    ----------
-    size : float
-        Side of a cell, meters; those of the ground are `GROUND_CELLS` times as wide.
-    key : (n,) int64
-    columns : dict of str to (n,) ndarray
-        See the table in the source: count, low, high, sum, ...
-    """
-
-    size: float
-    key: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    size: float  #: side of a cell, meters; those of the ground are `GROUND_CELLS` times as wide
+    key: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  #: (n,)
+    #: name to (n,) values, see the table in the source: count, low, high, sum, ...
     columns: dict[str, NDArray] = field(
         default_factory=lambda: {name: np.empty(0, kind) for name, (kind, _) in _COLUMNS.items()}
     )

@@ -51,10 +51,7 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
 
 
 def write_objects(
-    names: Sequence[str],
-    stage: ObjectsWriter,
-    workers: int = 1,
-    metadata: str | None = None,
+    names: Sequence[str], stage: ObjectsWriter, workers: int = 1, metadata: str | None = None
 ) -> dict[str, Any]:
     """Find objects in classified files, write them, say what was found; the files, and counts by kind."""
     check_target(stage.filename)
