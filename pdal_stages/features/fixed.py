@@ -108,11 +108,10 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
     out : (m, F) float32 array
         Out: shapes.
     """
-    reach = widths.shape[1] // 2
-    window = np.empty((2 * reach + 1, 2 * reach + 2), np.int64)
+    reach, starts = widths.shape[1] // 2, grid[4]
+    window = np.empty((len(radii), 2 * reach + 1, 2), np.int64)
     px, py, pz, keys = np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64)
     record = np.empty((1, 4), np.float32)
-    places = np.empty(2 * reach + 1, np.int64)
     line, left = np.int64(0), np.int64(2**62)
     a = 0
     while a < len(qx):
@@ -121,26 +120,23 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
         while b < len(qx) and math.floor(qx[b] / cell) == ix and math.floor(qy[b] / cell) == iy:
             b += 1
         on = iy == line and ix >= left
-        fill_window(grid[3], grid[4], grid[5], grid[6], iy, ix, reach, on, places, window)
+        move_window(grid[3], grid[5], grid[6], iy, ix, widths, on, window)
         line, left = iy, ix
         count = 0
         for k in range(len(radii)):
             if k == 0 or radii[k] != radii[k - 1]:
                 room = 0
                 for row in range(2 * reach + 1):
-                    w = widths[k, row]
-                    room += window[row, reach + w + 1] - window[row, reach - w] if w >= 0 else 0
+                    room += starts[window[k, row, 1]] - starts[window[k, row, 0]]
                 if room + LANES > len(px):
                     size = 2 * room + LANES
                     px, py, pz = np.empty(size), np.empty(size), np.empty(size)
                     keys = np.empty(size, np.int64)
                 count = 0
                 for row in range(2 * reach + 1):
-                    w = widths[k, row]
-                    if w >= 0:
-                        first, last = window[row, reach - w], window[row, reach + w + 1]
-                        copy_points(grid[0], grid[1], grid[2], first, last, px, py, pz, keys, count)
-                        count += last - first
+                    first, last = starts[window[k, row, 0]], starts[window[k, row, 1]]
+                    copy_points(grid[0], grid[1], grid[2], first, last, px, py, pz, keys, count)
+                    count += last - first
                 while count % LANES:
                     px[count], py[count], pz[count], keys[count] = FAR, FAR, FAR, 0
                     count += 1
@@ -158,26 +154,30 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
 
 
 @device
-def fill_window(cell_ix, cell_start, row_iy, row_start, iy, ix, reach, on, places, window):
-    """Fill where points begin in the cells round (iy, ix).
+def move_window(cell_ix, row_iy, row_start, iy, ix, widths, on, window):
+    """Fill `window` (k, rows, 2) with the first cell round (iy, ix) in each row, by the radius, and with the end of them.
 
-    ``window[k, c]`` becomes the first point of row ``iy - reach + k`` whose column is not below ``ix - reach + c``, and
-    ``places[k]`` the first cell of these; where it goes `on`, from a cell to the left, rows are followed from there.
+    Where it goes `on`, from a cell to the left, cells are followed from those that were found there.
     """
+    reach = widths.shape[1] // 2
     row = np.searchsorted(row_iy, iy - reach)
-    for k in range(2 * reach + 1):
-        if row >= len(row_iy) or row_iy[row] != iy - reach + k:
-            window[k] = 0
+    for r in range(2 * reach + 1):
+        if row >= len(row_iy) or row_iy[row] != iy - reach + r:
+            window[:, r] = 0
             continue
-        first, last = row_start[row], row_start[row + 1]
-        at = places[k] if on else first + np.searchsorted(cell_ix[first:last], ix - reach)
-        while at < last and cell_ix[at] < ix - reach:
-            at += 1
-        places[k] = at
-        for c in range(2 * reach + 2):
-            while at < last and cell_ix[at] < ix - reach + c:
-                at += 1
-            window[k, c] = cell_start[at]
+        start, last = row_start[row], row_start[row + 1]
+        at = start if on else start + np.searchsorted(cell_ix[start:last], ix - reach)
+        for k in range(len(widths)):
+            w = widths[k, r]
+            if w < 0:
+                window[k, r] = 0
+                continue
+            for side in range(2):
+                column = ix + w + 1 if side else ix - w
+                place = window[k, r, side] if on else at
+                while place < last and cell_ix[place] < column:
+                    place += 1
+                window[k, r, side] = place
         row += 1
 
 
