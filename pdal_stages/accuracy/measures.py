@@ -315,6 +315,16 @@ class Accuracy:
     iou = property(lambda self: self._by_class("iou"))
     support = property(lambda self: self._by_class("support"))
 
+    def confusions(self, most: int) -> list[tuple[int, int, int]]:
+        """The errors, largest first: reference class, predicted class, points; for the page's template."""
+        k = len(self.classes)
+        wrong = self.matrix.copy()
+        wrong[np.arange(k), np.arange(k)] = 0
+        i, j = np.nonzero(wrong)
+        order = np.argsort(-wrong[i, j], kind="stable")[:most]
+        pairs = zip(i[order], j[order], strict=True)
+        return [(self.classes[a], self.columns[b], int(wrong[a, b])) for a, b in pairs]
+
     def name(self, code: int) -> str:
         """A class's name."""
         return self.names.get(code) or class_name(code)

@@ -213,7 +213,7 @@ def _sources(kernel: Any) -> set[str]:
 @lru_cache(maxsize=1)
 def _tell_compiling(event: Any) -> None:
     """Say on stderr how many functions were compiled so far, where that takes longer than two seconds."""
-    bar = Progress(0, "compiling for this processor, once", "functions")
+    bar = Progress(0, "compiling for this processor, once, a minute or two", "functions")
     heard = {"on_start": lambda *_: None, "on_end": lambda *_: bar.update()}
     event.register("numba:compile", type("Listener", (event.Listener,), heard)())
 
