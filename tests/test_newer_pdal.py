@@ -8,6 +8,7 @@ import pytest
 from block_scene import ground_and_block
 
 import pdal_stages as ps
+from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.terrain import hag_minima
 
@@ -62,6 +63,12 @@ def test_copc_is_written(cloud, tmp_path):
     ]
     read = ps.run_pipeline(part).arrays[0]
     assert 0 < len(read) < len(before) and read["X"].max() <= 500_010
+    damaged = bytearray(out.read_bytes())
+    damaged[429 + 48] ^= 1  # the size of the first page
+    out.write_bytes(damaged)
+    for read in (str(out), part[0]):
+        with pytest.raises(StageError, match="the octree of the COPC file is damaged"):
+            ps.run_pipeline([read])
 
 
 @pytest.mark.parametrize("point_format", [1, 6])

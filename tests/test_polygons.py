@@ -224,12 +224,3 @@ def test_what_cannot_be_read_after_the_check_is_an_error_of_ours(tmp_path, monke
     (tmp_path / "lake.gpkg").write_bytes(b"no GeoPackage any more")
     with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read"):
         stage.run(points)
-
-
-def test_polygons_elsewhere_are_told(tmp_path):
-    far = shapely.transform(LAKE, lambda xy: xy + np.array([5000.0, 0.0]))
-    codes, report = run([f"{write(tmp_path / 'far.gpkg', [far])}=9"], cloud())
-    assert not (codes == 9).any()
-    assert "no polygon is where the points are" in report.warnings[0] and "far.gpkg" in report.warnings[0]
-    near = write(tmp_path / "near.gpkg", [LAKE])
-    assert not run([f"{near}=9"], cloud())[1].warnings

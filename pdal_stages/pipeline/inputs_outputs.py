@@ -13,11 +13,12 @@ from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
 from ..base.las import header_there, projection, read_header
+from ..base.octree import check_copc, check_ept
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from ..classifier.modelfile import find
 from ..stages.base import Stage
 from . import pdal as pdal_env
-from .read import Override, apply_overrides, is_writer, readers_files
+from .read import Override, apply_overrides, is_writer, reader_files, readers_files
 
 #: What the description of an EPT source is called.
 EPT = "ept.json"
@@ -97,6 +98,13 @@ def is_ept(name: str) -> bool:
     return name.startswith("ept://") or Path(name).name == EPT
 
 
+def ept_address(name: str) -> str:
+    """Where the description of an EPT source is."""
+    name = name.removeprefix("ept://")
+    name = name if name.endswith(EPT) else f"{name.rstrip('/')}/{EPT}"
+    return name if "://" in name else os.path.abspath(name)
+
+
 def is_las(name: str) -> bool:
     """Whether an input is a LAS, LAZ or COPC file, as its name says."""
     return Path(name).suffix.lower() in (".las", ".laz") and "://" not in name
@@ -136,7 +144,7 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
     """
     path = Path(target)
     if path.name == "#":
-        names = [_output_name(source, copc and pdal_env.writes_copc()) for source in sources]
+        names = [_output_name(source, copc and pdal_env.knows_copc()) for source in sources]
         outputs = [str(path.parent / name) for name in in_folders(sources, names)]
     else:
         outputs = named_outputs(target, [Path(_output_name(source, False)).stem for source in sources])
@@ -178,7 +186,7 @@ def writer_of(target: str) -> dict[str, Any]:
     """A writer that keeps the input's header, where it is a LAS file."""
     stage: dict[str, Any] = {"filename": target, "tag": "output"}
     if Path(target).suffix.lower() in (".las", ".laz"):
-        kind = "writers.copc" if _is_copc(target) and pdal_env.writes_copc() else "writers.las"
+        kind = "writers.copc" if _is_copc(target) and pdal_env.knows_copc() else "writers.las"
         stage |= {"type": kind, "forward": "all"}
     return stage
 
@@ -290,6 +298,17 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
     of_kind = {kind: reference_of(reader, horizontal) for kind, reader in kinds.items()}
     found = {path: of_kind[kind] for path, (kind, _) in readers.items()}
     return check_one_reference(found)
+
+
+def check_octrees(stages: list[dict[str, Any]]) -> None:
+    """Refuse damaged octrees that readers of COPC and EPT would walk; StageError."""
+    for stage in [stage for stage in stages if not is_writer(stage, stages)]:
+        name, kind = str(stage.get("filename", "")), stage.get("type", "")
+        if kind == "readers.ept" or (not kind and is_ept(name)):
+            check_ept(ept_address(name))
+        elif pdal_env.knows_copc() and (kind == "readers.copc" or (not kind and _is_copc(name))):
+            for path in reader_files(stage, las=True):
+                check_copc(path)
 
 
 def stage_files(stage: Stage) -> list[str]:

@@ -109,7 +109,7 @@ def check_copc(stages: list[dict[str, Any]]) -> None:
         last = stage is stages[-1] and len(stages) > 1
         if not name.lower().endswith(".copc.laz") or not (kind == "writers.las" or (last and not kind)):
             continue
-        if not pdal_env.writes_copc():
+        if not pdal_env.knows_copc():
             what = f"PDAL {pdal_env.dotted_version()} cannot write COPC"
             raise PipelineError(what, found=name, cure="Name the output .laz, or use PDAL 2.4 or later")
         if kind:

@@ -342,8 +342,8 @@ def las_writer_defaults() -> tuple[int, int]:
     return int(minor.group(1)) if minor else 4, int(format_id.group(1)) if format_id else 7
 
 
-def writes_copc() -> bool:
-    """Whether this PDAL has writers.copc."""
+def knows_copc() -> bool:
+    """Whether this PDAL reads and writes COPC."""
     return version() >= (2, 4, 0)
 
 

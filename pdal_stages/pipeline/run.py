@@ -20,7 +20,7 @@ from ..stages.base import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand
-from .inputs_outputs import check_readers, stage_files
+from .inputs_outputs import check_octrees, check_readers, stage_files
 from .read import (
     Override,
     PipelineSource,
@@ -234,6 +234,7 @@ class Pipeline:
         check_dimensions(self.expanded)
         odd = (check_readable(path) for path in readers_files(self.expanded.stages, las=True))
         self.warnings = [*self.expanded.warnings, *filter(None, odd)]
+        check_octrees(self.expanded.stages)
         units = [ours.stage.horizontal_unit for ours in self.expanded.ours]
         if units:
             self.warnings += check_readers(self.expanded.stages, next(filter(None, units), ""))

@@ -15,11 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import las, lascheck
-from ..base.checks import strict_json
 from ..base.errors import OptionError, PipelineError, StageError
+from ..base.octree import check_ept, read_ept
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import Reference, check_one_reference, is_ept, is_las, locations, reference_of
+from ..pipeline.inputs_outputs import (
+    Reference,
+    check_one_reference,
+    ept_address,
+    is_ept,
+    is_las,
+    locations,
+    reference_of,
+)
 from ..pipeline.read import LAS_READERS, named_files
 from .plan import TilePlan, outputs_for
 from .settings import (
@@ -36,8 +44,6 @@ from .settings import (
 )
 from .store import fingerprint
 
-#: Bytes of an EPT source's description at most.
-_LARGEST = 16 << 20
 #: Options of readers.tindex that choose files or points, or change them.
 _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
 #: Bytes looked at, at the beginning and the end.
@@ -73,9 +79,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
         paths = given if isinstance(given, list) else [name]  # from a command all are files
         if kind == "readers.ept":
             for path in paths:
-                path = path.removeprefix("ept://")
-                path = path if path.endswith("ept.json") else path.rstrip("/") + "/ept.json"
-                path = path if "://" in path else os.path.abspath(path)
+                path = ept_address(path)
                 found.setdefault(path, InputSource(path, options, "ept"))
             continue
         if kind == "readers.tindex":
@@ -107,7 +111,7 @@ def read_extent(source: InputSource) -> Extent:
     """Number of points and bounding box, from the first bytes; StageError where these cannot be read."""
     if source.kind != "ept":
         return las_extent(source.path)
-    described = read_ept(source.path)
+    described = check_ept(source.path)
     x0, y0, _, x1, y1, _ = map(float, described["boundsConforming"])
     return Extent(int(described["points"]), (x0, y0, x1, y1))
 
@@ -129,25 +133,6 @@ def las_extent(path: str) -> Extent:
 
 
 # ---- EPT sources ---------------------------------------------------------------------------------------------
-
-
-def read_ept(path: str) -> dict[str, Any]:
-    """The description of an EPT source."""
-    import urllib.request
-
-    try:
-        with urllib.request.urlopen(path, timeout=60) if "://" in path else open(path, "rb") as file:
-            found = strict_json(file.read(_LARGEST))
-        x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
-        left, low, _, right, high, _ = map(float, found["bounds"])
-        # PDAL looks for points beyond the octree without end.
-        there = left - 1 <= x0 <= x1 <= right + 1 and low - 1 <= y0 <= y1 <= high + 1
-        named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
-        if int(found["points"]) < 0 or not there or not named:
-            raise ValueError("a description of nothing, or of points beyond its octree")
-        return found
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
 
 
 def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
@@ -237,8 +222,9 @@ class Survey:
                     raise StageError(
                         "the name of the file is not UTF-8", where=source.path, cure="Rename the file"
                     )
-                if source.kind == "las" and (said := lascheck.check_readable(source.path)):
-                    odd.append(said)
+                if source.kind == "las":
+                    las.check_texts(source.path)
+                    odd += filter(None, [lascheck.check_readable(source.path)])
             except StageError as error:
                 self.unreadable[source.path] = str(error)
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""

@@ -152,6 +152,8 @@ def _epts() -> list[bytes]:
 def ept(data: bytes) -> str:
     """The description of an EPT source."""
     path = put("ept.json", data)
+    path.with_name("ept-hierarchy").mkdir(exist_ok=True)
+    (path.with_name("ept-hierarchy") / "0-0-0-0.json").write_text('{"0-0-0-0": 0}')
     found = inputs.read_extent(inputs.InputSource(str(path), {"type": "readers.ept"}, "ept"))
     assert found.count >= 0 and np.isfinite(found.box).all()
     TileGrid(10.0).covering(found.box)

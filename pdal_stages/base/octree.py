@@ -1,0 +1,156 @@
+"""Octrees held against themselves before PDAL walks them: of COPC files, and of EPT sources on this disk.
+
+PDAL takes what they say as it is. Pages that lie elsewhere or hold themselves end the process, or are walked forever, and
+points that no page names are left out without a word. Layouts: COPC 1.0 (copc.io), EPT 1.1 (entwine.io).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from .checks import strict_json
+from .errors import StageError
+from .las import read_header, records_of
+
+#: Level, x, y and z of a node.
+Key = tuple[int, int, int, int]
+#: Number of points of each node, and where they are.
+Nodes = dict[Key, tuple[int, Any]]
+#: What a page lists: nodes, or with -1 points the pages in which they are.
+Entries = Iterator[tuple[Key, int, Any]]
+
+#: Deeper nodes would be smaller than a step of the coordinates, which have 32 bits.
+_DEEPEST = 31
+_COPC_INFO, _COPC_ENTRY = struct.Struct("<5d2Q2d"), struct.Struct("<4iQ2i")
+#: Bytes of an EPT description that are read.
+_LARGEST = 2**24
+#: Endings of the files of an EPT source, by their type.
+_ENDINGS = {"binary": "bin", "laszip": "laz", "zstandard": "zst"}
+
+
+def check_copc(path: str | os.PathLike) -> None:
+    """Refuse a COPC file, readable as LAZ, whose octree does not hold each of its chunks once; StageError."""
+    header = read_header(path)
+    about = [data for record, data in records_of(path, b"copc") if record.number == 1]
+    if header is None or not about or len(about[0]) < 160:
+        return  # which PDAL says
+    x, y, z, half, spacing, begin, length, _, _ = _COPC_INFO.unpack_from(about[0])
+    try:
+        # Its cube holds all points, but for what programs round.
+        beyond = [abs(one - middle) for one, middle in zip(header.box, (x, y, x, y), strict=True)]
+        if not (half > 0 and max(beyond) <= 1.01 * half and math.isfinite(z) and spacing > 0):
+            raise ValueError(f"a cube of {2 * half:g} around {x:g}, {y:g}, {z:g}, points {spacing:g} apart")
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+
+            def entries(page: tuple[int, int]) -> Entries:
+                place, held = page
+                if not 0 < held <= size - place or held % _COPC_ENTRY.size:
+                    raise ValueError(f"a page of {held:,} bytes at {place:,}")
+                file.seek(place)
+                for *key, offset, inside, count in _COPC_ENTRY.iter_unpack(file.read(held)):
+                    yield tuple(key), count, (offset, inside)  # type: ignore[misc]
+
+            nodes = _walk((begin, length), entries)
+            file.seek(header.offset)
+            table = int.from_bytes(file.read(8), "little")
+            place = header.offset + 8  # chunks follow each other from here to their table
+            for count, (offset, inside) in sorted((n for n in nodes.values() if n[0]), key=lambda n: n[1]):
+                file.seek(place + header.point_bytes)  # a chunk begins with a point and their number
+                counted = int.from_bytes(file.read(4), "little")
+                if offset != place or not 0 < inside <= table - place or counted != count:
+                    raise ValueError(f"{count:,} points in {inside:,} bytes at {offset:,}")
+                place += inside
+        if (held := sum(count for count, _ in nodes.values())) != header.count:
+            raise ValueError(f"{held:,} points, the header counts {header.count:,}")
+    except ValueError as error:
+        raise StageError(
+            "the octree of the COPC file is damaged",
+            where=str(path),
+            found=str(error),
+            cure="Get the file again; named in.laz, not in.copc.laz, it is read as the LAZ file that it is, too",
+        ) from None
+
+
+def read_ept(path: str) -> dict[str, Any]:
+    """The description of an EPT source, ``ept.json``, which may be an address; StageError."""
+    import urllib.request
+
+    try:
+        with urllib.request.urlopen(path, timeout=60) if "://" in path else open(path, "rb") as file:
+            found = strict_json(file.read(_LARGEST))
+        x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
+        left, low, _, right, high, _ = map(float, found["bounds"])
+        # PDAL looks for points beyond the octree without end.
+        there = left - 1 <= x0 <= x1 <= right + 1 and low - 1 <= y0 <= y1 <= high + 1
+        named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
+        if int(found["points"]) < 0 or not there or not named:
+            raise ValueError("a description of nothing, or of points beyond its octree")
+        return found
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
+
+
+def check_ept(path: str) -> dict[str, Any]:
+    """The description of an EPT source, after its hierarchy and files were held against each other; StageError.
+
+    Of one at an address only the description is looked at.
+    """
+    described = read_ept(path)
+    if "://" in path:
+        return described
+    folder, kind = Path(path).parent, str(described.get("dataType"))
+    step = sum(int(dimension["size"]) for dimension in described["schema"])
+
+    def entries(page: str) -> Entries:
+        listed = json.loads((folder / "ept-hierarchy" / f"{page}.json").read_bytes())
+        for name, count in dict(listed).items():
+            level, x, y, z = map(int, name.split("-"))
+            yield (level, x, y, z), int(count), name
+
+    try:
+        for count, name in _walk("0-0-0-0", entries).values() if kind in _ENDINGS else ():
+            file = folder / "ept-data" / f"{name}.{_ENDINGS[kind]}"
+            held = file.stat().st_size if count else 0
+            if count and kind == "laszip":
+                header = read_header(file)
+                fits = header is not None and header.count == count
+            else:
+                fits = held == count * step if kind == "binary" else bool(held) == bool(count)
+            if not fits:
+                raise ValueError(f"{count:,} points in {file.name}, of {held:,} bytes")
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        what = "the EPT source is damaged"
+        cure = "Get it again from its source, or build it anew"
+        raise StageError(what, where=path, found=str(error), cure=cure) from None
+    return described
+
+
+def _walk(root: Any, entries: Callable[[Any], Entries]) -> Nodes:
+    """All nodes of an octree from its first page on; ValueError where they are none."""
+    found: Nodes = {}
+    waiting: list[tuple[Key, Any]] = [((0, 0, 0, 0), root)]
+    while waiting:  # not without end: a page that comes again has its nodes twice
+        first, page = waiting.pop()
+        for key, count, place in entries(page):
+            level, *at = key
+            if not 0 <= level <= _DEEPEST or not all(0 <= one < 1 << level for one in at) or count < -1:
+                raise ValueError(f"node {key} of {count:,} points")
+            if count == -1:
+                waiting.append((key, place))
+            elif key in found:
+                raise ValueError(f"node {key} is there twice")
+            else:
+                found[key] = count, place
+        if first not in found:
+            raise ValueError(f"node {first} is not in its page")
+    for level, *at in found:
+        if level and (level - 1, *(one >> 1 for one in at)) not in found:
+            raise ValueError(f"node {(level, *at)} is in no other")
+    return found
