@@ -107,6 +107,8 @@ def header_of(path: str) -> Any:
         with laspy.open(path) as reader:
             header = reader.header
         header.point_format.dtype()  # of extra bytes that no array can hold
+        if header.version.minor == 0:  # which laspy does not write, and PDAL writes as LAS 1.2
+            header.version = laspy.header.Version(1, 2)
     except Exception as error:  # laspy raises many types
         found = f"{type(error).__name__}: {error}"
         raise StageError("the input cannot be read", where=path, found=found) from None

@@ -76,6 +76,9 @@ def test_versions_and_formats(command, tmp_path, write_las, model, version, poin
     )
     # PDAL writes no LAS 1.0, newer PDAL LAS 1.4 where it is not told otherwise
     assert out.header.version.minor == version if version else out.header.version.minor in (2, 4)
+    if version <= 1:
+        command.runs(["classify", source, tmp_path / "t.las", "--model", model, "--tile", 20, "--workers", 0])
+        assert len(laspy.read(tmp_path / "t.las")) == 600
 
 
 def test_extra_bytes_of_every_type(command, tmp_path, write_las, model):
