@@ -222,4 +222,6 @@ def kept_kernels() -> int:
     """How many kernels there is compiled code of, of whatever version, without asking numba."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     folders = [Path(named)] if named else [_PACKAGE, Path.home() / ".cache" / "numba"]
-    return sum(1 for folder in folders for _ in folder.rglob("*.nbi"))
+    # os.walk passes over what may not be entered
+    found = (names for folder in folders for _, _, names in os.walk(folder))
+    return sum(name.endswith(".nbi") for names in found for name in names)

@@ -67,7 +67,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
     for index, stage in enumerate(stages):
         type_name = stage.get("type", "")
         if type_name not in stage_types():
-            out.stages.append(stage)
+            out.stages += _each_file(stage) if flags and is_reader(stages, index) else [stage]
             if flags and index == last_reader:
                 out.stages.append(flag_splitter(flags))
             continue
@@ -87,6 +87,13 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
     _follow_preparations(out)
     check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
     return out
+
+
+def _each_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
+    """A reader for each file of a pattern, in their order: PDAL takes them as the folder lists them."""
+    names = reader_files(reader)
+    named = {name: value for name, value in reader.items() if name != "tag"}
+    return [{**named, "filename": name} for name in names] if len(names) > 1 else [reader]
 
 
 def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
