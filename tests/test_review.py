@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from pdal_stages import cli
 from pdal_stages.accuracy.expected import BLOCK, ReviewCells, find_patches
+from pdal_stages.base.errors import StageError
+from pdal_stages.pipeline import reviewing
 from pdal_stages.pipeline.reviewing import styles
 
 
@@ -115,6 +117,18 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, capsys):
     whole = [str(folder / "whole.laz"), str(tmp_path / "w.gpkg"), "--json", str(tmp_path / "w.json")]
     assert cli.main(["review", *whole]) == 0
     assert np.isclose(json.loads((tmp_path / "w.json").read_text())["expected"], figures["expected"])
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("last", ["review_page", "write_layers"])
+def test_all_files_are_written_or_none(folder, tmp_path, monkeypatch, capsys, last):
+    def full(*_):
+        raise StageError("no room")
+
+    monkeypatch.setattr(reviewing, last, full)
+    out = [str(tmp_path / f"r.{ending}") for ending in ("gpkg", "json", "html")]
+    assert cli.main(["review", str(folder / "whole.laz"), out[0], "--json", out[1], "--html", out[2]]) == 1
+    assert "no room" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 @pytest.mark.pdal
