@@ -127,7 +127,10 @@ class _NoLinearAlgebra(NamedTuple):
 
 
 def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:
-    """Load a kernel without what only compiling needs: before it loads one, numba imports all that it can compile."""
+    """Load a kernel without what only compiling needs: before it loads one, numba imports all that it can compile.
+
+    Tried with numba 0.58, 0.61 and 0.68.
+    """
     from numba.core.runtime import rtsys
 
     codegen = target.codegen()
@@ -142,7 +145,7 @@ def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:
 
 
 def _library(codegen: Any, state: tuple[str, str, tuple[bytes, bytes]]) -> Any:
-    """A kernel's code; the intermediate code waits for kernels that call it to be compiled: most of a job's own memory."""
+    """A kernel's code; its intermediate code, which is larger, is read when a kernel that calls it is compiled."""
     from llvmlite.binding import parse_bitcode
 
     name, _, (code, intermediate) = state
