@@ -55,6 +55,19 @@ def test_cells_are_what_they_say():
         assert np.allclose(made.errors[k], errors, atol=1e-3)
 
 
+def test_places_are_told_in_the_coordinates_of_the_files():
+    cells, foot = ReviewCells.of(*cloud(3), 2.0), 0.3048
+    meters, feet = (
+        reviewing.Review(cells, find_patches(cells), 1, ["a.laz"], across) for across in (1.0, foot)
+    )
+    assert np.allclose(np.multiply(feet.rows[0]["box"], foot), meters.rows[0]["box"], atol=1e-3)
+    x, y = np.mean(np.reshape(feet.rows[0]["box"], (2, 2)), axis=0)
+    assert reviewing.lines(feet.to_dict())[-1].endswith(f"a.laz at {x:.0f}, {y:.0f}")
+    assert np.allclose(
+        reviewing.review_layers(feet)["patches"].shapes[0].bounds, feet.rows[0]["box"], atol=1e-3
+    )
+
+
 def test_patches_hold_each_cell_once_and_come_best_first():
     assert all("looked at" in styles(np.full(n, 0.2))["patches"] for n in (0, 1, 5))
     cells = ReviewCells.of(*cloud(9, 6000, 150.0), 2.0)

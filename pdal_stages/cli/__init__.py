@@ -45,7 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     streams = sys.stdout, sys.stderr
     for stream in streams:  # a locale that lacks a character shows its code, rather than ending the run
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
-            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+            # Line by line, so that what is told and what is found stand in their order in a file as well.
+            stream.reconfigure(errors="backslashreplace", line_buffering=True)  # type: ignore[union-attr]
     sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
     log: RunLog | None = None
     shown = os.environ.get("PDAL_STAGES_PROGRESS")

@@ -40,12 +40,14 @@ _LOOKED_AT = "120,170,120,90"
 
 @dataclass
 class Review:
-    """What was found; of the patches those `listed`, which come first, are written."""
+    """What was found; of the patches those `listed`, which come first, are written. Coordinates are told in units of
+    `across` meters, as the files have them."""
 
     cells: ReviewCells
     patches: Patches
     listed: int
     files: list[str]
+    across: float = 1.0
 
     @cached_property
     def tiles(self) -> list[dict[str, Any]]:
@@ -82,7 +84,7 @@ class Review:
                 "seconds": round(60.0 * float(p.minutes[k]), 1),
                 "per_minute": round(float(p.errors[k] / p.minutes[k]), 1),
                 "reason": p.reason[k],
-                "box": [round(float(v), 3) for v in p.box[k]],
+                "box": [round(float(v) / self.across, 3) for v in p.box[k]],
             }
             for k in range(self.listed)
         ]
@@ -134,7 +136,7 @@ def review_files(
     patches = find_patches(cells)
     held = np.cumsum(patches.errors)
     listed = int(np.searchsorted(held, share * held[-1])) + 1 if held[-1] > 0 else 0
-    return Review(cells, patches, min(listed, len(patches)), files)
+    return Review(cells, patches, min(listed, len(patches)), files, references[files[0]].units.horizontal)
 
 
 def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
@@ -193,21 +195,20 @@ def write_review(
     outputs = [Output(path, what, kind) for what, (path, kind) in pages.items() if path]
     check_outputs([Output(output, "review"), *outputs], [*input_files(inputs), *inputs])
     found = review_files(inputs, **how)
-    reference = reference_of_file(found.files[0])
-    layers = review_layers(found, reference.units.horizontal)
+    layers = review_layers(found)
     with whole_files(*filter(None, (json_file, html))) as files:
         if json_file:
             files[0].write_bytes((json.dumps(found.to_dict(), indent=1) + "\n").encode())
         if html:
             files[-1].write_bytes(review_page(found).encode())
-        write_layers(output, layers, reference.wkt, styles(found.patches.errors))
+        write_layers(output, layers, reference_of_file(found.files[0]).wkt, styles(found.patches.errors))
     return found
 
 
-def review_layers(found: Review, across: float = 1.0) -> dict[str, Layer]:
-    """Layers ``patches``, best first, and ``tiles``; coordinates in units of `across` meters."""
+def review_layers(found: Review) -> dict[str, Layer]:
+    """Layers ``patches``, best first, and ``tiles``."""
     shapely = vector("shapely")
-    boxes, of = shapely.box(*(found.cells.corners / across).T), found.cells.place[:, 0]
+    boxes, of = shapely.box(*(found.cells.corners / found.across).T), found.cells.place[:, 0]
     tiles = [row for row in found.tiles if row["points"]]
     order = np.argsort(found.patches.of_cell, kind="stable")
     ends = np.searchsorted(found.patches.of_cell[order], np.arange(1, found.listed + 1))

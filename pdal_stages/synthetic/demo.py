@@ -50,18 +50,19 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
         write_whole(folder / f"{name}.json", (json.dumps(listed, indent=4) + "\n").encode())
     with _step("training on the western half"):
         Pipeline(stages["train"]).execute(arrays=False)
-    with _step("classifying the eastern half"):
+    with _step("classifying the eastern half; how right that is"):
         job = Pipeline(stages["classify"])
         job.execute()
-    with _step("classifying it with the model that comes with the package, which has never seen such a town"):
+    with _step("the same with the model that comes with the package, which has never seen such a town"):
         Pipeline(stages["standard"]).execute(arrays=False)
     with _step("drawing the picture"):
         (points,) = job.arrays
         shown = points[np.isin(points["Reference"], [*map(int, CLASSES)])]
         columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
         write_png(folder / "classified.png", triptych(*columns))
+    print("points, heights beside classes beside errors, and how right the first model is, for a browser:")
     for file in ("classified.laz", "classified.png", "accuracy.html"):
-        print(folder / file)
+        print(f"  {folder / file}")
 
 
 def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str, Any]]]:
