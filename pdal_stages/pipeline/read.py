@@ -4,6 +4,7 @@ the files that PDAL's stages name."""
 from __future__ import annotations
 
 import glob
+import io
 import json
 import os
 import re
@@ -11,7 +12,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
@@ -23,6 +24,8 @@ LAS_WRITERS = ("writers.las", "writers.copc")
 LAS_READERS = ("readers.las", "readers.copc")
 #: What stages of PDAL have that never names a file.
 _NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
+#: Bytes that no pipeline has.
+_LARGEST = 1 << 26
 
 
 @dataclass
@@ -71,7 +74,8 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
 def _content(path: Path) -> bytes:
     """What a file holds, or what comes through a pipe, if somebody writes into it within some seconds."""
     if not path.is_fifo():
-        return path.read_bytes()
+        with open(path, "rb") as file:
+            return _bounded(file)
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as pipe:
         until = time.monotonic() + 5.0
         while (first := pipe.read(1)) == b"":  # None where a writer is there, but has written nothing yet
@@ -79,7 +83,14 @@ def _content(path: Path) -> bytes:
                 raise OSError("nobody writes into this pipe")
             time.sleep(0.05)
         os.set_blocking(pipe.fileno(), True)
-        return (first or b"") + pipe.read()
+        return (first or b"") + _bounded(io.BufferedReader(pipe))
+
+
+def _bounded(file: BinaryIO) -> bytes:
+    """All that a file holds; devices have no end."""
+    if len(data := file.read(_LARGEST)) == _LARGEST:
+        raise OSError(f"{_LARGEST >> 20} MB and more are no pipeline")
+    return data
 
 
 def decode(data: bytes, name: str) -> str:

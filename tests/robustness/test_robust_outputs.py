@@ -102,7 +102,7 @@ REPLACING = [
     (["pipeline", "twice.json"], "two output files are one"),
     *(([*words, "pipe.las"], "the input is a pipe") for words in (["train", "--model", "o.model"], ["accuracy", "a.las", "--reference"])),
     (["pipeline", "pipe.json"], "the input is a pipe"),
-    (["pipeline", "pipe.las"], "nobody writes into this pipe"),
+    (["pipeline", "pipe.las"], "nobody writes into this pipe"), (["pipeline", "/dev/zero"], "64 MB and more are no pipeline"),
     ([*CLASSIFY, "\udce9.las"], "rename the file"),
     *(([*words, ""], f"what follows '{words[-1]}' is empty") for words in (CLASSIFY, ["review", "a.las"], ["demo"], ["plugin", "--check", "--folder"])),
     ([*CLASSIFY, "o.las", "--metadata="], "what follows '--metadata=' is empty"),
