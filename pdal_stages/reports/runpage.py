@@ -39,7 +39,7 @@ def run_page(run: Mapping[str, Any]) -> str:
     return render(
         "run.html",
         title="Run in tiles",
-        subtitle=f"{pipeline}{len(run['tiles']):,} tiles of {run['tile']:g}",
+        subtitle=f"{pipeline}{len(run['tiles']):,} tile{'s' * (len(run['tiles']) > 1)} of {run['tile']:g}",
         run=run,
         figures=_figures(run),
         what=_what(run),
