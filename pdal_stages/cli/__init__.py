@@ -104,7 +104,7 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
         for one in parser.commands.values():
             one.rare = ()
     if not rest or rest[0] not in parser.commands:
-        parser.parse_args(rest)  # which shows help or the version, or says what is wrong, and leaves
+        parser.parse_args(rest or ["--help"])  # help, the version or what is wrong, and the end
     command, *rest = rest
     for before, word in itertools.pairwise([command, *rest]):
         if not word or re.fullmatch("--[a-z-]+=", word):  # as a path it would be the current folder
