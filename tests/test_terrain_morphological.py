@@ -15,7 +15,7 @@ from pdal_stages.terrain import cells, filtered_ground, groundcells, openings
 from pdal_stages.terrain.groundcells import FilterOptions
 from pdal_stages.terrain.hillside import roofs_of_hillsides
 from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii, remove_plateaus
-from pdal_stages.terrain.planes import GroundRaster, surface
+from pdal_stages.terrain.planes import GroundRaster, planes_of_blocks
 
 SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
 
@@ -87,7 +87,7 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
     assert np.array_equal(floor, want_floor)
 
 
-def slow_planes(cells, left, bottom, level, floor, at):
+def slow_planes(cells, level, floor, at):
     """Plane (height, gradient) of one block of the pyramid, by least squares over its cells, and recursion."""
     size = 2**level
     center = (np.array(at) + 0.5) * size
@@ -98,10 +98,16 @@ def slow_planes(cells, left, bottom, level, floor, at):
 
     ground = [(np.array(c), p, z) for c, (p, z) in cells.items() if weight(np.array(c)) > 0]
     if level == 3:
-        known = [(weight(np.array(c)), f) for c, f in floor.items() if weight(np.array(c)) > 0]
-        if not known:
+        known = [(*(np.array(c) + 0.5 - center), f, weight(np.array(c))) for c, f in floor.items()]
+        known = np.array([row for row in known if row[3] > 0]).T
+        if not known.size:
             return None
-        prior = np.array([np.average([f for _, f in known], weights=[k for k, _ in known]), 0, 0])
+        *middle, level = np.average(known[:3], axis=1, weights=known[3])
+        spread = np.cov(known[:3], aweights=known[3], ddof=0)
+        slope = np.linalg.solve(spread[:2, :2] + 0.02 * size**2 * np.eye(2), spread[:2, 2])
+        near = slope @ spread[:2, 2] >= 0.6 * spread[2, 2] and known[3].sum() >= 0.3 * 4 * size**2
+        slope = slope if near and np.hypot(*slope) >= 0.5 else np.zeros(2)
+        prior = np.array([level - slope @ middle, *slope])
     else:
         uv = center / (2 * size) - 0.5
         base = np.floor(uv).astype(int)
@@ -109,7 +115,7 @@ def slow_planes(cells, left, bottom, level, floor, at):
         for a in (0, 1):
             for b in (0, 1):
                 parent = base + np.array([a, b])
-                plane = slow_planes(cells, left, bottom, level + 1, floor, tuple(parent))
+                plane = slow_planes(cells, level + 1, floor, tuple(parent))
                 share = (1 - abs(uv[0] - parent[0])) * (1 - abs(uv[1] - parent[1]))
                 if plane is not None and share > 0:
                     d = center - (parent + 0.5) * 2 * size
@@ -132,36 +138,23 @@ def slow_planes(cells, left, bottom, level, floor, at):
     return prior + np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
 
 
-def test_planes_equal_the_slow_reference():
+@pytest.mark.parametrize("slope", [0.0, 3.0])
+def test_planes_equal_the_slow_reference(slope):
     rng = np.random.default_rng(4)
     left, bottom, h, w = -13, 40, 30, 26
     ground = rng.random((h, w)) < 0.05
     place = rng.uniform(-0.5, 0.5, (h, w, 3)) * [1, 1, 40]
-    floor = rng.normal(0, 5, (h, w)).astype(np.float32)
+    floor = (rng.normal(0, 5, (h, w)) + slope * np.arange(w)).astype(np.float32)
     raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
     raster[ground] = floor[ground]
-    planes = surface(GroundRaster(left, bottom, raster, place, ground, floor, {}), 3, np.ones_like(ground))
-    cells = {
-        (i + left, j + bottom): (place[j, i, :2], place[j, i, 2])
-        for j, i in zip(*np.nonzero(ground), strict=True)
-    }
-    known = {
-        (i + left, j + bottom): floor[j, i] for j, i in zip(*np.nonzero(np.isfinite(raster)), strict=True)
-    }
-    empty = [(j, i) for j, i in zip(*np.nonzero(~ground), strict=True)]
-    for j, i in [empty[k] for k in rng.choice(len(empty), 3, replace=False)]:
-        # A cell without ground has what the blocks of 2 x 2 cells say.
-        uv = (np.array([i + left, j + bottom]) + 0.5) / 2 - 0.5
-        base = np.floor(uv).astype(int)
-        want = 0.0
-        for a in (0, 1):
-            for b in (0, 1):
-                parent = base + np.array([a, b])
-                plane = slow_planes(cells, left, bottom, 1, known, tuple(parent))
-                d = np.array([i + left, j + bottom]) + 0.5 - (parent + 0.5) * 2
-                share = (1 - abs(uv[0] - parent[0])) * (1 - abs(uv[1] - parent[1]))
-                want += share * (plane[0] + plane[1:] @ d)
-        assert planes[j, i, 0] == pytest.approx(want, abs=1e-6)
+    planes = planes_of_blocks(GroundRaster(left, bottom, raster, place, ground, floor, {}), 3, 0.5)
+    places = [(j, i, (i + left, j + bottom)) for j in range(h) for i in range(w)]
+    cells = {c: (place[j, i, :2], place[j, i, 2]) for j, i, c in places if ground[j, i]}
+    known = {c: floor[j, i] for j, i, c in places if np.isfinite(raster[j, i])}
+    for k in rng.choice(len(places), 4, replace=False):
+        column, row = np.array(places[k][2]) // 2
+        want = slow_planes(cells, 1, known, (column, row))
+        assert planes.values[row - planes.bottom, column - planes.left] == pytest.approx(want, abs=1e-6)
 
 
 def square(place, reach):
@@ -358,6 +351,17 @@ def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground():
     found = filtered_ground(x, y, z)
     assert (found["Ground"][ground] == 0).mean() < 0.006
     assert np.abs(found["HeightAboveGround"][ground]).max() < 2  # no treetops stand for it
+
+
+def test_rock_steps_on_a_steep_slope_are_ground(monkeypatch):
+    """From level planes no ground is regained uphill of where openings took all of it."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 200, (2, 40_000))
+    steps = 4 * np.floor((x + 6 * np.sin(y / 15)) / 40)
+    z = 1.2 * x + 2 * np.sin(x / 9) * np.cos(y / 13) + steps + rng.normal(0, 0.2, len(x))
+    assert (filtered_ground(x, y, z)["Ground"] == 0).mean() < 0.08
+    monkeypatch.setattr(groundcells, "STEEP", np.inf)
+    assert (filtered_ground(x, y, z)["Ground"] == 0).mean() > 0.2
 
 
 # ---- what must hold --------------------------------------------------------------------------------------

@@ -30,8 +30,8 @@ from .planes import reach as planes_reach
 NEAR, FAR = 8.0, 32.0
 #: The most cells a window's radius may have.
 _MOST_CELLS = 300
-#: How often ground is regained.
-ROUNDS = 3
+#: How often ground is regained; on slopes (rise over run) that are steeper, from there on, from sloping planes.
+ROUNDS, STEEP = 3, 0.5
 #: Cells along the side of a block.
 BLOCK_SIDE = SIDE
 
@@ -235,7 +235,7 @@ def ground_raster(
 
     def near(cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
         """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
-        blocks = planes_of_blocks(told, options.levels(block))
+        blocks = planes_of_blocks(told, options.levels(block), STEEP * cell)
         found = np.zeros(len(cells), bool)
         rest = np.isfinite(raster) & ~ground
         _near(cells, place, rest, *blocks, left, bottom, cell, options.threshold, options.scalar, found)

@@ -2,9 +2,10 @@
 
 Every block of the pyramid (a cell, 2 x 2 cells, 4 x 4, ...; anchored to absolute coordinates) has a plane at
 its center: a least squares fit to the ground of the 3 x 3 blocks round it, held by what the planes of the
-four nearest blocks of the next coarser level say there. Where ground is dense the finest level decides;
-across a hole the finest level that sees its rim does. The reach is bounded (:func:`reach`), sums are taken
-in a fixed tree, so the same ground gives the same bits whatever lies further away.
+four nearest blocks of the next coarser level say there; the coarsest planes lie at the mean of what is below objects.
+Where ground is dense the finest level decides; across a hole the finest level that sees its rim does. The reach
+is bounded (:func:`reach`), sums are taken in a fixed tree, so the same ground gives the same bits whatever lies
+further away.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from .openings import highest_around
 _STIFFNESS = 0.02
 #: Weight of the coarser height, in ground cells.
 _HOLD = 0.1
+#: The floor is near to a plane that tells such a share of its variance, where such a share of the cells is measured.
+_PLANE, _MEASURED = 0.6, 0.3
 
 
 class GroundRaster(NamedTuple):
@@ -144,18 +147,49 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
                 _add(block, fine[j, i], dx, dy, 1.0)
 
 
-def _coarsest(floor, raster, left, bottom, level, out, out_left, out_bottom):
-    """Level planes at the mean of `floor` over the measured cells of 3 x 3 blocks."""
-    h, w = out.shape[:2]
-    j, i = np.nonzero(np.isfinite(raster))
-    block = (((j + bottom) >> level) - out_bottom) * w + ((i + left) >> level) - out_left
-    sums = np.stack([np.bincount(block, v, h * w).reshape(h, w) for v in (floor[j, i], None)])
-    padded, weights = np.pad(sums, ((0, 0), (1, 1), (1, 1))), (0.5, 1.0, 0.5)
-    total, n = sum(
-        weights[b] * weights[a] * padded[:, b : b + h, a : a + w] for b in range(3) for a in range(3)
-    )
-    out[:] = 0.0
-    out[..., 0] = np.divide(total, n, out=np.full((h, w), np.nan), where=n > 0)
+@njit
+def _moments_of_floor(floor, lowest, level, left, bottom, out, out_left, out_bottom):
+    """The same of `floor` over the measured cells of each block of the coarsest level, and sums of its squares."""
+    size = 1 << level
+    for j in range(floor.shape[0]):
+        for i in range(floor.shape[1]):
+            if lowest[j, i] < np.inf:
+                x = ((i + left) & (size - 1)) + 0.5 - 0.5 * size
+                y, z = ((j + bottom) & (size - 1)) + 0.5 - 0.5 * size, np.float64(floor[j, i])
+                block = out[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
+                for k, value in enumerate((1.0, x, y, x * x, x * y, y * y, z, x * z, y * z, z * z)):
+                    block[k] += value
+
+
+@njit
+def _coarsest(moments, size, steep, planes):
+    """Level planes at the mean of the floor of 3 x 3 blocks; the plane nearest to it where it is steep and near to one."""
+    h, w = moments.shape[:2]
+    sums = np.empty(9)
+    for j in range(h):
+        for i in range(w):
+            sums[:], squares = 0.0, 0.0
+            for b in range(max(j - 1, 0), min(j + 2, h)):
+                for a in range(max(i - 1, 0), min(i + 2, w)):
+                    weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
+                    _add(sums, moments[b, a], (a - i) * size, (b - j) * size, weight)
+                    squares += weight * moments[b, a, 9]
+            n = sums[0]
+            planes[j, i, 0], planes[j, i, 1], planes[j, i, 2] = np.nan, 0.0, 0.0
+            if n == 0.0:
+                continue
+            x, y, z = sums[1] / n, sums[2] / n, sums[6] / n
+            planes[j, i, 0] = z
+            if n < _MEASURED * 4.0 * size * size:
+                continue
+            stiff = _STIFFNESS * size * size
+            xx, yy, xy = sums[3] / n - x * x + stiff, sums[5] / n - y * y + stiff, sums[4] / n - x * y
+            xz, yz = sums[7] / n - x * z, sums[8] / n - y * z
+            determinant = xx * yy - xy * xy
+            gx, gy = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
+            if np.sqrt(gx * gx + gy * gy) >= steep and gx * xz + gy * yz >= _PLANE * (squares / n - z * z):
+                planes[j, i, 0] = z - gx * x - gy * y
+                planes[j, i, 1], planes[j, i, 2] = gx, gy
 
 
 @njit
@@ -203,8 +237,11 @@ def _fit(moments, size, planes):
             planes[j, i, 2] = along + gy
 
 
-def planes_of_blocks(raster: GroundRaster, levels: int) -> Planes:
-    """Planes of blocks of 2 x 2 cells, through the ground of a raster; there are `levels` coarser levels, at least 1."""
+def planes_of_blocks(raster: GroundRaster, levels: int, steep: float = np.inf) -> Planes:
+    """Planes of blocks of 2 x 2 cells, through the ground of a raster; there are `levels` coarser levels, at least 1.
+
+    Those of the coarsest level are not level where what lies below objects rises by `steep` meters per cell or more.
+    """
     h, w = raster.shape
     moments: list[np.ndarray] = []
     spans = [(raster.left, raster.bottom)]
@@ -220,7 +257,9 @@ def planes_of_blocks(raster: GroundRaster, levels: int) -> Planes:
         moments.append(made)
         spans.append((low_a, low_b))
     planes = np.empty((h, w, 3))
-    _coarsest(raster.floor, raster.lowest, *spans[0], levels, planes, *spans[levels])
+    made = np.zeros((h, w, 10))
+    _moments_of_floor(raster.floor, raster.lowest, levels, *spans[0], made, *spans[levels])
+    _coarsest(made, 2.0**levels, steep, planes)
     for level in range(levels, 0, -1):
         made = moments.pop()
         if level < levels:
