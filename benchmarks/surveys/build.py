@@ -1,4 +1,4 @@
-"""Train a shipped model from the open clouds; the same bits every time.
+"""Train a shipped model from the open clouds; the same bits every time, as long as the stages compute the same.
 
 python benchmarks/surveys/build.py --data DIR --out pdal_stages/models/standard.model
 """
