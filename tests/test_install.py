@@ -136,7 +136,8 @@ def test_torch():
 
 
 def test_skips_that_must_not_happen_fail(tmp_path):
-    shutil.copy(ROOT / "tests/conftest.py", tmp_path)
+    for name in ("conftest.py", "block_scene.py"):
+        shutil.copy(ROOT / "tests" / name, tmp_path)
     (tmp_path / "test_skips.py").write_text(SKIPS)
     environment = {
         **os.environ,

@@ -100,7 +100,6 @@ OVERRIDES = {
     f"--{FEATURES}.neighborhoods=": "is an empty list",
 }
 USAGE = {
-    "no command": ([], "the following arguments are required"),
     "unknown command": (["pipelines"], "Did you mean 'pipeline'?"),
     "unknown choice": (["classify", "a.las", "out", "--per", "fil"], "Did you mean 'file'?"),
     "options of stages for a model": (["model", "no.model", "--filters.x.y=1"], "takes no stage options"),
