@@ -9,10 +9,11 @@ import sys
 
 def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     code = (
+        "from pdal_stages.base.messages import Progress; Progress.delay = 0.0; "
         "import numpy as np; from pdal_stages.synthetic.townplan import Plan, ground, heights; plan = Plan(1, "
         "np.ones((2, 4)), 0, np.eye(2)); assert ground(3.0, 40.0, plan)[0] == heights(np.array([[3.0, 40.0]]), plan)"
     )
-    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "lines"}
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "1"}
 
     def said(code: str = code) -> str:
         return subprocess.run([sys.executable, "-c", code], env=env, text=True, capture_output=True).stderr
