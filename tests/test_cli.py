@@ -135,3 +135,12 @@ def test_help_fits_a_screen(command, capsys, monkeypatch):
         re.findall(r"--[^ ]*\w+", "\n".join(lines))
     )
     assert bool(flags) == ("--help-all" in lines[-1])
+
+
+def test_no_command_shows_the_help(capsys):
+    shown = []
+    for words in ([], ["--help"]):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        shown.append((ended.value.code, capsys.readouterr().out))
+    assert shown[0] == shown[1] and "classify" in shown[0][1]

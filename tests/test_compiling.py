@@ -22,7 +22,7 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     assert not said()
     for caller in (tmp_path / "kernels").rglob("*.heights-*"):
         caller.unlink()  # and is compiled again, with what it calls from the cache
-    assert "Traceback" not in said() and list((tmp_path / "kernels").rglob("*.heights-*"))
+    assert "compiling for this processor, once" in said()
     for index in (tmp_path / "kernels").rglob("*.nbi"):
         index.write_bytes(b"damaged")
     assert "Traceback" not in said("import os; os.environ['PDAL_STAGES_PROGRESS'] = '0'; " + code)

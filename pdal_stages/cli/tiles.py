@@ -263,12 +263,14 @@ def check_reports(options: argparse.Namespace) -> None:
 
 def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
     """Write reports; the exit code. `again`: of an interrupted run, how to go on."""
+    told = run.to_dict()
     for name in filter(None, [options.metadata, *options.report]):
-        text = json.dumps(run.to_dict(), indent=1) + "\n"
         if name in options.report and Path(name).suffix.lower() != ".json":
             from ..reports.runpage import run_page
 
-            text = run_page(run.to_dict())
+            text = run_page(told)
+        else:
+            text = json.dumps(told, indent=1) + "\n"
         write_whole(name, text.encode(), "report")
     if not again:
         return 1 if run.failures else 0

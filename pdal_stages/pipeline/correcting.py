@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import checks
+from ..base.arrays import places_among
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
 from ..base.las import LEGACY_LIMIT
@@ -185,8 +186,7 @@ def partners(
         ordered = named[orders[-1]]
         # The first of a place is paired with the first of the same place, and so on.
         keys.append(ordered * max(n, m) + np.arange(len(ordered)) - np.searchsorted(ordered, ordered))
-    at = np.searchsorted(keys[1], keys[0]).clip(None, m - 1)  # both ascend
-    there = keys[1][at] == keys[0]
+    at, there = places_among(keys[1], keys[0])
     out[orders[0][there]] = orders[1][at[there]]
     left = np.ones(m, bool)
     left[out[out >= 0]] = False

@@ -20,7 +20,7 @@ from ..stages import preparation
 from ..stages.base import Stage, stage_type, stage_types
 from ..stages.points import MAKERS
 from . import pdal as pdal_env
-from .las_output import check_copc, check_writers, files_with_flags_to_split, flag_splitter
+from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
 from .read import PipelineSource, is_reader, reader_files
 from .runtime import TRAMPOLINE, made, place, python_filter
 
@@ -58,7 +58,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
     stages = [copy.deepcopy(one) if isinstance(one, dict) else {"filename": one} for one in source.stages]
     places = [source.where(number) for number in range(len(stages))]
     _refuse_several_ends(stages, places)
-    check_copc(stages)
+    check_copc_outputs(stages)
     out = Expanded([], warnings=unread_extra_dimensions(stages))
     flags = _flags_to_split(stages) if whole else []
     last_reader = max((n for n in range(len(stages)) if is_reader(stages, n)), default=None)

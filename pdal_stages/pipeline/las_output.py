@@ -102,7 +102,7 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[s
     return what, f"Give writers.las {_AS_LAS_14}"
 
 
-def check_copc(stages: list[dict[str, Any]]) -> None:
+def check_copc_outputs(stages: list[dict[str, Any]]) -> None:
     """Refuse a plain LAZ file under the name of a COPC file."""
     for stage in stages:
         name, kind = str(stage.get("filename", "")), stage.get("type", "")
