@@ -18,6 +18,7 @@ from ..base.errors import StageError, suggest
 from ..base.files import Output, check_outputs
 from ..base.messages import LoggedStream, PlainStream, RunLog, print_messages
 from ..base.version import __version__
+from .watcher import watched
 
 #: Modules and their commands, which are imported for these alone; for ``commands`` all are.
 _COMMANDS = {
@@ -37,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
     arguments = [word for word in arguments if word != "--debug"]
+    ended = watched(arguments) if argv is None else lambda: None
     if argv is None:
         # Those threads spin while they wait, for next to nothing.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -74,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print_messages(str(error if isinstance(error, StageError) else _unforeseen(error)))
     finally:
+        ended()
         if log is not None:
             log.end(code)
         sys.stdout, sys.stderr = streams
