@@ -51,6 +51,6 @@ def _death(arguments: Sequence[str]) -> StageError:
     return StageError(
         "the process died in the midst of its work, and no output was completed after that",
         found=one_line(shlex.join(["pdal-stages", *arguments])),
-        cure="Either it was killed, as the system does where memory runs out: work in tiles (classify --tile). Or PDAL crashed, as "
-        "it does on damaged LAZ or COPC points: try the inputs one by one with 'pdal info --stats'",
+        cure="Where memory ran out, the system killed it: work in tiles (classify --tile). Or PDAL crashed, as it does on "
+        "damaged LAZ or COPC points: try the inputs one by one with 'pdal info --stats'",
     )
