@@ -34,7 +34,7 @@ def stages(source, kind, target, **more):
 @pytest.mark.parametrize("more", [{}, {"inputs": ["in"]}], ids=["", "inputs"])
 def test_no_ground_is_an_error(tmp_path, kind, more):
     if pdal_env.version() >= (2, 9, 0):
-        pytest.skip("this PDAL goes on without ground")
+        pytest.skip("PDAL 2.9 and newer go on without ground")
     job = ps.Pipeline(
         stages(write(tmp_path / "a.las", [1] * 90 + [5] * 10), kind, tmp_path / "o.las", **more)
     )

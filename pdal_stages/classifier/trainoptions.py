@@ -135,7 +135,7 @@ class TrainingOptions(Settings):
     base: Any = setting(
         None,
         "model",
-        "A model to build on, which takes few labels; classes that the labels lack keep its answer",
+        "A model to build on, so that few labels do; it still decides on classes that the labels lack",
     )
     algorithm: str = setting(
         "random_forest",

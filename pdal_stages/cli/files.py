@@ -25,18 +25,18 @@ def add_commands(parser: Parser) -> None:
     takes("--html", metavar="FILE", help="Web page to write (default: beside the vector file)")
     takes("--json", metavar="FILE", help="Write figures to a JSON file")
     takes(
-        "--share", type=float, default=0.95, metavar="SHARE", help="Share of expected errors to list (0.95)"
+        "--share", type=float, default=0.95, metavar="SHARE", help="Share of expected errors to cover (0.95)"
     )
     takes("--cell", type=float, default=0.0, metavar="METERS", help="Side of the cells (default: by density)")
     takes("--workers", type=int, default=1, metavar="N", help="Files to read at the same time (default: 1)")
-    takes("--model", default="standard", help="Model to ask where files have no Reliability")
+    takes("--model", default="standard", help="Model for files without Reliability (default: standard)")
 
-    what = "Mark what a person corrected or confirmed, for train"
+    what = "Mark points that a person corrected or confirmed, to train on"
     takes = parser.command("corrections", _corrections, what)
-    takes("before", help="The file as it was classified (LAS or LAZ)")
-    takes("after", nargs="?", help="The same points, in any order, as the person left them")
-    takes("--out", required=True, metavar="FILE", help="File to write: the new classes, and Checked")
-    area = "Polygons in which everything was checked (from review: where 'done' is 1)"
+    takes("before", help="LAS or LAZ file as classified")
+    takes("after", nargs="?", help="The same points after a person's corrections, in any order")
+    takes("--out", required=True, metavar="FILE", help="File to write: new classes, and Checked")
+    area = "Polygons in which all points were checked; of review's file, those with 'done' 1"
     takes("--area", action="append", default=[], metavar="FILE", help=area)
     takes("--around", type=float, default=1.0, metavar="METERS", help="Radius checked around changes (1)")
 

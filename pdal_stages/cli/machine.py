@@ -22,16 +22,16 @@ _TYPES = {int: "integer", float: "number"}
 
 def add_commands(parser: Parser) -> None:
     """``drivers``, ``options``, ``commands``, ``doctor``, ``plugin``, ``demo`` and ``warmup``."""
-    takes = parser.command("drivers", _drivers, "List stages: ours, then PDAL's")
-    takes("--ours", action="store_true", help="Only ours")
+    takes = parser.command("drivers", _drivers, "List all stages: ours, then PDAL's")
+    takes("--ours", action="store_true", help="Only our stages")
     takes("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
 
     takes = parser.command("options", _options, "List the options of a stage")
-    takes("stage", help="e.g. filters.hag_minima; for PDAL's stages pdal --options is asked")
+    takes("stage", help="One of ours or PDAL's, e.g. filters.hag_minima")
     takes("--showjson", action="store_true", help="As JSON Schema")
 
     takes = parser.command("commands", partial(_commands, parser), "List commands with their arguments")
-    told = "As JSON, with stages, models and classes, to build dialogs from"
+    told = "As JSON, with stages, models and classes, for programs that build dialogs"
     takes("--showjson", action="store_true", help=told)
 
     parser.command("doctor", _doctor, "Check what is installed, and say how to get what is missing")
@@ -39,20 +39,20 @@ def add_commands(parser: Parser) -> None:
     parser.command("plugin", _plugin, "Build our stages into PDAL itself, for all programs that use it")
     command = parser.commands["plugin"]
     what = command.add_mutually_exclusive_group(required=True)
-    what.add_argument("--install", action="store_true", help="Compile it and put it beside filters.python")
+    what.add_argument("--install", action="store_true", help="Compile them, beside filters.python")
     what.add_argument("--check", action="store_true", help="Say what is there and what is missing")
-    what.add_argument("--uninstall", action="store_true", help="Remove it")
-    folder = "Another folder; PDAL_DRIVER_PATH must name it and that of filters.python"
+    what.add_argument("--uninstall", action="store_true", help="Remove them")
+    folder = "Another folder; PDAL_DRIVER_PATH must name it and the folder of filters.python"
     command.add_argument("--folder", type=Path, metavar="DIR", help=folder)
 
     takes = parser.command("demo", _demo, "Make a town, train on one half, classify the other", logged=True)
-    takes("folder", nargs="?", default="pdal-stages-demo", help="Where results go")
-    takes("--size", type=float, default=200.0, help="Side of the town in meters")
-    takes("--density", type=float, default=7.0, help="Points per square meter")
-    takes("--seed", type=int, default=1, help="Another number makes another town")
+    takes("folder", nargs="?", default="pdal-stages-demo", help="Folder for the results (pdal-stages-demo)")
+    takes("--size", type=float, default=200.0, help="Side of the town in meters (200)")
+    takes("--density", type=float, default=7.0, help="Points per square meter (7)")
+    takes("--seed", type=int, default=1, help="Another number gives another town (1)")
 
-    takes = parser.command("warmup", _warmup, "Compile the kernels once, so that later runs start at once")
-    takes("--all", action="store_true", help="Also those for kopt, ropt, copt and shape distributions")
+    takes = parser.command("warmup", _warmup, "Compile the kernels now, so that later runs do not wait")
+    takes("--all", action="store_true", help="Also the kernels of kopt, ropt, copt and shape distributions")
 
 
 def _drivers(options: argparse.Namespace) -> None:

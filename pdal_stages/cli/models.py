@@ -25,7 +25,7 @@ def add_commands(parser: Parser) -> None:
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("--model", required=True, help="Model file to write")
     takes_options(takes, "writers.classifiermodel", *_OF_TRAINING)
-    surveys = "Files that are one survey, e.g. north=north/*.laz; any other file is one by itself"
+    surveys = "Files that belong to one survey, e.g. north=north/*.laz; any other file counts as a survey"
     takes("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
 
     tiles.add_sizes(parser.commands["train"])
@@ -34,15 +34,15 @@ def add_commands(parser: Parser) -> None:
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("--model", required=True, help="Model file to write, for classify --model")
     takes("--teacher", default="standard", metavar="MODEL", help="Model to learn from (default: standard)")
-    takes("--sure", type=float, default=0.7, metavar="SHARE", help="Least Reliability to trust (0.7)")
+    takes("--sure", type=float, default=0.7, metavar="SHARE", help="Least Reliability to learn from (0.7)")
     tiles.add_sizes(parser.commands["adapt"])
 
     what = "Compare classes with a reference, points or objects"
     takes = parser.command("accuracy", _accuracy, what, overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("--reference", action="append", metavar="FILE", help="True classes: the same points in their order")
-    takes("--model", help="Score this model, a file or a shipped one, on labeled files")
-    takes("--dimension", default="Classification", metavar="NAME", help="Dimension to judge (Classification)")
+    takes("--model", help="Classify labeled files with this model and score it")
+    takes("--dimension", default="Classification", metavar="NAME", help="Dimension to score (Classification)")
     takes("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
     takes("--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)")
     takes("--area", metavar="FILE", help="With --objects: count only objects inside these polygons")
@@ -51,7 +51,7 @@ def add_commands(parser: Parser) -> None:
 
     takes = parser.command("model", _model, "Describe a model file")
     takes("file", help="A model file or a shipped model")
-    takes("--showjson", action="store_true", help="Everything, as JSON")
+    takes("--showjson", action="store_true", help="Print all of it as JSON")
 
 
 def _models(options: argparse.Namespace) -> None:

@@ -26,13 +26,13 @@ _LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
 
 def add_commands(parser: Parser) -> None:
     """``pipeline``, ``expand`` and ``validate``."""
-    help = "Run a PDAL pipeline that may have our stages"
+    help = "Run a PDAL pipeline, with our stages or without"
     rare = ("file_option", "nostream", "verbose", "scheduler", "per", "buffer")
     takes = parser.command("pipeline", _pipeline, help, overrides=True, logged=True, rare=rare)
     _input(takes)
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     takes("--validate", action="store_true", help="Check without reading points, then stop")
-    takes("--nostream", action="store_true", help="Accepted, as by PDAL; our stages never stream")
+    takes("--nostream", action="store_true", help="Accepted as in PDAL; our stages never stream")
     levels = "PDAL's log: 1 warnings (default), 2 what it does, 3 everything"
     takes("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
     tiles.add_arguments(parser.commands["pipeline"])
@@ -40,14 +40,14 @@ def add_commands(parser: Parser) -> None:
     help = "Print a pipeline as plain PDAL JSON, for stock 'pdal pipeline'"
     takes = parser.command("expand", _expand, help, overrides=True)
     _input(takes)
-    takes("-o", "--output", metavar="FILE", help="Write it to a file instead")
+    takes("-o", "--output", metavar="FILE", help="Write to a file, not to standard output")
 
     _input(parser.command("validate", _validate, "Check a pipeline without reading points", overrides=True))
 
 
 def _input(takes: Callable) -> None:
     takes("file", nargs="?", help="Pipeline JSON file")
-    takes("-i", "--input", dest="file_option", metavar="FILE", help="The same, as PDAL's --input")
+    takes("-i", "--input", dest="file_option", metavar="FILE", help="The same file, as in PDAL")
     takes("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
 
 

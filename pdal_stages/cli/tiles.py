@@ -66,11 +66,11 @@ def add_commands(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="FILE=CODE",
-        help="Class of ground inside polygons, e.g. lakes.gpkg=9; of other classes: bridges.gpkg=17:2,6; may be repeated",
+        help="Class for ground inside polygons, e.g. lakes.gpkg=9; for other classes: bridges.gpkg=17:2,6; may be repeated",
     )
     takes("--objects", metavar="FILE", help="Also write buildings, trees and more to a vector file")
     takes_options(takes, "filters.modelclassifier", "vegetation_heights", "keep_sure")
-    takes("--where", help="Classify only points for which this holds")
+    takes("--where", help="Classify only points that meet this condition")
     takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
     add_arguments(parser.commands["classify"], survey=True)
 
@@ -176,16 +176,16 @@ def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> Non
     takes = add_sizes(command, f"{when} (docs/large-areas.md).")
     takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
     takes("--per", choices=PER, default="auto", help="One output per input or per tile (auto: per input)")
-    around = argparse.SUPPRESS if survey else "What PDAL's own filters need around a tile"
+    around = argparse.SUPPRESS if survey else "How far PDAL's own filters look beyond a tile"
     takes("--buffer", type=float, metavar="METERS", help=around)
     takes("--resume", action="store_true", help="Continue a run that was stopped or failed")
-    takes("--dry-run", action="store_true", help="Show the tiles and what they will take, then stop")
+    takes("--dry-run", action="store_true", help="Show tiles, memory and disk needed, then stop")
     takes("--report", action="append", default=[], metavar="FILE", help="Write a report, .html or .json")
 
 
 def add_sizes(
     command: argparse.ArgumentParser,
-    what: str = "Points that do not fit in memory are read in tiles; the model is the same.",
+    what: str = "Points that do not fit in memory are read in tiles, which give the same model.",
 ) -> Callable:
     """Add the flags of ``train``, whose only output is a model; returns what adds more."""
     takes = command.add_argument_group("large areas", what).add_argument

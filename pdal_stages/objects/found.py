@@ -26,7 +26,7 @@ class ObjectSettings(Settings):
 
     cell: float = _setting(
         0.5,
-        "Side of the grid's cells: about 1.4 times the distance of points, so that few cells of a roof are empty; 1 for 2 "
+        "Side of the grid's cells: about 1.4 times the spacing of points, so that few cells of a roof are empty; 1 for 2 "
         "points/m2",
         0.05,
         100,

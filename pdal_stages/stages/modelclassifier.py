@@ -58,7 +58,7 @@ class ModelClassifier(Stage):
     keep_sure: float | None = option(
         "number",
         None,
-        "Keep only classes sure enough for this share to be right, e.g. 0.98; others become rejected_code, by default 1",
+        "Keep a class only where this share is expected to be right, e.g. 0.98; others get rejected_code (default 1)",
         minimum=0.5,
         maximum=0.999,
     )
