@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import laspy
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages import cli
 from pdal_stages.base.errors import StageError
+from pdal_stages.base.las import records_of
 from pdal_stages.pipeline.correcting import near_any, partners, write_corrections
 from pdal_stages.synthetic import write_town
 
@@ -123,6 +125,18 @@ def test_a_copc_file_becomes_a_plain_one(tmp_path):
     assert made.header.parse_crs() == las.header.parse_crs()
     assert "copc" not in {one.user_id for one in [*made.header.vlrs, *(made.evlrs or [])]}
     assert len(ps.run_pipeline([str(out)]).arrays[0]) == len(las)
+
+
+def test_geotiff_keys_that_are_padded_stay_as_they_are(town, tmp_path):
+    """As they are in old files in feet: laspy counts the padding."""
+    las = laspy.read(town)
+    las.vlrs[:] = [one for one in las.vlrs if one.user_id != "LASF_Projection"]
+    keys = struct.pack("<12H", 1, 1, 0, 1, 3072, 0, 1, 25832, 0, 0, 0, 0)
+    las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "keys", keys))
+    las.write(tmp_path / "b.las")
+    changed_copy(town, tmp_path / "c.las")
+    write_corrections(*(str(tmp_path / f"{name}.las") for name in "bdc"))
+    assert [data for _, data in records_of(tmp_path / "d.las", b"LASF_Projection")] == [keys]
 
 
 @pytest.mark.filterwarnings("ignore:.crs. was not provided")

@@ -123,8 +123,10 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, folder, expected):
     stages = pipeline(folder, tmp_path / "o_#.laz")
     run = command(tmp_path / "job.json", stages, "--workers", "0", preexec_fn=limit)
     _, err = run.communicate(timeout=300)
-    assert run.returncode == 1, err
+    assert run.returncode == 1 and "the temporary file could not be written" in err
+    assert "Make room on the disk" in err and "Move it out of the inputs" not in err  # which are not to blame
     assert not list(tmp_path.glob("o_*")) and not clouds.hidden(tmp_path)
+    assert not [left for left in (tmp_path / ".pdal-stages" / "kept").iterdir() if left.suffix != ".json"]
     assert not run_tiled(stages, 20, workers=0, resume=True, buffer=0.0).failures
     check_same(tmp_path, expected)
 
@@ -364,6 +366,24 @@ def test_a_name_that_is_not_utf8(tmp_path, folder, capsys):
     assert main(["pipeline", str(tmp_path / "job.json"), *words]) == 1
     assert "the name of the file is not UTF-8" in capsys.readouterr().err
     assert all("w\\udce4st" in Path(name).read_text() for name in reports)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--report", "job.json"], "the report file is one of the inputs"),
+        (["--metadata", "job.json"], "the metadata file is one of the inputs"),
+        (["--report", "r.json", "--metadata", "r.json"], "the report file is the metadata file too"),
+        (["--metadata", "o.laz"], "the metadata file is the output file too"),
+    ],
+)
+def test_reports_replace_neither_the_pipeline_nor_an_output(tmp_path, folder, run_job, words, said):
+    words = [str(tmp_path / word) if "." in word else word for word in words]
+    stages = [folder / "west.laz", {"type": "filters.hag_minima"}, tmp_path / "o.laz"]
+    code, _, err = run_job(stages, "--tile", 40, *words)
+    assert code == 1 and said in err
+    assert json.loads((tmp_path / "job.json").read_text())[1:2] == stages[1:2]
+    assert not (tmp_path / "o.laz").exists()
 
 
 # ---- what a run keeps -------------------------------------------------------------------------------------

@@ -36,6 +36,11 @@ def print_messages(*lines: str) -> None:
         print(f"pdal-stages: {line}", file=sys.stderr)
 
 
+def counted(count: int, word: str) -> str:
+    """A number of things: ``1 tile``, ``1,200 tiles``."""
+    return f"{count:,} {word}{'s' * (count != 1)}"
+
+
 class PlainStream:
     """A text stream whose text is :func:`plain`; all else is the stream's."""
 

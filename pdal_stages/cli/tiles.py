@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..base.errors import OptionError, StageError
-from ..base.files import check_writable, write_whole
+from ..base.files import HTML, JSON, Output, write_whole
 from ..base.las import class_name
-from ..base.messages import one_line, print_messages
+from ..base.messages import counted, one_line, print_messages
 from ..base.resources import parse_size
 from ..pipeline.run import LEFT_ALONE
 from ..tiling.report import InterruptedRun, TiledRun
@@ -105,10 +105,8 @@ def _classify(options: argparse.Namespace) -> int:
         request,
         options_of(options),
         metadata=options.metadata or "",
-        log=options.log or "",
-        reports=bool(options.report),
+        beside=tuple(beside(options)),
     )
-    check_reports(options)
     then = None
     if options.objects:
         stage = writer(options.objects, own)
@@ -251,14 +249,15 @@ def end_at_once(options: argparse.Namespace) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def check_reports(options: argparse.Namespace) -> None:
-    """Refuse reports that cannot be written, before any work."""
+def beside(options: argparse.Namespace) -> list[Output]:
+    """The log, the metadata and the reports, which are written beside the outputs."""
+    kinds = {".html": HTML, ".htm": HTML, ".json": JSON}
     for name in options.report:
-        if Path(name).suffix.lower() not in (".html", ".htm", ".json"):
+        if Path(name).suffix.lower() not in kinds:
             raise OptionError("--report writes .html or .json", found=name)
-        check_writable(name, "report")
-    if options.metadata:
-        check_writable(options.metadata, "metadata")
+    reports = [Output(name, "report", kinds[Path(name).suffix.lower()]) for name in options.report]
+    more = [("log", options.log, ""), ("metadata", options.metadata, JSON)]
+    return [*(Output(name, what, kind) for what, name, kind in more if name), *reports]
 
 
 def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
@@ -342,8 +341,3 @@ def print_dry(run: TiledRun) -> None:
         print(f"  and {len(run.tiles) - _MOST_TILES} more")
     print_messages(*run.messages)
     _print_failures(run)
-
-
-def counted(count: int, word: str) -> str:
-    """A number of things, in words."""
-    return f"{count:,} {word}{'s' * (count != 1)}"

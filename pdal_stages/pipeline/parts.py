@@ -112,6 +112,8 @@ def header_of(path: str) -> Any:
     except Exception as error:  # laspy raises many types
         found = f"{type(error).__name__}: {error}"
         raise StageError("the input cannot be read", where=path, found=found) from None
+    for directory in header.vlrs.get("GeoKeyDirectoryVlr"):  # laspy counts what pads the record as keys
+        directory.geo_keys_header.number_of_keys = sum(key.id > 0 for key in directory.geo_keys)
     for records in filter(None, (header.vlrs, header.evlrs)):
         records[:] = [record for record in records if record.user_id != "copc"]
     return header

@@ -17,7 +17,7 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, whole_files
 from ..base.las import read_header
-from ..base.messages import Progress, duration, one_line, print_messages
+from ..base.messages import Progress, counted, duration, one_line, print_messages
 from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
@@ -249,7 +249,7 @@ def review_page(review: Review) -> str:
     return render(
         "review.html",
         title="Where to look",
-        subtitle=f"{len(found['tiles']):,} file{'s' * (len(found['tiles']) > 1)}",
+        subtitle=counted(len(found["tiles"]), "file"),
         figures=figures,
         tiles=found["tiles"][:_ROWS],
         hidden=max(0, len(found["tiles"]) - _ROWS),

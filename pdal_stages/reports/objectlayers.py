@@ -239,7 +239,8 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
             )
         found = pyogrio.read_info(path, layer=named, force_feature_count=True)["features"]
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
-        raise StageError("objects could not be written", found=str(error)) from None
+        what, cure = "the vector file could not be written", "Is there room on the disk?"
+        raise StageError(what, found=str(error), cure=cure) from None
     if found != len(layer.shapes):
         lost = f"{found:,} of {len(layer.shapes):,} {name}"
         raise StageError("objects could not be written completely", found=lost, cure="Make room on the disk")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..base import las
 from ..base.errors import OptionError, StageError
-from ..base.files import JSON, Output, check_outputs, write_whole
+from ..base.files import Output, check_outputs, write_whole
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
 from .report import Job, TiledRun
@@ -37,9 +37,8 @@ class ClassifyTask:
     output: str  #: a file; of several inputs a folder, or a name with ``#`` for the input's
     request: ClassifyRequest = field(default_factory=ClassifyRequest)
     options: TilingOptions = field(default_factory=TilingOptions)
-    metadata: str = ""  #: a file that is written beside
-    log: str = ""  #: another one
-    reports: bool = False  #: whether reports are wanted, which only runs in tiles have
+    metadata: str = ""  #: a file that a run in one piece writes
+    beside: tuple[Output, ...] = ()  #: files that the caller writes, metadata among them
 
     @cached_property
     def files(self) -> list[str]:
@@ -51,7 +50,7 @@ class ClassifyTask:
         """Whether the only input is a file that fits into memory, and nothing asks for tiles."""
         options = self.options
         asked = options.tile is not None or options.per != "auto" or options.scheduler or options.resume
-        if len(self.files) > 1 or asked or self.reports:
+        if len(self.files) > 1 or asked or any(one.what == "report" for one in self.beside):
             return False
         if not is_las(self.files[0]):
             return not is_ept(self.files[0])
@@ -81,17 +80,12 @@ class ClassifyTask:
                 found = f"{folder}: {error.strerror}"
                 raise StageError("the output folder cannot be made", found=found) from None
 
-    @property
-    def _beside(self) -> list[Output]:
-        more = [("log", self.log, ""), ("metadata", self.metadata, JSON)]
-        return [Output(name, what, kind) for what, name, kind in more if name]
-
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
         (source,), (target,) = self.files, self.outputs
         self._make_folders()
         pipeline = self.request.pipeline(source, target)
-        pipeline.check_outputs(*self._beside)
+        pipeline.check_outputs(*self.beside)
         count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
         if self.metadata:
             text = json.dumps(pipeline.metadata, indent=2, default=str) + "\n"
@@ -138,5 +132,6 @@ class ClassifyTask:
         )
         if not dry_run:
             self._make_folders()
-        check_outputs(self._beside, self.files)
+        outputs = [Output(name) for name in self.outputs if Path(name).parent.is_dir()]
+        check_outputs([*outputs, *self.beside], self.files)
         return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)

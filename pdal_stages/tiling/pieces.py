@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import begins_run
+from ..base.files import whole_files
 from ..pipeline.parts import header_of, las_chunks
 from .inputs import CloudIndex, InputSource, fetch_ept
 from .settings import Box, TileGrid, check_number
@@ -27,6 +28,8 @@ if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in o
 
 #: Points of a block: LAZ is compressed in pieces of so many.
 BLOCK = 50_000
+#: What messages call the copy.
+TEMPORARY = "temporary"
 #: Points that are sorted together.
 _PART = 1_000_000
 #: The points are sorted by cells; so many of these make up the side of a tile.
@@ -66,7 +69,7 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     tiles: Counter[tuple[int, int]] = Counter()
     found = []
     total = 0
-    with open(f"{target}.partial", "wb") as out:
+    with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
         for records in record_blocks(path, most=_PART):
             x, y = coordinates(records, header)
             low = np.minimum(low, (x.min(), y.min()))
@@ -86,7 +89,6 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
             found += made
             total += len(records)
-    os.replace(f"{target}.partial", target)
     box = [*low.tolist(), *high.tolist()]
     return {"count": total, "box": box, "tiles": [(*t, n) for t, n in sorted(tiles.items())], "cells": found}
 

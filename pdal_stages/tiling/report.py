@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from ..base.messages import counted
 from ..base.version import __version__
 from ..pipeline.run import LEFT_ALONE
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
@@ -93,8 +94,8 @@ class TiledRun:
         if not tiles and not outputs:
             return ""
         return (
-            f" ({tiles} tiles and {outputs} outputs are not made because of it. Move it out of the inputs to make them "
-            "without it)"
+            f" ({counted(tiles, 'tile')} and {counted(outputs, 'output')} are not made because of it. Move it out of the "
+            "inputs to make them without it)"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -159,7 +160,7 @@ def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> 
     # What one stage says and several say, too.
     for text in [text for text in found if text.partition(": ")[2] in found]:
         del found[text]
-    told = [f"{text} ({n} tile{'s' * (n != 1)})" for text, n in found.most_common(_MOST_MESSAGES)]
+    told = [f"{text} ({counted(n, 'tile')})" for text, n in found.most_common(_MOST_MESSAGES)]
     if len(found) > _MOST_MESSAGES:
         told.append(f"and {len(found) - _MOST_MESSAGES} more; see --report")
     if short := [job.name for job in done if job.record.get("short")]:

@@ -27,7 +27,7 @@ from ..terrain.cells import refuse_scattered
 from .ground import BlockTask, FirstRoundTask, block_name, blocks_around, from_before, left_name
 from .inputs import CloudIndex, InputSource, Survey
 from .outputs import FileTask
-from .pieces import sort_points
+from .pieces import TEMPORARY, sort_points
 from .plan import TilePlan, make_plan, outputs_for
 from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .settings import TilingOptions, worker_bytes
@@ -243,6 +243,8 @@ class _Run:
         for job in self._do("reading the inputs", waiting, task_of):
             assert job.source is not None
             path = job.source.path
+            if f"the {TEMPORARY} file" in job.reason:  # for which the input is not to blame
+                raise StageError(job.reason)
             if job.reason:
                 survey.unreadable[path] = job.reason
                 continue
