@@ -83,7 +83,7 @@ def write_corrections(
     with whole_files(output) as (part,):
         las.write(str(part))
     lines = [
-        f"{len(codes):,} points, {changed.sum():,} changed, {checked.sum():,} checked ({checked.mean():.2%})"
+        f"{len(codes):,} points, {changed.sum():,} changed, {checked.sum():,} checked ({100 * checked.mean():.2f} %)"
     ]
     moves = Counter(zip(codes[changed].tolist(), new[changed].tolist(), strict=True))
     lines += [f"  {one} became {other}{n:>14,}" for (one, other), n in moves.most_common()]
@@ -154,7 +154,7 @@ def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> 
             cure="Check its reference system; GeoJSON without one is in degrees",
         )
     inside = points_inside(x, y, shapes)
-    told = f"{inside.sum():,} points lie in the {len(shapes):,} polygons of {file} that were looked at"
+    told = f"{inside.sum():,} points lie in the polygons of {file} that were looked at"
     notes += [*filter(None, [note]), told]
     return inside
 

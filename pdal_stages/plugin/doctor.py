@@ -120,7 +120,7 @@ def _python_of(what: str, run: Callable[[list], object]) -> Finding:
 def _plugin() -> Iterator[Finding]:
     good, bad = building.check()
     if bad:
-        cure = "pdal-stages plugin --check; not needed by pdal-stages"
+        cure = "pdal-stages plugin --install; pdal-stages itself does not need it"
         what = "native stages (pdal pipeline knows our names)"
         yield Finding(what, bad[-1].split(". ")[0], cure, needed=False)
     else:
