@@ -270,7 +270,9 @@ def slow_roofs(ground, raster, cell):
             others += not walls and bool(beside or near)
             creased += near
         rim = len(feet) >= 0.5 * (len(feet) + others) and len(directions) >= 10 and high >= 1.8
-        if rim and creased <= 0.4 * len(members):
+        plane = np.column_stack([cell * at, np.ones(len(at))])
+        tilt = np.hypot(*np.linalg.lstsq(plane, [cells[c] for c in map(tuple, at)])[0][:2])
+        if rim and tilt < 0.4 and creased <= 0.4 * len(members):
             below |= dict.fromkeys(members, np.mean(feet))
     beside = {c: [below[b] for b in square(c, reach) if b in below] for c in creases}
     below |= {c: min(levels) for c, levels in beside.items() if levels}
@@ -296,6 +298,15 @@ def test_roofs_of_hillsides_equal_the_slow_reference(seed, cell):
     assert [found[at] for at in want] == pytest.approx(list(want.values()), abs=1e-4)
     part = roofs_of_hillsides(ground[:, 40:], raster[:, 40:], cell)
     assert np.array_equal(part[:, 50:], found[:, 90:])
+
+
+@pytest.mark.parametrize(("tilt", "roof"), [(0.0, True), (0.3, True), (0.5, False)])
+def test_what_is_tilted_as_a_steep_slope_is_no_roof(tilt, roof):
+    j, i = np.mgrid[:44, :60]
+    lifted = (abs(j - 22) < 7) & (abs(i - 30) < 8)
+    raster = (0.6 * j + np.where(lifted, 4 - (0.6 - tilt) * (j - 22), 0)).astype(np.float32)
+    found = np.isfinite(roofs_of_hillsides(np.ones(raster.shape, bool), raster, 1.0))
+    assert found[lifted].mean() > 0.9 if roof else not found.any()
 
 
 def test_a_roof_is_no_ground_whatever_its_width_and_steps():

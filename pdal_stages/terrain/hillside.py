@@ -2,8 +2,8 @@
 
 Cells are linked where one can walk from one to the next, but not across creases, where the surface bends upward: between a
 roof and the slope. A set of linked cells is a roof if it is as large as a house, if walls go down from it in most directions
-and along most of its rim, and if few of its cells are next to creases. Terraces are longer, knolls have no walls, and rocks
-are full of creases.
+and along most of its rim, if few of its cells are next to creases, and if it is level on the whole, flat or gabled.
+Terraces are longer, knolls have no walls, rocks are full of creases, and what lies on a steep slope is tilted as that is.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ DROP, WALL, BEYOND, HIGH = 1.0, 1.0, 2.0, 1.8
 #: Walls are in so many of 16 directions from the middle, and along such a share of what of the rim is not at a hole; such a
 #: share of the cells may be next to creases.
 DIRECTIONS, SHARE, CREASED = 10, 0.5, 0.4
+#: The plane through a roof rises by less than this, in meters per meter.
+LEVEL = 0.4
 
 
 @njit
@@ -87,6 +89,22 @@ def _rims(number, asked, creases, ground, raster, cell, sums, sectors, rims, low
             low[k, 1] = max(low[k, 1], most)
 
 
+def _slopes(
+    number: NDArray[np.int64], asked: NDArray[np.bool_], sums: NDArray[np.int64], raster: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Rise per cell of the plane through each set of cells (n,); 0 where it is not asked for, or all lie on a line."""
+    rows, columns = np.nonzero(np.append(asked, False)[number])
+    sets, z = number[rows, columns], raster[rows, columns].astype(np.float64)
+    size = sums[:, 2]
+    # From the middle, times the set's size: whole numbers, the same wherever the array begins.
+    v, u = (
+        (at * size[sets] - sums[sets, axis]).astype(np.float64) for axis, at in enumerate((rows, columns))
+    )
+    uu, uv, vv, uz, vz = (np.bincount(sets, a, len(size)) for a in (u * u, u * v, v * v, u * z, v * z))
+    determinant = np.maximum(uu * vv - uv * uv, 1.0)
+    return size * np.hypot(uz * vv - vz * uv, vz * uu - uz * uv) / determinant
+
+
 def roofs_of_hillsides(
     ground: NDArray[np.bool_], raster: NDArray[np.float32], cell: float
 ) -> NDArray[np.float32]:
@@ -104,10 +122,12 @@ def roofs_of_hillsides(
     grounds = np.bincount(number[ground & ~creases], minlength=count)
     asked = (grounds > FOOTING * size) & (side * cell < WIDEST) & (size * cell * cell >= SMALLEST)
     sectors, rims, low = np.zeros((count, 16), bool), np.zeros((count, 3), np.int64), np.zeros((count, 2))
-    _rims(number, asked, creases, ground, raster, cell, sums_of_sets(number, size), sectors, rims, low)
+    sums = sums_of_sets(number, size)
+    _rims(number, asked, creases, ground, raster, cell, sums, sectors, rims, low)
     walls, others, creased = rims.T
     roof = asked & (sectors.sum(axis=1) >= DIRECTIONS) & (walls >= SHARE * (walls + others))
     roof &= (creased <= CREASED * size) & (low[:, 1] >= HIGH)
+    roof &= _slopes(number, roof, sums, raster) < LEVEL * cell
     if not roof.any():
         return np.full(raster.shape, HOLE)
     below = np.append(np.where(roof, low[:, 0] / np.maximum(walls, 1), HOLE), HOLE)[number].astype(np.float32)
