@@ -11,6 +11,7 @@ import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
 from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain.cells import SIDE as BLOCK_SIDE
 from pdal_stages.terrain.cells import lowest_of_cells
 from pdal_stages.terrain.groundblocks import (
     GroundCells,
@@ -19,7 +20,7 @@ from pdal_stages.terrain.groundblocks import (
     cells_of_block,
     reach_of_block,
 )
-from pdal_stages.terrain.groundcells import BLOCK_SIDE, FilterOptions
+from pdal_stages.terrain.groundcells import FilterOptions
 from pdal_stages.tiling import tile
 from pdal_stages.tiling.ground import FirstRoundTask
 

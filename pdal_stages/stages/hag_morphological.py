@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..terrain.cells import SIDE
 from ..terrain.groundblocks import GroundCells, around_blocks, by_block, cells_of_block, reach_of_block
-from ..terrain.groundcells import BLOCK_SIDE, FilterOptions
+from ..terrain.groundcells import FilterOptions
 from ..terrain.morphological import filtered_ground
 from ..terrain.openings import opening_names
 from .base import HEIGHTS_OUTSIDE, Stage
@@ -125,7 +126,7 @@ class HagMorphological(Stage):
         """How far the rounds before the tiles reach; all that a point's height depends on is in cells."""
         cell = self.cell
         reach = (reach_of_block(self._filter) + 2) * cell
-        return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
+        return Blocks(SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
 
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """First, what blocks need of the points ``around`` them, and those (n, 3) inside each (:func:`inside_block`)."""

@@ -6,6 +6,7 @@ Points are cut into pieces whose rasters are small wherever points lie: groups f
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +29,41 @@ LARGEST, SIDE = 2100 * 2100, 1024
 _EMPTY, _FEW = 32, 1 << 16
 #: Blocks along the way that links two points.
 _PARTS = 4
+
+
+class CellWindow(NamedTuple):
+    """Cells from a column and row on."""
+
+    left: int
+    bottom: int
+    width: int
+    height: int
+
+    @classmethod
+    def round(cls, column: NDArray[np.int64], row: NDArray[np.int64]) -> CellWindow:
+        """The smallest one round some cells."""
+        left, bottom = int(column.min()), int(row.min())
+        return cls(left, bottom, int(column.max()) + 1 - left, int(row.max()) + 1 - bottom)
+
+    def grown(self, by: int) -> CellWindow:
+        """So many cells more on every side."""
+        return CellWindow(self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by)
+
+    def holds(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which cells lie in it."""
+        inside = (column >= self.left) & (column < self.left + self.width)
+        return inside & (row >= self.bottom) & (row < self.bottom + self.height)
+
+    def numbers(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Numbers of cells in it, row by row."""
+        return (row - self.bottom) * self.width + column - self.left
+
+    def on(self, left: int, bottom: int, h: int, w: int) -> tuple[slice, slice]:
+        """Rows and columns of what of it lies on a raster."""
+        i, j = self.left - left, self.bottom - bottom
+        (j0, j1), (i0, i1) = np.clip((j, j + self.height), 0, h), np.clip((i, i + self.width), 0, w)
+        return slice(int(j0), int(j1)), slice(int(i0), int(i1))
+
 
 _Piece = tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]
 
@@ -234,20 +270,20 @@ def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link:
     points that no chain of others connects with steps of at most `link` cells. One piece, all points, where the whole
     is small enough.
     """
-    cells = _cells(column, row)
-    if cells <= min(LARGEST, _FEW + _EMPTY * len(column)):
+    window = CellWindow.round(column, row)
+    if window.width * window.height <= min(LARGEST, _FEW + _EMPTY * len(column)):
         yield slice(None), slice(None)
         return
     groups = _groups(column, row, link)
     refuse_scattered(len(column), len(groups))
     for group in groups:
         c, r = column[group], row[group]
-        if _cells(c, r) <= LARGEST:
+        window = CellWindow.round(c, r)
+        if window.width * window.height <= LARGEST:
             yield group, slice(None)
             continue
         for own in runs(keys_of(c // SIDE, r // SIDE)):
-            west, east, south, north = c[own].min(), c[own].max(), r[own].min(), r[own].max()
-            inside = (c >= west - reach) & (c <= east + reach) & (r >= south - reach) & (r <= north + reach)
+            inside = CellWindow.round(c[own], r[own]).grown(reach).holds(c, r)
             near, mine = np.flatnonzero(inside), np.zeros(len(c), bool)
             mine[own] = True
             for part in _groups(c[near], r[near], link):
@@ -263,11 +299,6 @@ def refuse_scattered(points: int, places: int) -> None:
             found=f"{points:,} points in {places:,} places",
             cure="Look whether the file's scale and unit are right: pdal info --summary FILE",
         )
-
-
-def _cells(column: NDArray[np.int64], row: NDArray[np.int64]) -> int:
-    """Cells of the smallest raster round points."""
-    return (int(column.max()) - int(column.min()) + 1) * (int(row.max()) - int(row.min()) + 1)
 
 
 def _groups(column: NDArray[np.int64], row: NDArray[np.int64], link: int) -> list[NDArray[np.int64]]:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 from .cells import (
+    CellWindow,
     cell_numbers,
     keys_of,
     levels,
@@ -254,9 +255,9 @@ def levels_near_decks(
     if len(z):
         for points, own in patches(column, row, int(REACH), FAR + AHEAD):
             c, r = column[points], row[points]
-            left, bottom = int(c.min()), int(r.min())
-            h, w = int(r.max()) + 1 - bottom, int(c.max()) + 1 - left
-            cell = (r - bottom) * w + c - left
+            window = CellWindow.round(c, r)
+            left, bottom, w, h = window
+            cell = window.numbers(c, r)
             order, begins = levels(z[points], cell)
             lowest = order[begins]
             heights, cell = z[points][lowest], cell[lowest]

@@ -9,19 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import HIGHEST, HOLE, cell_numbers, keys_of, lowest_of_cells, runs
+from .cells import HIGHEST, HOLE, SIDE, CellWindow, cell_numbers, keys_of, lowest_of_cells, runs
 from .decks import CELL, decks_of_levels, level_points, levels_near_decks
-from .groundcells import (
-    BLOCK_SIDE,
-    NEAR,
-    CellMeans,
-    CellWindow,
-    FilterOptions,
-    GroundPoints,
-    add_ground,
-    ground_raster,
-    means_of,
-)
+from .groundcells import NEAR, CellMeans, FilterOptions, GroundPoints, add_ground, ground_raster, means_of
 from .planes import GroundRaster, around, heights_above, surface
 from .planes import reach as planes_reach
 
@@ -108,9 +98,9 @@ def by_block(
     use: NDArray[np.bool_],
     cell: float,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them; meters."""
+    """Those of points that may be ground (m, 3) by the block of `SIDE` cells that holds them; meters."""
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
-    column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
+    column, row = (cell_numbers(axis[mine], cell) // SIDE for axis in (x, y))
     parts = runs(keys_of(column, row))
     return {
         (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[mine[p]] for axis in (x, y, z)])
@@ -141,13 +131,13 @@ def cells_of_block(
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
 ) -> GroundCells:
-    """The cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
+    """The cells of a block, column and row of a grid of blocks of `SIDE` cells.
 
     `outer` is (n, 4) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the block, and few more.
     `points` are all that may be ground in the block, in parts (n, 3).
     """
     x, y, z, top = np.ascontiguousarray(outer.T)
-    own = CellWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+    own = CellWindow(block[0] * SIDE, block[1] * SIDE, SIDE, SIDE)
     cell, openings = options.cell, options.opening_radii
     # Openings reach into cells without points.
     spill = max([*openings, 0]) + 2

@@ -18,7 +18,7 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.jit import njit
 from .belowground import pits, pits_reach
-from .cells import HOLE, SIDE, cell_numbers, lowest_points
+from .cells import HOLE, CellWindow, cell_numbers, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .hillside import roofs_of_hillsides
@@ -32,8 +32,6 @@ NEAR, FAR = 8.0, 32.0
 _MOST_CELLS = 300
 #: How often ground is regained; on slopes (rise over run) that are steeper, from there on, from sloping planes.
 ROUNDS, STEEP = 3, 0.5
-#: Cells along the side of a block.
-BLOCK_SIDE = SIDE
 
 
 @dataclass(frozen=True)
@@ -134,30 +132,6 @@ _PARTS = 2.0**20
 CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
-class CellWindow(NamedTuple):
-    """Cells from a column and row on."""
-
-    left: int
-    bottom: int
-    width: int
-    height: int
-
-    def grown(self, by: int) -> CellWindow:
-        """So many cells more on every side."""
-        return CellWindow(self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by)
-
-    def holds(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which cells lie in it."""
-        inside = (column >= self.left) & (column < self.left + self.width)
-        return inside & (row >= self.bottom) & (row < self.bottom + self.height)
-
-    def on(self, left: int, bottom: int, h: int, w: int) -> tuple[slice, slice]:
-        """Rows and columns of what of it lies on a raster."""
-        i, j = self.left - left, self.bottom - bottom
-        (j0, j1), (i0, i1) = np.clip((j, j + self.height), 0, h), np.clip((i, i + self.width), 0, w)
-        return slice(int(j0), int(j1)), slice(int(i0), int(i1))
-
-
 class GroundPoints(NamedTuple):
     """Points with finite coordinates in meters (n,) each, and the cells they fall in."""
 
@@ -179,11 +153,6 @@ class GroundPoints(NamedTuple):
         """Part of them."""
         return GroundPoints._make(values[which] for values in self)
 
-    def window(self) -> CellWindow:
-        """The cells round them."""
-        left, bottom = int(self.column.min()), int(self.row.min())
-        return CellWindow(left, bottom, int(self.column.max()) + 1 - left, int(self.row.max()) + 1 - bottom)
-
 
 def ground_raster(
     points: GroundPoints, options: FilterOptions, margin: int = 1, wanted: CellWindow | None = None
@@ -194,10 +163,11 @@ def ground_raster(
     cells are `wanted`, the raster holds these and as many around as steps still look at, when that is known.
     """
     x, y, z, top, use, deck, column, row = points
-    left, bottom, w, h = points.window().grown(margin)
+    window = CellWindow.round(column, row).grown(margin)
+    left, bottom, w, h = window
     shape = h, w
     mine = np.flatnonzero(use)
-    inside = (row[mine] - bottom) * w + column[mine] - left
+    inside = window.numbers(column[mine], row[mine])
     low = lowest_points(x[mine], y[mine], z[mine], inside, h * w).reshape(shape)
     lowest = np.append(mine, -1)[low]
     cell = options.cell

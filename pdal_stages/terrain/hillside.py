@@ -89,22 +89,6 @@ def _rims(number, asked, creases, ground, raster, cell, sums, sectors, rims, low
             low[k, 1] = max(low[k, 1], most)
 
 
-def _slopes(
-    number: NDArray[np.int64], asked: NDArray[np.bool_], sums: NDArray[np.int64], raster: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    """Rise per cell of the plane through each set of cells (n,); 0 where it is not asked for, or all lie on a line."""
-    rows, columns = np.nonzero(np.append(asked, False)[number])
-    sets, z = number[rows, columns], raster[rows, columns].astype(np.float64)
-    size = sums[:, 2]
-    # From the middle, times the set's size: whole numbers, the same wherever the array begins.
-    v, u = (
-        (at * size[sets] - sums[sets, axis]).astype(np.float64) for axis, at in enumerate((rows, columns))
-    )
-    uu, uv, vv, uz, vz = (np.bincount(sets, a, len(size)) for a in (u * u, u * v, v * v, u * z, v * z))
-    determinant = np.maximum(uu * vv - uv * uv, 1.0)
-    return size * np.hypot(uz * vv - vz * uv, vz * uu - uz * uv) / determinant
-
-
 def roofs_of_hillsides(
     ground: NDArray[np.bool_], raster: NDArray[np.float32], cell: float
 ) -> NDArray[np.float32]:
@@ -122,12 +106,15 @@ def roofs_of_hillsides(
     grounds = np.bincount(number[ground & ~creases], minlength=count)
     asked = (grounds > FOOTING * size) & (side * cell < WIDEST) & (size * cell * cell >= SMALLEST)
     sectors, rims, low = np.zeros((count, 16), bool), np.zeros((count, 3), np.int64), np.zeros((count, 2))
-    sums = sums_of_sets(number, size)
-    _rims(number, asked, creases, ground, raster, cell, sums, sectors, rims, low)
+    _rims(number, asked, creases, ground, raster, cell, sums_of_sets(number, size), sectors, rims, low)
     walls, others, creased = rims.T
     roof = asked & (sectors.sum(axis=1) >= DIRECTIONS) & (walls >= SHARE * (walls + others))
     roof &= (creased <= CREASED * size) & (low[:, 1] >= HIGH)
-    roof &= _slopes(number, roof, sums, raster) < LEVEL * cell
+    for k in np.flatnonzero(roof):
+        j, i = np.nonzero(number == k)
+        plane = np.column_stack([j - j[0], i - i[0], np.ones(len(j))])
+        north, east, _ = np.linalg.lstsq(plane, raster[j, i])[0]
+        roof[k] = np.hypot(north, east) < LEVEL * cell
     if not roof.any():
         return np.full(raster.shape, HOLE)
     below = np.append(np.where(roof, low[:, 0] / np.maximum(walls, 1), HOLE), HOLE)[number].astype(np.float32)

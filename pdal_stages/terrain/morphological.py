@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import StageError
 from ..base.resources import map_blocks
-from .cells import HIGHEST, columns, patches
+from .cells import HIGHEST, CellWindow, columns, patches
 from .decks import decks_of_levels, find_decks
 from .groundblocks import GroundCells
 from .groundcells import (
@@ -166,7 +166,7 @@ def _given(
 ) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
     """The same with the ground that was found before, as cells."""
     for of, own in patches(points.column, points.row, 0, options.link):
-        window = points.some(of).window().grown(options.reach_of_cells)
+        window = CellWindow.round(points.column[of], points.row[of]).grown(options.reach_of_cells)
         yield of, own, *cells.on(window, options.opening_radii)
 
 

@@ -123,6 +123,19 @@ def _add(total, m, dx, dy, weight):
     total[8] += weight * m[8] + dy * z
 
 
+@device
+def _sum_around(moments, j, i, size, sums):
+    """Sums of the moments of the 3 x 3 blocks round one, about its center: nearer ones weigh more."""
+    sums[:] = 0.0
+    for b in range(max(j - 1, 0), min(j + 2, moments.shape[0])):
+        for a in range(max(i - 1, 0), min(i + 2, moments.shape[1])):
+            if moments[b, a, 0] > 0:
+                weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
+                _add(sums, moments[b, a], (a - i) * size, (b - j) * size, weight)
+                for k in range(9, len(sums)):
+                    sums[k] += weight * moments[b, a, k]
+
+
 @njit
 def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
     """Moments of the ground of each block of 2 x 2 cells, about its center."""
@@ -165,15 +178,10 @@ def _moments_of_floor(floor, lowest, level, left, bottom, out, out_left, out_bot
 def _coarsest(moments, size, steep, planes):
     """Level planes at the mean of the floor of 3 x 3 blocks; the plane nearest to it where it is steep and near to one."""
     h, w = moments.shape[:2]
-    sums = np.empty(9)
+    sums = np.empty(10)
     for j in range(h):
         for i in range(w):
-            sums[:], squares = 0.0, 0.0
-            for b in range(max(j - 1, 0), min(j + 2, h)):
-                for a in range(max(i - 1, 0), min(i + 2, w)):
-                    weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
-                    _add(sums, moments[b, a], (a - i) * size, (b - j) * size, weight)
-                    squares += weight * moments[b, a, 9]
+            _sum_around(moments, j, i, size, sums)
             n = sums[0]
             planes[j, i, 0], planes[j, i, 1], planes[j, i, 2] = np.nan, 0.0, 0.0
             if n == 0.0:
@@ -187,7 +195,7 @@ def _coarsest(moments, size, steep, planes):
             xz, yz = sums[7] / n - x * z, sums[8] / n - y * z
             determinant = xx * yy - xy * xy
             gx, gy = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-            if np.sqrt(gx * gx + gy * gy) >= steep and gx * xz + gy * yz >= _PLANE * (squares / n - z * z):
+            if np.sqrt(gx * gx + gy * gy) >= steep and gx * xz + gy * yz >= _PLANE * (sums[9] / n - z * z):
                 planes[j, i, 0] = z - gx * x - gy * y
                 planes[j, i, 1], planes[j, i, 2] = gx, gy
 
@@ -210,12 +218,7 @@ def _fit(moments, size, planes):
     sums = np.empty(9)
     for j in range(h):
         for i in range(w):
-            sums[:] = 0.0
-            for b in range(max(j - 1, 0), min(j + 2, h)):
-                for a in range(max(i - 1, 0), min(i + 2, w)):
-                    if moments[b, a, 0] > 0:
-                        weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
-                        _add(sums, moments[b, a], (a - i) * size, (b - j) * size, weight)
+            _sum_around(moments, j, i, size, sums)
             n, x, y = sums[0], sums[1], sums[2]
             if n == 0.0:
                 continue

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import cell_numbers, keys_of, patches
+from .cells import CellWindow, cell_numbers, keys_of, patches
 
 #: Side of the cells, meters.
 CELL = 1.0
@@ -80,9 +80,9 @@ def find_towers(
     near = np.flatnonzero(use & (wire | (height > FOOT)) & _near(column, row, wires))
     for points, own in patches(column[near], row[near], int(REACH), int(REACH)):
         at = near[points]
-        left, bottom = int(column[at].min()), int(row[at].min())
-        h, w = int(row[at].max()) + 1 - bottom, int(column[at].max()) + 1 - left
-        cell = (row[at] - bottom) * w + column[at] - left
+        window = CellWindow.round(column[at], row[at])
+        left, bottom, w, h = window
+        cell = window.numbers(column[at], row[at])
         order = np.argsort(cell, kind="stable")
         start = np.searchsorted(cell[order], np.arange(h * w + 1))
         some = at[order]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from .cells import cell_numbers, levels, longest_sides, number_sets, patches
+from .cells import CellWindow, cell_numbers, levels, longest_sides, number_sets, patches
 
 #: Side of the cells, meters.
 CELL = 1.0
@@ -60,10 +60,9 @@ def find_wires(
     column, row = cell_numbers(xyz[:, 0], CELL), cell_numbers(xyz[:, 1], CELL)
     for points, own in patches(column[high], row[high], int(REACH), int(LONG)):
         at = high[points]
-        left, bottom = int(column[at].min()) - _MARGIN, int(row[at].min()) - _MARGIN
-        w, h = int(column[at].max()) + 1 + _MARGIN - left, int(row[at].max()) + 1 + _MARGIN - bottom
-        near = use & (column >= left) & (column < left + w) & (row >= bottom) & (row < bottom + h)
-        found = _find(xyz, (row - bottom) * w + column - left, np.flatnonzero(near), at, h, w)
+        window = CellWindow.round(column[at], row[at]).grown(_MARGIN)
+        near = np.flatnonzero(use & window.holds(column, row))
+        found = _find(xyz, window.numbers(column, row), near, at, window.height, window.width)
         out[at[own]] = found[own]
     return out
 
