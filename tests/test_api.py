@@ -12,7 +12,7 @@ import pytest
 from block_scene import ground_and_block
 
 import pdal_stages as ps
-from pdal_stages.base.errors import DependencyError, OptionError, StageError
+from pdal_stages.base.errors import DependencyError, StageError
 from pdal_stages.stages.multiscalefeatures import MultiscaleFeatures
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -117,7 +117,7 @@ def test_the_estimator_keeps_the_conventions(scene, tmp_path):
     assert np.array_equal(clone(made).fit(xyz[order], y[order]).predict(xyz), made.predict(xyz))
     made.save(tmp_path / "m.model")
     assert np.array_equal(ps.load_model(tmp_path / "m.model").predict(xyz).classification, made.predict(xyz))
-    with pytest.raises(OptionError, match=r"\(n, 3\)"):
+    with pytest.raises(StageError, match=r"\(n, 3\)"):
         made.fit(xyz[:, :2], y)
 
 

@@ -211,8 +211,10 @@ def test_errors_say_what_was_found(monkeypatch):
         train([TrainingCloud(xyz, np.ones(500, int), dimensions)], TrainingOptions(**SMALL), progress=False)
     with pytest.raises(OptionError, match="differ in number"):
         train([TrainingCloud(xyz, label[:-1], dimensions)], TrainingOptions(**SMALL), progress=False)
-    with pytest.raises(OptionError, match="no training cloud"):
+    with pytest.raises(OptionError, match="no points to train on"):
         train([], TrainingOptions(**SMALL), progress=False)
+    with pytest.raises(OptionError, match=r"no points to train on.* 7, 18 are left out"):
+        train([TrainingCloud(xyz, np.full(500, 7), dimensions)], TrainingOptions(**SMALL), progress=False)
     with pytest.raises(OptionError, match="mask"):
         train([TrainingCloud(xyz, label, dimensions, mask=label)], TrainingOptions(**SMALL), progress=False)
     monkeypatch.setattr(foresttraining, "free_memory", lambda: 1000)

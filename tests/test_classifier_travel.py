@@ -207,5 +207,5 @@ def test_clouds_made_one_at_a_time(tmp_path):
     at_hand = learned(clouds(3), passes=2, context=["own", "box1"], thin=[0.3])
     streamed = learned((cloud for cloud in clouds(3)), passes=2, context=["own", "box1"], thin=[0.3])
     assert written(at_hand, tmp_path, "a") == written(streamed, tmp_path, "b")
-    with pytest.raises(OptionError, match="no training cloud"):
+    with pytest.raises(OptionError, match="no points to train on"):
         learned(iter(()))

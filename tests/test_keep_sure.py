@@ -58,6 +58,10 @@ def test_what_is_damaged_or_not_there_is_refused(tmp_path):
             Sureness.from_dict(wrong)
     with pytest.raises(OptionError, match="never scored on ground"):
         sureness_of({}, str(tmp_path / "m.model"))
+    for text in (b"{", b"\xff", b"[]"):
+        (tmp_path / "m.sureness.json").write_bytes(text)
+        with pytest.raises(ModelError, match="damaged"):
+            sureness_of({}, str(tmp_path / "m.model"))
 
 
 def test_the_shipped_model_says_what_it_costs():

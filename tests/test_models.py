@@ -116,6 +116,8 @@ def test_training_keeps_the_stages_before_it(ready_town, tmp_path):
 
 def test_heights_follow_from_what_is_read():
     assert preparation_of(["X", "Intensity"]) == []
+    assert preparation_of(["HeightAboveOpening_x"]) == []
+    assert preparation_of(["HeightAboveOpening_2_5"])[0]["openings"] == [2.5]
     assert preparation_of(["HeightAboveGround"]) == [{"type": "filters.hag_minima"}]
     assert preparation_of(["Ground", "HeightAboveOpening_17", "HeightAboveOpening_5"]) == [
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}

@@ -108,3 +108,17 @@ def test_points_without_classes_or_ground():
         run_stage({**points, "Classification": np.full(50, 6, np.uint8)})
     with pytest.raises(StageError, match="Classification"):
         run_stage(points)
+
+
+def test_a_tile_without_ground_is_only_warned_of(tmp_path, write_las):
+    x = np.arange(0, 900, 0.5)
+    x = x[x % 30 < 20]
+    x, y = np.tile(x, 8), np.repeat(np.arange(8) * 0.5, len(x))
+    codes = np.where(x < 30, 2, 6).astype(np.uint8)
+    points = {"X": x, "Y": y, "Z": np.where(codes == 2, 0.0, 6.0), "Classification": codes}
+    source = write_las(tmp_path / "roofs.las", points)
+    Pipeline(stages(source, tmp_path / "whole.laz")).execute(arrays=False)
+    run = ps.run_tiled(stages(source, tmp_path / "tiled.laz"), 100, workers=0, progress=False)
+    assert not run.failures
+    whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
+    np.testing.assert_array_equal(whole["ObjectID"], tiled["ObjectID"])

@@ -1,4 +1,4 @@
-"""Figures that mean nothing: sides of voxels, no memory, labels of another number."""
+"""Figures that mean nothing: sides of voxels, no memory, labels of another number, coordinates that are none."""
 
 from __future__ import annotations
 
@@ -30,3 +30,21 @@ def test_the_estimator_says_what_is_wrong():
         PointClassifier().fit(xyz, np.zeros(49, int))
     with pytest.raises(OptionError, match="'options' must be TrainingOptions"):
         PointClassifier(options=5).fit(xyz, np.zeros(50, int))
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300])
+def test_a_coordinate_that_is_none(wrong):
+    xyz = np.random.default_rng(0).uniform(0, 9, (200, 3))
+    labels = np.where(xyz[:, 2] > 4, 6, 2)
+    options = ps.TrainingOptions(neighborhoods="k5", dimensions=(), count=20, trees=2, passes=1, folds=0)
+    model = ps.train(xyz, labels, options, dimensions={}, progress=False)
+    xyz[7, 0] = wrong
+    for call in (
+        lambda: model.predict(xyz),
+        lambda: ps.train(xyz, labels, options, dimensions={}, progress=False),
+        lambda: ps.train([ps.TrainingCloud(xyz, labels)], options, progress=False),
+    ):
+        with pytest.raises(StageError, match="1 of 200 points"):
+            call()
+    with pytest.raises(StageError, match="shape"):
+        model.predict(xyz[:, :2])

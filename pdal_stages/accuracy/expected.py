@@ -68,11 +68,14 @@ class ReviewCells:
         side: float,
         file: int = 0,
     ) -> ReviewCells:
-        """Cells of points: (n, 3) meters, (n,) class codes, (n,) reliabilities from 0 to 1; of file number `file`."""
+        """Cells of points: (n, 3) meters, (n,) class codes, (n,) reliabilities from 0 to 1; of file number `file`.
+
+        A reliability that is not known (NaN) is 0.
+        """
         group = _GROUP_OF[codes]
         judged = group < len(GROUPS)
         column, row = np.floor(xyz[judged, :2].T / side).astype(np.int64)
-        wrong = 1.0 - np.clip(np.asarray(reliability, np.float64)[judged], 0.0, 1.0)
+        wrong = 1.0 - np.clip(np.nan_to_num(np.asarray(reliability, np.float64)[judged]), 0.0, 1.0)
         one = np.eye(len(GROUPS), dtype=np.int64)[group[judged]]
         place = np.stack([np.full(len(row), file, np.int64), row, column], axis=1)
         return cls.join([cls(side, place, one, one * np.rint(wrong * _PARTS).astype(np.int64)[:, None])])

@@ -14,7 +14,6 @@ from ..base import checks
 from ..base.errors import ModelError, StageError
 from ..base.resources import map_blocks, resolve_threads
 from ..classifier.algorithms import ArrayRule, Column, InputPlan, PredictRequest, gather, with_returns
-from ..features.index import check_xyz
 from .circles import Circles, halo_m
 from .configuration import Configuration, parse_configuration
 from .geometry import Pyramid, build, scramble
@@ -135,7 +134,7 @@ class AlsNet:
         from threadpoolctl import threadpool_limits
 
         rows, progress = request.rows, request.progress
-        xyz = check_xyz(request.xyz)
+        xyz = request.xyz
         columns = scaled(xyz, dimensions, self.inputs, self.mean, self.scale)
         circles = Circles(xyz, self.configuration.points, self.spacing, columns)
         numbers = circles.needed(rows)

@@ -27,7 +27,6 @@ from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.trainoptions import TrainingOptions
 from ..features.cells import density
-from ..features.index import check_xyz
 from . import batches
 from .algorithm import AlsNet, make_pyramid, scaled
 from .circles import Circles, spacing_for
@@ -93,7 +92,7 @@ class _Session:
         self.threads, self.inputs = resolve_threads(training.threads), inputs(training)
         options, names = self.options, self.inputs
         # Of all clouds, one after the other; the place of each point's class is -1 where it is only a neighbor.
-        self.clouds = [check_xyz(np.asarray(cloud.xyz), cloud.name) for cloud in clouds]
+        self.clouds = [cloud.xyz for cloud in clouds]
         self.labeled = label_classes(clouds, training)
         self.position = position = np.concatenate([np.asarray(one) for _, one in self.labeled])
         self.classes = classes = self.labeled.classes

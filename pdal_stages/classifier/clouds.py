@@ -22,6 +22,7 @@ from ..base.las import UNINFORMATIVE
 from ..base.messages import Progress
 from ..base.version import __version__
 from ..features.cells import density, represent
+from ..features.index import check_xyz
 from .algorithms import known
 from .classes import MAX_LABEL, ClassMap
 from .trainoptions import TrainingOptions
@@ -109,6 +110,7 @@ def prepared(sources: Iterable[TrainingCloud], options: TrainingOptions) -> Iter
 
 def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     """A cloud without ignored points and with one point per voxel."""
+    check_xyz(cloud.xyz, cloud.name)
     named: set[int] = set()
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)

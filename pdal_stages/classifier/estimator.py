@@ -91,19 +91,14 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
             options = TrainingOptions(**given)
         if not isinstance(options, TrainingOptions):
             raise OptionError("'options' must be TrainingOptions", found=repr(options)[:60])
-        xyz, labels = _cloud(X), np.asarray(y)
-        if labels.shape != (len(xyz),):
-            raise OptionError(
-                f"there must be one label for each of the {len(xyz):,} points", found=f"shape {labels.shape}"
-            )
-        self.model_ = train(xyz, labels, options, dimensions=dimensions, progress=False)
+        self.model_ = train(X, y, options, dimensions=dimensions, progress=False)
         self.classes_ = self.model_.codes
         self.n_features_in_ = 3
         return self
 
     def _predicted(self, X: npt.ArrayLike, dimensions: Any, **more: Any) -> Prediction:
         check_is_fitted(self)
-        return self.model_.predict(_cloud(X), dimensions, threads=self.threads, **more)
+        return self.model_.predict(np.asarray(X), dimensions, threads=self.threads, **more)
 
     def predict(
         self, X: npt.ArrayLike, dimensions: Mapping[str, npt.ArrayLike] | None = None
@@ -123,10 +118,3 @@ class PointClassifier(ClassifierMixin, BaseEstimator):
         """Write the model file."""
         check_is_fitted(self)
         self.model_.save(path)
-
-
-def _cloud(X: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    xyz = np.asarray(X, np.float64)
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise OptionError("points must be an array of shape (n, 3)", found=xyz.shape)
-    return xyz

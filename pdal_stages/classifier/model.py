@@ -173,7 +173,7 @@ class Model:
             See :class:`PredictionOptions`.
         """
         how = PredictionOptions(**options)
-        xyz = np.asarray(xyz, dtype=np.float64)
+        xyz = check_xyz(xyz)
         n = len(xyz)
         given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads)
         asked = np.ones(n, np.bool_) if where is None else _checked("where", where, n, "b", "true or false")
@@ -203,7 +203,7 @@ class Model:
         order, grid = None, None
         if self._cell is not None and len(xyz):
             # one copy of the coordinates, in the order in which all is computed
-            grid = build_grid(check_xyz(xyz), self._cell)
+            grid = build_grid(xyz, self._cell)
             order, xyz = grid.order, grid.coordinates
             grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
             if rows is not None:
@@ -281,7 +281,7 @@ class Model:
         report.figures["density"] = round(found, 3)
         if not trained["low"] / TOLERANCE <= found <= trained["high"] * TOLERANCE:
             few = max(report.figures.get("fewer_than_three", {}).values(), default=0)
-            lonely = f"; {100 * few / count:.2g} % have fewer than three neighbors" if few else ""
+            lonely = f"; {100 * few / count:.3g} % have fewer than three neighbors" if few else ""
             report.warnings.append(
                 f"the cloud has {found:.3g} points/m2, the model was trained on "
                 f"{summary.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"

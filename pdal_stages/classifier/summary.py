@@ -250,7 +250,10 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
         return Sureness.from_dict(info["sureness"])
     beside = Path(path).with_suffix(SUFFIX)
     if beside.is_file():
-        return Sureness.from_dict(json.loads(beside.read_text(encoding="utf-8")))
+        try:
+            return Sureness.from_dict(json.loads(beside.read_bytes()))
+        except (OSError, ValueError, RecursionError) as error:
+            raise ModelError("the file beside the model is damaged", where=str(beside), found=error) from None
     cure = "Train it with folds (the default), on labels that lie in more than one place"
     if info.get("teacher"):
         cure = "Its labels are another model's answers; take a model that was scored on a person's labels"

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
+from ..features.index import check_xyz
 from .algorithms import ALWAYS, WHERE_THERE, preparing, required, trainer
 from .clouds import TrainingCloud, prepared, spooled
 from .context import Context
@@ -59,7 +60,12 @@ def train(
     preparation: list[dict[str, Any]] = []
     sources: Any = [clouds] if isinstance(clouds, TrainingCloud) else clouds
     if labels is not None:
-        xyz = np.asarray(clouds, np.float64)
+        xyz = check_xyz(clouds)
+        if np.shape(labels) != (len(xyz),):
+            raise OptionError(
+                f"there must be one label for each of the {len(xyz):,} points",
+                found=f"shape {np.shape(labels)}",
+            )
         if dimensions is None:
             dimensions, options, preparation = _prepared(xyz, labels, options)
         sources = [TrainingCloud(xyz, labels, dimensions)]
@@ -68,7 +74,11 @@ def train(
         made = list(each) if isinstance(sources, list | tuple) else spooled(each, folder or Path(temporary))
         made = [one for one in made if one.points]
         if not made:
-            raise OptionError("no training cloud was given")
+            left_out = ", ".join(map(str, options.ignore))
+            raise OptionError(
+                "there are no points to train on",
+                cure=f"Give some; those of labels {left_out} are left out ('ignore') unless 'classes' names them",
+            )
         model = trainer(options.algorithm).train(made, options, progress)
     if preparation:
         model.info["preparation"] = preparation

@@ -130,7 +130,7 @@ class Cells:
         size : float
             Side of a cell, meters.
         reliability : (n,) float, optional
-            0 to 1.
+            0 to 1; NaN where it is not known.
         classes : mapping, optional
             Class codes of each kind.
         """
@@ -148,17 +148,16 @@ class Cells:
                 "heights lie beyond 2,000 km", found=f"{height.min() / MM:g} to {height.max() / MM:g} m"
             )
         z = height.astype(np.int32)
-        told = np.full(len(z), reliability is not None, np.int32)
-        sure = np.zeros(len(z), np.int64)
-        if reliability is not None:
-            sure = np.rint(np.clip(np.asarray(reliability)[used], 0.0, 1.0) * MM).astype(np.int64)
+        given = np.full(len(z), np.nan) if reliability is None else np.asarray(reliability)[used]
+        told = ~np.isnan(given)
+        sure = np.rint(np.clip(np.where(told, given, 0.0), 0.0, 1.0) * MM).astype(np.int64)
         columns = {
             "count": np.ones(len(z), np.int32),
             "low": z,
             "high": z,
             "sum": z,
             "sure": sure,
-            "told": told,
+            "told": told.astype(np.int32),
         }
         return cls(size, key, columns)._joined()
 

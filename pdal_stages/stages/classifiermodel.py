@@ -15,7 +15,7 @@ from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
 from ..base.messages import Report
 from ..classifier import summary
-from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, required, trainer, welcome
+from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, gather, required, trainer, welcome
 from ..classifier.classes import ClassMap
 from ..classifier.clouds import TrainingCloud
 from ..classifier.foresttraining import SHORT
@@ -287,7 +287,7 @@ class ClassifierModel(Stage):
         """The cloud as it is, or one for each value of the dimension `survey`, after that value."""
         if not self.survey:
             return [(0.0, cloud)]
-        value = np.asarray(cloud.dimensions[self.survey])
+        value = gather((self.survey,), cloud.dimensions, len(cloud), where=cloud.name)[self.survey]
         parts = [(float(one), cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
         return [(one, replace(part, name=f"{self.survey} {one:g}", survey=None)) for one, part in parts]
 

@@ -77,8 +77,14 @@ class MultiscaleFeatures(Stage):
 
     def check(self) -> None:
         check_side(self.voxel)
-        fits = self.plan.shapes or any(one.kind == "copt" for one in self.plan.neighborhoods)
-        if fits and not (self.bins and Path(self.bins).exists()):
+        plan, (bins, threshold) = self.plan, _read_bins(self.bins)
+        if self.bins and Path(self.bins).exists():
+            if (plan.shapes and bins is None) or (plan.copt and threshold is None):
+                raise _not_thresholds(self.bins, "none of what these features need")
+            for part in plan.layout:
+                if part.shapes and bins is not None:
+                    bins.thresholds(part.neighborhood.token)  # refused where there are none
+        elif plan.shapes or plan.copt:
             self.instead_of_tiles = (
                 'Thresholds are fitted to the points: give "bins": "thresholds.json", and run the pipeline once without '
                 "--tile on one typical file, which writes it"
@@ -134,8 +140,8 @@ class MultiscaleFeatures(Stage):
                 rows = there[rows]
                 for name, column in zip(names, columns, strict=True):
                     out[name][rows] = values[:, column]
-        if self.bins and not Path(self.bins).exists():
-            _write_bins(self.bins, engine)
+        if self.bins and not Path(self.bins).exists() and len(engine):
+            _write_bins(self.bins, engine.fit())
         points.report.figures.update(
             {
                 "neighborhoods": len(plan.neighborhoods),
@@ -159,11 +165,15 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
             None if threshold is None else float(threshold),
         )
     except (OSError, ValueError, AttributeError, TypeError, KeyError, RecursionError) as error:
-        raise OptionError(
-            f"option 'bins': '{path}' is not a file of thresholds written by this stage",
-            found=str(error),
-            cure="Delete it to have it written anew, or name another file",
-        ) from None
+        raise _not_thresholds(path, str(error)) from None
+
+
+def _not_thresholds(path: str, found: str) -> OptionError:
+    return OptionError(
+        f"option 'bins': '{path}' does not hold the thresholds that this stage writes",
+        found=found,
+        cure="Delete it to have it written again, or name another file",
+    )
 
 
 def _write_bins(path: str, engine: FeatureEngine) -> None:

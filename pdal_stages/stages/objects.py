@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..base import checks
 from ..base.arrays import places_among
+from ..base.errors import StageError
 from ..objects.cells import CLASSES, ENOUGH, Cells, Kind, kind_of_code, refuse_unclassified
 from ..objects.find import FOUND, find_objects
 from ..objects.found import Objects, ObjectSettings
@@ -56,6 +57,7 @@ class ObjectOptions:
     ignore: Selection = ignore_option("Points of no object")
 
     options: dict[str, Any]
+    own_points: str
 
     @cached_property
     def settings(self) -> ObjectSettings:
@@ -78,10 +80,15 @@ class ObjectOptions:
         Raises
         ------
         StageError
-            Where no point has a class of any kind, or none is ground.
+            Where no point has a class of any kind, or none is ground; a warning in tiles, others of which may have some.
         """
         cells = self.records(points)
-        refuse_unclassified(cells, points.class_codes[points.usable(self.ignore)])
+        try:
+            refuse_unclassified(cells, points.class_codes[points.usable(self.ignore)])
+        except StageError as error:
+            if not self.own_points:
+                raise
+            points.report.warnings.append(str(error))
         if thin := cells.thin():
             points.report.warnings.append(
                 f"cells of {cells.size:g} m hold fewer than {ENOUGH:g} points of {thin[0]} on average, so objects may fall "

@@ -8,6 +8,7 @@ and not stored by training.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -51,6 +52,8 @@ PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
 #: Options that say where in a pipeline a stage stands, how it is run, or in what units the points at hand are; not what
 #: it makes; and decks, which whoever applies a model looks for or not.
 _ASIDE = ("decks", "tag", "inputs", "user_data", "log", "threads", "horizontal_unit", "vertical_unit")
+#: How the names of heights above openings begin; the width follows.
+_OPENING = "HeightAboveOpening_"
 #: Most stages of a preparation, and characters of one as JSON.
 _MOST, _LONGEST = 8, 1000
 
@@ -140,7 +143,8 @@ def _number(value: float) -> int | float:
 def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """The stage that makes these dimensions, as far as they are heights."""
     wanted = list(names)
-    openings = [int(name.rpartition("_")[2]) for name in wanted if name.startswith("HeightAboveOpening_")]
+    widths = [name.removeprefix(_OPENING).replace("_", ".") for name in wanted if name.startswith(_OPENING)]
+    openings = [_number(float(width)) for width in widths if re.fullmatch(r"\d+(\.\d+)?", width)]
     if not openings and "Ground" not in wanted:
         return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in wanted else []
     stage: dict[str, Any] = {"type": "filters.hag_morphological"}

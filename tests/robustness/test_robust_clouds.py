@@ -124,6 +124,24 @@ def test_training_on_odd_clouds(command, tmp_path, write_las):
         command.runs(words(ODD[case], {}, {}))
 
 
+def test_thresholds_and_surveys_of_no_points(command, tmp_path, write_las):
+    flight, bins = np.where(np.arange(300) < 9, np.nan, 1.0), tmp_path / "b.json"
+    source = {
+        "type": "readers.las",
+        "filename": str(written(tmp_path / "in.las", random(300), write_las, Flight=flight)),
+        "use_eb_vlr": True,
+    }
+    shapes = {"type": FEATURES["type"], "neighborhoods": "k5", "feature_set": "D1", "bins": str(bins)}
+    for none in ({"where": "Z > 99"}, {"ignore": [2, 6]}):
+        command.runs(["pipeline", job(tmp_path, source, {**shapes, **none}), "--metadata", tmp_path / "m"])
+        assert bins.exists() == ("where" in none)
+        bins.unlink(missing_ok=True)
+    bins.write_text('{"bins": null, "copt_threshold": null}')
+    command.refused(["pipeline", job(tmp_path, source, shapes)], "does not hold the thresholds", "Delete it")
+    train = {**TRAIN, "filename": str(tmp_path / "model"), "survey": "Flight"}
+    command.refused(["pipeline", job(tmp_path, source, HAG, train)], "Flight is not finite", "9 points")
+
+
 def test_labels_that_are_none(command, tmp_path, write_las):
     arrays = {
         "Weight": np.full(100, 2.5),
