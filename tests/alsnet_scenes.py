@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from pdal_stages.alsnet import AlsNet, Configuration, Level
+from pdal_stages.alsnet.algorithm import AlsNet
+from pdal_stages.alsnet.configuration import Configuration, Level
 from pdal_stages.alsnet.weights import fresh
 
 TINY = Configuration(

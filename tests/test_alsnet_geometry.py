@@ -6,8 +6,8 @@ from alsnet_scenes import TINY, coverage, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.alsnet import Circles, parse_configuration
-from pdal_stages.alsnet.circles import halo_m, spacing_for
+from pdal_stages.alsnet.circles import Circles, halo_m, spacing_for
+from pdal_stages.alsnet.configuration import parse_configuration
 from pdal_stages.alsnet.geometry import ball_query, build, farthest_points, scramble, stack, three_nearest
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features.cells import density

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages import load_model
-from pdal_stages.alsnet import AlsNet, Circles
-from pdal_stages.alsnet.algorithm import make_pyramid, scaled
+from pdal_stages.alsnet.algorithm import AlsNet, make_pyramid, scaled
+from pdal_stages.alsnet.circles import Circles
 from pdal_stages.alsnet.geometry import build, scramble
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import modelfile
@@ -28,7 +28,7 @@ def net_with(**changes):
 
 def test_a_level_equals_a_computation_by_hand():
     """One level, one layer each, one ball: every number checked with loops."""
-    from pdal_stages.alsnet import Configuration, Level
+    from pdal_stages.alsnet.configuration import Configuration, Level
 
     one = Configuration("one", 16, (Level(2, 5.0, 3, (4,), (3,)),), head=(2,), dropout=0.0)
     net = random_net(("Z",), 2, one)

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 import pdal_stages
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.alsnet import Circles, Configuration, Level
 from pdal_stages.alsnet.batches import (
     JITTER,
     THIN,
@@ -27,6 +26,8 @@ from pdal_stages.alsnet.batches import (
     side_by_side,
     spread,
 )
+from pdal_stages.alsnet.circles import Circles
+from pdal_stages.alsnet.configuration import Configuration, Level
 from pdal_stages.alsnet.geometry import build
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.base.files import CHECKPOINT, kind_of

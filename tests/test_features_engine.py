@@ -348,6 +348,13 @@ def test_wrong_queries(cloud, queries, message):
         compute_features(cloud, queries, "c1", "Density")
 
 
+@pytest.mark.parametrize("far", [1e9, 2.5e9, 1e12])
+def test_strays_far_apart_change_nothing(cloud, far):
+    strays = np.vstack([cloud[:500], [[far, far, 0.0], [-far, 5.0, 0.0]]])
+    one, other = (compute_features(xyz, range(500), "c1,k5", "covariance") for xyz in (cloud[:500], strays))
+    assert np.array_equal(one.values, other.values)
+
+
 def test_wrong_options(cloud):
     plan = FeaturePlan.parse("c1", "Density")
     with pytest.raises(OptionError, match="plan"):

@@ -99,7 +99,7 @@ def test_presets_bring_dimensions():
 
 def test_neighborhoods_are_values():
     (one,) = parse_neighborhoods("c2")
-    assert one == Neighborhood("cylinder", (2.0,)) and hash(one) == hash(parse_neighborhoods(one)[0])
+    assert one == Neighborhood("cylinder", (2.0,)) and hash(one) == hash(parse_neighborhoods("c2.0")[0])
     assert str(one) == "c2"
 
 

@@ -20,7 +20,8 @@ import numpy.typing as npt
 from ..base.arrays import places_among
 from ..base.errors import OptionError
 from ..base.resources import map_blocks
-from ..features.cells import WHOLE, cell_keys, cell_means
+from ..features.cells import WHOLE, cell_means
+from ..features.index import cell_keys
 from ..features.neighborhoods import SIDES
 
 #: Word of a token, which the side of a cell in meters follows: axes of the cells (3 x 3 x 3 around the point's, or 3 x 3

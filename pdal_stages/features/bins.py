@@ -96,28 +96,17 @@ class ShapeBins:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> ShapeBins:
         """The bins that :meth:`to_dict` described; OptionError where it is not such a description."""
-        if not isinstance(data, Mapping):
-            raise OptionError("shape thresholds must be an object", found=type(data).__name__, cure=_CURE)
-        result = {}
-        for token, rows in data.items():
-            if not isinstance(rows, Mapping) or set(rows) != set(METRICS):
-                raise OptionError(
-                    f"the shape thresholds of '{token}' must name {', '.join(METRICS)}",
-                    found=", ".join(map(str, rows)) if isinstance(rows, Mapping) else type(rows).__name__,
-                    cure=_CURE,
-                )
-            result[token] = [rows[name] for name in METRICS]
-        return cls(result)
+        each = data.values() if isinstance(data, Mapping) else [None]
+        if not all(isinstance(rows, Mapping) and set(rows) == set(METRICS) for rows in each):
+            raise OptionError(
+                f"shape thresholds must be those of {', '.join(METRICS)} of each neighborhood",
+                found=repr(data)[:80],
+                cure=_CURE,
+            )
+        return cls({token: [rows[name] for name in METRICS] for token, rows in data.items()})
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, ShapeBins):
-            return NotImplemented
-        return self.to_dict() == other.to_dict()
-
-    __hash__ = None  # type: ignore[assignment]  # equal by value, and not meant for a key
-
-    def __repr__(self) -> str:
-        return f"ShapeBins({', '.join(self._thresholds)})"
+        return isinstance(other, ShapeBins) and self.to_dict() == other.to_dict()
 
 
 def _checked(token: str, rows: Any) -> np.ndarray:

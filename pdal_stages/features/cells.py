@@ -24,10 +24,8 @@ import numpy.typing as npt
 from ..base.arrays import begins_run, hash_of
 from ..base.errors import OptionError
 from ..base.jit import njit
-from .index import cell_numbers
+from .index import cell_keys
 
-#: Points whose cells are numbered in one go: they stay in a core's cache.
-_TOGETHER = 1 << 16
 #: A share of 1.
 WHOLE = 65535
 #: Smallest and largest side of voxels, and of the cells whose points are counted for the density, in meters.
@@ -56,43 +54,6 @@ def cell_means(
     return cell, means
 
 
-def cell_keys(
-    coordinates: npt.NDArray[np.float64], side: float
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """A number for each point's cell, such that cells beside each other along the last axis follow each other.
-
-    And offsets (3 or 9,): added to a number, they give the middle cells of the rows of three around it.
-    """
-    axes, n = _ORDER[coordinates.shape[1]], len(coordinates)
-    spans = np.array([[coordinates[:, k].min(), coordinates[:, k].max()] if n else [0.0, 0.0] for k in axes])
-    first, last = cell_numbers(spans, side).T
-    # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
-    lengths = [int(length) + 2 for length in last - first]
-    numbers = None
-    if float(np.prod(np.array(lengths, float))) >= 2.0**62:
-        numbers = [_without_gaps(cell_numbers(coordinates[:, k], side)) for k in axes]
-        lengths = [int(number.max(initial=0)) + 2 for number in numbers]
-    keys = np.empty(n, np.int64)
-    for start in range(0, n, _TOGETHER):
-        part = slice(start, start + _TOGETHER)
-        key: Any = 0
-        for place, (k, length) in enumerate(zip(axes, lengths, strict=True)):
-            number = (
-                cell_numbers(coordinates[part, k], side) - first[place]
-                if numbers is None
-                else numbers[place][part]
-            )
-            key = key * length + number
-        keys[part] = key
-    steps = [1]
-    for length in lengths[1:]:
-        steps = [step * length for step in steps] + [1]
-    offsets = np.zeros(1, np.int64)
-    for step in steps[:-1]:
-        offsets = np.add.outer(offsets, np.array([-step, 0, step])).reshape(-1)
-    return keys, np.sort(offsets)
-
-
 def density(xyz: npt.NDArray[np.float64]) -> float:
     """Points per square meter: the median over the occupied cells of :data:`CELL` meters, 0 for an empty cloud.
 
@@ -104,16 +65,6 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
     keys.sort()
     starts = np.flatnonzero(begins_run(keys))
     return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
-
-
-#: Axes from the slowest to the fastest.
-_ORDER = {2: (1, 0), 3: (1, 0, 2)}
-
-
-def _without_gaps(number: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Strays far apart: empty stretches become one empty cell."""
-    there, at = np.unique(number, return_inverse=True)
-    return np.concatenate(([0], np.cumsum(np.minimum(np.diff(there), 2))))[at]
 
 
 def check_side(side: float) -> float:

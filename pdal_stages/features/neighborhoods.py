@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from ..base.errors import OptionError, suggest
 
@@ -95,7 +96,7 @@ class Neighborhood:
         return self.token
 
 
-def parse_neighborhoods(spec: str | Neighborhood | Iterable[str | Neighborhood]) -> list[Neighborhood]:
+def parse_neighborhoods(spec: str | Iterable[str]) -> list[Neighborhood]:
     """Parse presets and tokens into neighborhoods, in the order given, each one once.
 
     Parameters
@@ -115,9 +116,6 @@ def parse_neighborhoods(spec: str | Neighborhood | Iterable[str | Neighborhood])
     """
     found: dict[str, Neighborhood] = {}
     for word in _words(spec):
-        if isinstance(word, Neighborhood):
-            found.setdefault(word.token, word)
-            continue
         for token in PRESETS[word][0] if word in PRESETS else (word,):
             one = _parse_token(token)
             found.setdefault(one.token, one)
@@ -135,30 +133,20 @@ def parse_neighborhoods(spec: str | Neighborhood | Iterable[str | Neighborhood])
     return list(found.values())
 
 
-def preset_dimensions(spec: str | Neighborhood | Iterable[str | Neighborhood]) -> tuple[str, ...]:
+def preset_dimensions(spec: str | Iterable[str]) -> tuple[str, ...]:
     """The points' own dimensions that the presets named in `spec` use as features."""
     used = (PRESETS[word][1] for word in _words(spec) if word in PRESETS)
     return tuple(dict.fromkeys(name for names in used for name in names))
 
 
-def _words(spec) -> list:
-    if isinstance(spec, Neighborhood):
-        return [spec]
+def _words(spec: Any) -> list[str]:
     if isinstance(spec, str):
         # A comma inside parentheses belongs to the token.
         return [w.strip().lower() for w in re.split(r",(?![^()]*\))", spec) if w.strip()]
-    try:
-        items = list(spec)
-    except TypeError:
-        raise OptionError(
-            "'neighborhoods' must be text or a list of text", found=repr(spec), cure=_CURE
-        ) from None
-    words: list = []
-    for item in items:
-        if not isinstance(item, str | Neighborhood):
-            raise OptionError("a neighborhood must be written as text", found=repr(item), cure=_CURE)
-        words.extend(_words(item))
-    return words
+    items = list(spec) if isinstance(spec, Iterable) else [spec]
+    if not all(isinstance(item, str) for item in items):
+        raise OptionError("'neighborhoods' must be text or a list of text", found=repr(spec)[:80], cure=_CURE)
+    return [word for item in items for word in _words(item)]
 
 
 def _parse_token(text: str) -> Neighborhood:

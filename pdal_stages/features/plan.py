@@ -163,7 +163,7 @@ class FeaturePlan:
     @classmethod
     def parse(
         cls,
-        neighborhoods: str | Neighborhood | Iterable[str | Neighborhood],
+        neighborhoods: str | Iterable[str],
         feature_set: str | Iterable[str] = "all",
         dimensions: str | Iterable[str] = (),
     ) -> FeaturePlan:
@@ -187,8 +187,8 @@ class FeaturePlan:
             For unknown words, and for features that no chosen neighborhood has.
         """
         words = parse_feature_set(feature_set)
-        if not isinstance(neighborhoods, str | Neighborhood):
-            neighborhoods = list(neighborhoods) if isinstance(neighborhoods, Iterable) else neighborhoods
+        if isinstance(neighborhoods, Iterable) and not isinstance(neighborhoods, str):
+            neighborhoods = list(neighborhoods)
         parsed = tuple(parse_neighborhoods(neighborhoods))
         given = dimensions.split(",") if isinstance(dimensions, str) else list(dimensions)
         own = preset_dimensions(neighborhoods) if any(word in WITH_DIMENSIONS for word in words) else ()
@@ -293,13 +293,13 @@ class FeaturePlan:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
         """The plan that :meth:`to_dict` described; OptionError where it is not such a description."""
-        try:
-            tokens, words, dimensions = data["neighborhoods"], data["features"], data["dimensions"]
-        except (KeyError, TypeError):
-            raise OptionError("a feature plan needs 'neighborhoods', 'features' and 'dimensions'") from None
+        lists = ("neighborhoods", "features", "dimensions")
+        tokens, words, dimensions = (data.get(name) if isinstance(data, Mapping) else None for name in lists)
         for value in (tokens, words, dimensions):
             if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
-                raise OptionError("a feature plan holds lists of text", found=repr(value)[:80])
+                raise OptionError(
+                    f"a feature plan needs lists of text: {', '.join(lists)}", found=repr(data)[:80]
+                )
         parsed = tuple(parse_neighborhoods(tokens))
         given = data.get("least_members", LEAST_MEMBERS)
         least = checks.whole("'least_members' of a feature plan", given, 3, 100)

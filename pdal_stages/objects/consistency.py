@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import places_among
-from ..base.errors import StageError
 from ..base.jit import njit
 from ..base.las import NOISE, by_height
+from ..features.index import cell_keys
 
 #: Rules in the order in which they are applied, and how many voxels to each side they look.
 RULES = {"ground": 2, "islands": 1, "lone": 1}
@@ -106,18 +106,8 @@ class _Voxels:
         kinds = np.full(256, _OTHER, np.uint8)
         kinds[GROUND], kinds[list(VEGETATION)], kinds[BUILDING] = _GROUND, _VEGETATION, _BUILDING
         self.kind = kinds[codes]
-        key, self.strides = np.zeros(len(rows), np.int64), np.ones(3, np.int64)
-        room = 1
-        for axis in (2, 1, 0):
-            number = np.floor(xyz[rows, axis] / SIDE)
-            low = number.min() - 2.0  # room for neighbors
-            self.strides[axis] = room
-            room *= int(number.max() - low) + 3
-            if room > 2**62:
-                cure = "Drop stray points first"
-                raise StageError("points lie too far apart for a grid of voxels", cure=cure)
-            key += (number - low).astype(np.int64) * self.strides[axis]
-        self.keys, self.voxel = np.unique(key, return_inverse=True)
+        keys, self.offsets = cell_keys(xyz[rows], SIDE)
+        self.keys, self.voxel = np.unique(keys, return_inverse=True)
 
     def counts(self, kind: NDArray) -> NDArray[np.int64]:
         """Points of each of four kinds in each voxel, (voxels, 4)."""
@@ -128,8 +118,7 @@ class _Voxels:
         voxels, at = np.unique(self.voxel[points], return_inverse=True)
         before = np.insert(self.counts(kind).cumsum(axis=0), 0, 0, axis=0)
         total = np.zeros((len(voxels), 4), np.int64)
-        steps = np.array(list(product((-1, 0, 1), repeat=2))) @ self.strides[:2]
-        _add_columns(self.keys, self.keys[voxels], steps, before, total)
+        _add_columns(self.keys, self.keys[voxels], self.offsets, before, total)
         return total[at]
 
     def vegetation_near(self, points: NDArray, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -145,13 +134,13 @@ class _Voxels:
         built = self.kind == _BUILDING
         low, stands = built & self.flat & (self.height < LOW), built & ~self.flat & (self.height > HIGH)
         # Feet of walls are labeled building as often as ground, so it is changed where more is low than stands.
-        column, at = np.unique((self.keys // self.strides[1])[self.voxel], return_inverse=True)
+        x, y = np.floor(self.xyz[self.rows, :2] / SIDE).T.astype(np.int64)
+        column, at = np.unique((y << 32) + x, return_inverse=True)
         more = np.bincount(at, 1.0 * low - stands)
         own, of = np.unique(at[low], return_inverse=True)
         total = np.zeros(len(own))
         for i, j in product(range(-2, 3), repeat=2):
-            step = i * (self.strides[0] // self.strides[1]) + j
-            place, there = places_among(column, column[own] + step)
+            place, there = places_among(column, column[own] + (i << 32) + j)
             total += more[place] * there
         return np.flatnonzero(low)[total[of] > 0], _GROUND
 
