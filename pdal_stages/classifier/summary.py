@@ -145,7 +145,7 @@ def score(info: Mapping[str, Any]) -> str:
         by = crossed.get("by", "blocks")
         label = f"{groups_word(str(crossed.get('groups'))) if by == 'groups' else by} held out"
     values = [_percent(row.get(name)) for name in ("overall_accuracy", "kappa", "mean_f1")]
-    return "{:<17}overall accuracy {}, kappa {}, mean F1 {}".format(label, *values)
+    return "{:<15}  overall accuracy {}, kappa {}, mean F1 {}".format(label, *values)
 
 
 def groups_word(dimension: str) -> str:
