@@ -13,6 +13,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import DimensionError, OptionError
+from pdal_stages.pipeline.expansion import together
 from pdal_stages.terrain.minima import hag_minima
 
 pytestmark = pytest.mark.pdal
@@ -108,6 +109,34 @@ def test_door_3_filters_python_by_hand(cloud, pdal_module):
     pipeline = pdal_module.Pipeline(json.dumps(stages))
     assert pipeline.execute() == 3000
     assert pipeline.arrays[0]["HeightAboveGround"].max() > 5
+
+
+# ---- several stages in one filter ------------------------------------------------------------------------
+
+
+def test_stages_that_follow_one_another_are_one_filter(cloud, model):
+    """Those with tags stay apart: the same values, of dimensions that a later stage forgets too."""
+    heights = {"type": "filters.hag_morphological", "ground": True, "terrain_slope": True, "decks": True}
+    classifier = {"type": "filters.modelclassifier", "model": str(model)}
+    ours = [{"type": "filters.detachednoise"}, heights, classifier, {"type": "filters.bridges"}]
+    stages = [str(cloud), *ours, {"type": "filters.consistency"}]
+    alone = [stages[0], *({**stage, "tag": f"t{n}"} for n, stage in enumerate(stages[1:]))]
+    pipelines = [ps.Pipeline(each) for each in (stages, alone)]
+    plain, tagged = (together(pipeline.expanded.stages) for pipeline in pipelines)
+    assert tagged == pipelines[1].expanded.stages
+    several = [[one["stage"] for one in stage["pdalargs"]["together"]] for stage in plain[1:]]
+    types = [
+        None,
+        *(stage["type"] for stage in stages[1:]),
+    ]  # the classifier ends a row: it gives memory back
+    assert several == [types[1:4], types[4:]]
+    found, expected = ([pipeline.execute(), *pipeline.arrays][1] for pipeline in pipelines)
+    assert found["Slope"].any()
+    assert found["Ground"].any()
+    for name in expected.dtype.names:
+        assert found[name].tobytes() == expected[name].tobytes(), name
+    reports = [[[one.to_dict() for one in each] for _, each in pipeline.reports] for pipeline in pipelines]
+    assert reports[0] == reports[1]
 
 
 # ---- class codes that do not fit -------------------------------------------------------------------------

@@ -13,10 +13,11 @@ from __future__ import annotations
 import json
 import sys
 import uuid
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any
+from typing import Any, cast
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -69,7 +70,7 @@ def python_filter(
 
 
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Run one expanded stage on one point view; True, also where it failed (see above).
+    """Run an expanded stage, or several together, on one point view; True, also where one failed (see above).
 
     Parameters
     ----------
@@ -79,18 +80,23 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     ins, outs : dict
         PDAL's dimensions, and the ones to write back.
     """
-    arguments = module["pdalargs"]
-    label = str(arguments.get("label", ""))
-    # PDAL's module object stays alive; the register need not grow.
-    sys.modules.pop(label, None)
-    try:
-        stage = made.get(label) or _made_again(arguments)
-        report = run_on_view(stage, module, ins, outs)
-        module["out_metadata"] = node(arguments["stage"], leaves(report))
-        _reports.setdefault(label, []).append(report)
-    except BaseException as error:
-        _failures[label] = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
-        hand_over(_failures[label], outs)
+    asked = module["pdalargs"]
+    several = asked.get("together", [asked])
+    for arguments in several:
+        label = str(arguments.get("label", ""))
+        # PDAL's module object stays alive; the register need not grow.
+        sys.modules.pop(label, None)
+        # Only the last may give memory of PDAL's arrays back, which it does with those of a dict.
+        seen = {**ins, **outs} if arguments is several[-1] else ChainMap(outs, cast(dict, ins))
+        try:
+            stage = made.get(label) or _made_again(arguments)
+            report = run_on_view(stage, module, seen, outs)
+            module["out_metadata"] = node(arguments["stage"], leaves(report))
+            _reports.setdefault(label, []).append(report)
+        except BaseException as error:
+            _failures[label] = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
+            hand_over(_failures[label], outs)
+            break
     return True
 
 
@@ -144,7 +150,7 @@ def run_on_view(
             raise points.missing(name, stage.hint)
     if not points.count:
         return run_on_nothing(stage)
-    points.lent_by_pdal = isinstance(ins, dict)
+    points.lent_by_pdal = ins.keys() - outs.keys() if isinstance(ins, dict) else set()
     for name, values in stage.run(points).items():
         target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.

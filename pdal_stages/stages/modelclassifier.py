@@ -32,6 +32,7 @@ class ModelClassifier(Stage):
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors."
+    forgets = True
     model_file: str = option(
         "model",
         None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -57,8 +57,8 @@ class Points:
     own: NDArray | None = None
     #: Where they will be written with codes up to 31 alone: what to say of others, and the cure.
     code_limit: tuple[str, str] | None = None
-    #: Whether the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
-    lent_by_pdal: bool = False
+    #: Which of the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
+    lent_by_pdal: Set[str] = frozenset()
 
     def __post_init__(self) -> None:
         self.count = len(self.arrays["X"]) if "X" in self.arrays else 0
@@ -131,9 +131,10 @@ class Points:
         self.__dict__.pop("axes", None)
         kept, lent = set(names), self.arrays
         self.arrays = {name: lent[name] for name in lent if name in kept}
-        if self.lent_by_pdal:  # which makes these arrays for this one call, and frees them after it
-            for array in (lent[name] for name in lent.keys() - kept if lent[name] is not self.own):
-                give_back(array)
+        # PDAL makes these arrays for this one call, and frees them after it.
+        for name in self.lent_by_pdal - kept:
+            if lent[name] is not self.own:
+                give_back(lent[name])
 
     def take_xyz(self) -> NDArray[np.float64]:
         """:attr:`xyz`, not kept here: who takes it may let go of it."""
