@@ -184,7 +184,9 @@ def move_window(cell_ix, row_iy, row_start, iy, ix, widths, on, window):
 @device(forceinline=True)
 def copy_points(x, y, z, first, last, px, py, pz, keys, at):
     """Append the points first..last - 1."""
-    for i in range(last - first):
+    # Unsigned: what may be negative is looked up with a detour.
+    first, at = np.uint64(first), np.uint64(at)
+    for i in range(np.uint64(last) - first):
         px[at + i] = x[first + i]
         py[at + i] = y[first + i]
         pz[at + i] = z[first + i]

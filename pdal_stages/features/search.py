@@ -126,7 +126,7 @@ def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, ne
             return hi, -1, reach2
 
 
-@device
+@device(forceinline=True)
 def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
     """Sort the neighbors of one query into near.sorted and near.pos; how many, or -1 where `reach2` is too short."""
     x, y, z, d2, bins, hist = near.x, near.y, near.z, near.d2, near.bins, near.hist

@@ -34,7 +34,7 @@ MADE = len(SURFACES)
 UP = 1.0 + 1e-6
 
 
-@device
+@device(forceinline=True)
 def agreement(surfaces, near, count, own, columns, out):
     """Write the four features of the first `count` neighbors round a query of that surface to their `columns` of `out`.
 

@@ -278,21 +278,21 @@ def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Expa
 
 
 def together(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """An expanded pipeline with one filter for stages of ours that follow one another.
+    """An expanded pipeline with one filter for stages of ours, and functions, that follow one another.
 
-    For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. A stage with a tag or inputs
-    stays by itself, as PDAL wires it; one that forgets points is the last of its filter.
+    For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. What tags and inputs wire stays
+    as it is; a stage that forgets dimensions is the last of its filter.
     """
     out: list[dict[str, Any]] = []
     for stage in stages:
         before = out[-1] if out else {}
-        apart = any(str(one.get("module")) not in made or one.keys() & PDAL_OWN for one in (before, stage))
-        several = [] if apart else before["pdalargs"].get("together", [before["pdalargs"]])
-        if apart or stage_type(several[-1]["stage"]).forgets:
-            out.append(stage)
-            continue
-        adds = dict.fromkeys([*before.get("add_dimension", ()), *stage.get("add_dimension", ())])
-        out[-1] = {**before, "pdalargs": {"together": [*several, stage["pdalargs"]]}}
-        if adds:
-            out[-1]["add_dimension"] = [*adds]
+        wired = (before.keys() - {"inputs"} | stage.keys()).intersection(PDAL_OWN)
+        if not wired and all(str(one.get("module")) in made for one in (before, stage)):
+            several = before["pdalargs"].get("together", [before["pdalargs"]])
+            if not getattr(made.get(several[-1]["label"]), "forgets", False):
+                adds = [*dict.fromkeys(before["add_dimension"] + stage["add_dimension"])]
+                joined = {"pdalargs": {"together": [*several, stage["pdalargs"]]}, "add_dimension": adds}
+                out[-1] = {**before, **joined}
+                continue
+        out.append(stage)
     return out

@@ -207,9 +207,10 @@ class Pipeline:
                     if not reports:  # newer PDAL leaves filters out where there are no points
                         reports.append(runtime.run_on_nothing(ours.stage, ours.place))
         except StageError as error:
+            failure = failure or callbacks.failure
             if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
-            raise failure or callbacks.failure or self._located(error) from None
+            raise failure or self._located(error) from None
         names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
         names |= {made: names.get(target, target) for made, target in compressed.items()}
         self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)

@@ -46,8 +46,9 @@ _OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 _reports: dict[str, list[Report]] = {}
 _failures: dict[str, StageError] = {}
 _usual_stdout: Any = sys.__stdout__
-#: Stages made in this process by label, as long as someone holds them; in another process options are parsed anew.
-made: WeakValueDictionary[str, Stage] = WeakValueDictionary()
+#: Stages made in this process, and its functions, by label, as long as someone holds them; in another process options
+#: are parsed anew.
+made: WeakValueDictionary[str, Any] = WeakValueDictionary()
 
 
 def place(type_name: str, tag: str | None) -> str:
@@ -59,14 +60,14 @@ def python_filter(
     label: str, source: str, arguments: dict[str, Any], adds: Mapping[str, str]
 ) -> dict[str, Any]:
     """A ``filters.python`` that runs `source` and adds dimensions (name -> PDAL type)."""
-    out = {
+    return {
         "type": "filters.python",
         "module": label,
         "function": "stage",
         "source": source,
         "pdalargs": arguments,
+        "add_dimension": [f"{name}={kind}" for name, kind in adds.items()],
     }
-    return {**out, "add_dimension": [f"{name}={kind}" for name, kind in adds.items()]} if adds else out
 
 
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
@@ -89,22 +90,36 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         # Only the last may give memory of PDAL's arrays back, which it does with those of a dict.
         seen = {**ins, **outs} if arguments is several[-1] else ChainMap(outs, cast(dict, ins))
         try:
-            stage = made.get(label) or _made_again(arguments)
-            report = run_on_view(stage, module, seen, outs)
-            module["out_metadata"] = node(arguments["stage"], leaves(report))
-            _reports.setdefault(label, []).append(report)
+            _run_one(arguments, label, module, seen, outs)
         except BaseException as error:
-            _failures[label] = as_stage_error(error, place(arguments["stage"], arguments.get("tag")))
-            hand_over(_failures[label], outs)
+            where = place(arguments.get("stage", "filters.python"), arguments.get("tag"))
+            failure = _failures[label] = as_stage_error(error, where)
+            outs.clear()
+            outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
+            if _redirected():  # PDAL puts it back only after a run that succeeds, and its log is gone by now
+                sys.stdout = _usual_stdout
+                pdal_env.keep(_usual_stdout)
             break
     return True
 
 
-def hand_over(failure: StageError, outs: dict[str, Any]) -> None:
-    """End a filter that failed, with its message for PDAL."""
-    outs.clear()
-    outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
-    restore_stdout()
+@pdal_env.catches
+def _run_one(
+    arguments: Mapping[str, Any],
+    label: str,
+    module: dict[str, Any],
+    ins: Mapping[str, Any],
+    outs: dict[str, Any],
+) -> None:
+    """Run a stage or a function on one view. What it raises may be anything, Ctrl-C too."""
+    pdal_env.check_interrupt()
+    stage = made.get(label) or _made_again(arguments)
+    if not isinstance(stage, Stage):
+        stage(module, ins, outs)
+        return
+    report = run_on_view(stage, module, ins, outs)
+    module["out_metadata"] = node(arguments["stage"], leaves(report))
+    _reports.setdefault(label, []).append(report)
 
 
 def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -> Points:
@@ -138,12 +153,10 @@ def _made_again(arguments: Mapping[str, Any]) -> Stage:
     return stage
 
 
-@pdal_env.catches
 def run_on_view(
     stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
 ) -> Report:
-    """Run a stage on one view; its report. What it raises may be anything, Ctrl-C too."""
-    pdal_env.check_interrupt()
+    """Run a stage on one view; its report."""
     points = points_of(stage, module, ins)
     for name in stage.reads():
         if name not in ins:
@@ -232,13 +245,6 @@ def remember_stdout() -> None:
         _usual_stdout = sys.stdout
 
 
-def restore_stdout() -> None:
-    """Put ``sys.stdout`` back: PDAL does so only after a run that succeeds, and its log is gone by now."""
-    if _redirected():
-        sys.stdout = _usual_stdout
-        pdal_env.keep(_usual_stdout)
-
-
 def _redirected() -> bool:
     return type(sys.stdout).__module__ == "redirector"  # PDAL's own type
 
@@ -255,12 +261,6 @@ remember_stdout()
 
 #: Gets the script's globals, the dimensions, and a dict for those to write back.
 Function = Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None]
-_CALLBACK = """\
-def stage(ins, outs):
-    from pdal_stages.pipeline.runtime import call_back
-    return call_back(globals(), ins, outs)
-"""
-_functions: dict[str, Function] = {}
 
 
 class Callbacks(AbstractContextManager):
@@ -269,31 +269,23 @@ class Callbacks(AbstractContextManager):
     Attributes
     ----------
     failure : StageError or None
-        What the first function that failed raised.
+        After the block: what the first function that failed raised.
     """
 
     def __init__(self) -> None:
-        self._labels: list[str] = []
+        self._functions: dict[str, Function] = {}
         self.failure: StageError | None = None
 
     def __exit__(self, *exc: object) -> None:
-        for label in self._labels:
-            _functions.pop(label, None)
+        for label in self._functions:
+            self.failure = self.failure or collect(label)[1]
+        self._functions.clear()
 
     def filter(self, function: Function, adds: Mapping[str, str] | None = None, **own: Any) -> dict[str, Any]:
         """A ``filters.python`` that calls a function and adds dimensions (name -> PDAL type); `own`: its tag, inputs."""
         label = f"pdal_stages_callback_{uuid.uuid4().hex}"
-
-        def called(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> None:
-            try:
-                function(module, ins, outs)
-            except StageError as error:
-                self.failure = self.failure or error
-                raise
-
-        _functions[label] = called
-        self._labels.append(label)
-        return {**python_filter(label, _CALLBACK, {"label": label}, adds or {}), **own}
+        self._functions[label] = made[label] = function
+        return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **own}
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """The stages, with a check before each that ends the process of old PDAL where no point is ground."""
@@ -302,13 +294,10 @@ class Callbacks(AbstractContextManager):
         out: list[dict[str, Any]] = []
         for stage in stages:
             if stage.get("type") in NEEDS_GROUND:
-                named = place(stage["type"], stage.get("tag"))
-                check = self.filter(partial(_check_ground, named))
-                check["tag"] = check["module"]
-                if "inputs" in stage:
-                    check["inputs"] = stage["inputs"]
-                stage = {**stage, "inputs": [check["tag"]]}
-                out.append(check)
+                wired = {"inputs": stage["inputs"]} if "inputs" in stage else {}
+                check = partial(_check_ground, place(stage["type"], stage.get("tag")))
+                out.append(self.filter(check, **wired))
+                stage = {key: value for key, value in stage.items() if key not in wired}
             out.append(stage)
         return out
 
@@ -325,15 +314,3 @@ def _check_ground(where: str, module: dict[str, Any], ins: Mapping[str, Any], ou
         cure="Find ground before, with filters.smrf or filters.csf, or take filters.hag_morphological, which reads no "
         "classes",
     )
-
-
-@pdal_env.catches
-def call_back(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Call the function of a filter that :class:`Callbacks` made."""
-    label = module["pdalargs"]["label"]
-    sys.modules.pop(label, None)
-    try:
-        _functions[label](module, ins, outs)
-    except BaseException as error:
-        hand_over(as_stage_error(error, "filters.python"), outs)
-    return True

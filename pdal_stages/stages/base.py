@@ -73,7 +73,8 @@ class Stage(ABC):
     #: For a stage that a model file may carry, to be run by whoever applies it: the options that the file may give. Model
     #: files come from strangers, so none that holds a path.
     in_models: ClassVar[tuple[str, ...]] = ()
-    #: Whether it forgets most dimensions early and then needs much memory: a stage after it gets the points from PDAL anew.
+    #: Whether it forgets most dimensions (:meth:`Points.keep_only`) and then needs much memory: the next stage gets the
+    #: points from PDAL anew.
     forgets: ClassVar[bool] = False
     #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read wider.
     open_ended: ClassVar[bool] = False
