@@ -26,13 +26,13 @@ import numpy as np
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.accuracy import Accuracy
-from pdal_stages.classifier.algorithms import ALWAYS, WHERE_THERE
+from pdal_stages.classifier.algorithms import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS
 from pdal_stages.classifier.model import load_model
 from pdal_stages.features.plan import SURFACES
 from pdal_stages.terrain import filtered_ground
 
 #: What ``pdal-stages train`` takes where points have it.
-DIMENSIONS = (*ALWAYS, *WHERE_THERE, "returns")
+DIMENSIONS = (*DEFAULT_DIMENSIONS, *OPTIONAL_DIMENSIONS, "returns")
 PAPERS = "c1,c2,c3,c5,s1,s2,s3,s5,kopt"
 ONE = {"passes": 1}
 FEATURES = TrainingOptions().feature_set
@@ -53,9 +53,9 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "without s5": {**ONE, "neighborhoods": "k10,k20,k50"},
         "without k10": {**ONE, "neighborhoods": "s5,k20,k50"},
         "with c2": {**ONE, "neighborhoods": "c2,s5,k10,k20,k50"},
-        "without return numbers": {**ONE, "dimensions": (*ALWAYS, *WHERE_THERE)},
-        "without heights above openings": {**ONE, "dimensions": (*ALWAYS, "Ground", "returns")},
-        "heights above ground alone": {**ONE, "dimensions": ALWAYS},
+        "without return numbers": {**ONE, "dimensions": (*DEFAULT_DIMENSIONS, *OPTIONAL_DIMENSIONS)},
+        "without heights above openings": {**ONE, "dimensions": (*DEFAULT_DIMENSIONS, "Ground", "returns")},
+        "heights above ground alone": {**ONE, "dimensions": DEFAULT_DIMENSIONS},
     },
     "surfaces": {
         "none": {},

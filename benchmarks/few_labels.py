@@ -17,7 +17,7 @@ import laspy
 import numpy as np
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.algorithms import preparing
+from pdal_stages.classifier.algorithms import preparation_module
 from pdal_stages.classifier.model import load_model
 
 #: File, what its labels become, codes that are dropped.
@@ -52,7 +52,7 @@ def scores(folder: Path, name: str, base, counts):
     table = np.zeros(256, np.int64)
     table[list(becomes)] = list(becomes.values())
     label = table[np.asarray(las.classification)[there]]
-    dimensions = dict(preparing().made_of_coordinates(base.info["preparation"], xyz, None, None))
+    dimensions = dict(preparation_module().made_of_coordinates(base.info["preparation"], xyz, None, None))
     dimensions["ReturnNumber"] = np.asarray(las.return_number)[there]
     dimensions["NumberOfReturns"] = np.asarray(las.number_of_returns)[there]
     west = xyz[:, 0] < np.median(xyz[:, 0])

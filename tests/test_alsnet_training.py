@@ -194,6 +194,9 @@ def test_resumed_training_equals_one_without_a_break(tmp_path):
     assert held["mean_f1"] == max(row["mean_f1"] for row in whole.info["training"]["curve"])
     with pytest.raises(ModelError, match=r"another training.*options"):
         fit(clouds, checkpoint=path, **{**setting, "learning_rate": 0.5})
+    other = {name: np.asarray(column)[::-1] for name, column in values.items()}
+    with pytest.raises(ModelError, match=r"another training.*data"):  # of the same places, other values
+        fit([TrainingCloud(xyz, labels, other)], checkpoint=path, **setting)
 
 
 @needs_torch

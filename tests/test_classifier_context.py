@@ -9,7 +9,7 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import passes
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.context import OWN, WHOLE, Context, around, count_shares
-from pdal_stages.classifier.passes import Asked, PassRun
+from pdal_stages.classifier.passes import PassRun, WeightedPass
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
@@ -83,7 +83,7 @@ def test_band_by_band_is_the_same(seed, kind, size):
     got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(passes, "BAND", size)
-        run = PassRun([Asked(Said(blocks=blocks), 3), Asked(Said(context), 3)], request)
+        run = PassRun([WeightedPass(Said(blocks=blocks), 3), WeightedPass(Said(context), 3)], request)
         for rows, columns in run.blocks(lambda columns, rows: columns):
             seen[rows] += 1
             got[rows] = columns

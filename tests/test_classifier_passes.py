@@ -177,7 +177,7 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.classifier.passes import Asked, predict
+    from pdal_stages.classifier.passes import WeightedPass, predict
 
     first = two.passes[0]
 
@@ -187,7 +187,7 @@ def test_a_pass_may_come_from_elsewhere(two, other):
 
         def predict(self, request, finish):
             p = np.zeros((len(request.xyz), 3))
-            for found, result in predict([Asked(first, 3)], request, lambda p: p):
+            for found, result in predict([WeightedPass(first, 3)], request, lambda p: p):
                 p[found] = result
             rows = slice(None) if request.rows is None else request.rows
             request.report.figures["batches"] = 1

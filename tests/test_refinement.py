@@ -229,7 +229,9 @@ def of_the_base(base, xyz, dimensions):
     """What a base hands on of every point of a cloud without voxels, as it is counted."""
     out = np.empty((len(xyz), len(base.classes)), np.uint16)
     request = PredictRequest(xyz, dimensions)
-    for rows, shares in predict(base.asked, request, lambda p: count_shares(weighed(p, base.factors))):
+    for rows, shares in predict(
+        base.weighted_passes, request, lambda p: count_shares(weighed(p, base.factors))
+    ):
         out[rows] = shares
     return out
 

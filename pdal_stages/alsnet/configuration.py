@@ -30,13 +30,11 @@ def _widths(what: str, value: Any) -> tuple[int, ...]:
 class Level(Settings):
     """One level of set abstraction and the feature propagation back from it."""
 
-    centers: int = setting(MISSING, "integer", "Points kept, by farthest point sampling, or all", 1, 10**7)
+    centers: int = setting(MISSING, "integer", "Points kept by farthest point sampling", 1, 10**7)
     radius: float = setting(MISSING, "number", "Radius of the ball around each center, meters", 1e-3, 1e4)
     samples: int = setting(MISSING, "integer", "Points taken from a ball", 1, 1024)
-    #: of the shared perceptron over a ball's points; the maximum over the points follows
-    mlp: tuple[int, ...] = setting(MISSING, "numbers", "Widths", check=_widths)
-    #: of the shared perceptron after interpolation to the level above
-    up: tuple[int, ...] = setting(MISSING, "numbers", "Widths", check=_widths)
+    mlp: tuple[int, ...] = setting(MISSING, "numbers", "Layer widths before max pooling", check=_widths)
+    up: tuple[int, ...] = setting(MISSING, "numbers", "Layer widths after interpolation", check=_widths)
 
 
 @dataclass(frozen=True)
@@ -46,8 +44,7 @@ class Configuration(Settings):
     name: str
     points: int = setting(MISSING, "integer", "Points of a batch: the nearest around a grid point", 16, 10**7)
     levels: tuple[Level, ...] = ()
-    #: after the last propagation; dropout follows, then one linear layer to the classes
-    head: tuple[int, ...] = setting((128,), "numbers", "Widths", check=_widths)
+    head: tuple[int, ...] = setting((128,), "numbers", "Layer widths before dropout", check=_widths)
     dropout: float = setting(0.5, "number", "Share of the head's outputs left out in training", 0.0, 0.95)
 
     def __post_init__(self) -> None:
@@ -200,33 +197,25 @@ class NetworkOptions(Settings):
 
     configuration: Any = "small"  #: the name of one of :data:`CONFIGURATIONS`, or one of your own
     points: int | None = None  #: of a batch, instead of the configuration's
-    #: None: for four batches a point
-    spacing: float | None = setting(None, "number", "Spacing of the batches' grid, meters", 0.01, 1e5)
-    #: from the batch's center
-    coordinates: str = setting("Z", "string", "Coordinates that are inputs", choices=("", "Z", "XYZ"))
-    #: each sees every chosen batch once
-    epochs: int = setting(60, "integer", "Most epochs", 1, 100_000)
-    batches_per_step: int = setting(2, "integer", "Batches whose gradients make one step", 1, 1024)
-    #: it falls to 1 % of that along a cosine
-    learning_rate: float = setting(0.002, "number", "Learning rate at the start", 1e-8, 10.0)
-    #: 1 / sqrt(share), 1 ("none") [WM19], or 1 / share ("balanced")
+    spacing: float | None = setting(None, "number", "Spacing of batches, m; default: four a point", 0.01, 1e5)
+    coordinates: str = setting("Z", "string", "Coordinates used as inputs", choices=("", "Z", "XYZ"))
+    epochs: int = setting(60, "integer", "Most epochs; each sees every chosen batch once", 1, 100_000)
+    batches_per_step: int = setting(2, "integer", "Batches per optimizer step", 1, 1024)
+    learning_rate: float = setting(0.002, "number", "Initial learning rate; falls to 1 % of it", 1e-8, 10.0)
+    #: 1 (none) [WM19], 1 / sqrt(share) or 1 / share (balanced)
     class_weights: str = setting(
-        "sqrt", "string", "Weights in the loss", choices=("none", "sqrt", "balanced")
+        "sqrt", "string", "Class weights in the loss", choices=("none", "sqrt", "balanced")
     )
-    #: batches whose class shares have a standard deviation of this or more (per cent) are not trained on: they hold next
-    #: to nothing but one class [WM19: 20 %]; 100: all are used
-    histogram_threshold: float = setting(20.0, "number", "Most uneven batch that is used", 0.0, 100.0)
-    augment: bool = setting(True, "boolean", "Turn, move, shake and thin each batch, anew in each epoch")
-    #: in whole blocks, to choose the best epoch; 0: none
-    validation: float = setting(0.2, "number", "Share of the ground held out", 0.0, 0.5)
-    block_size: float = setting(25.0, "number", "Side of those blocks, meters", 0.1, 1e6)
-    #: without a better mean F1 on the held out blocks; 0: never
-    patience: int = setting(20, "integer", "Epochs after which training ends", 0, 100_000)
-    #: where it exists, training goes on from it
-    checkpoint: str | None = setting(None, "filename", "File written after every epoch", check=_file)
+    #: batches above it are nearly all of one class and not trained on [WM19: 20 %]; 100: all are
+    histogram_threshold: float = setting(20.0, "number", "Largest spread of class shares, %", 0.0, 100.0)
+    augment: bool = setting(True, "boolean", "Rotate, shift, jitter and thin each batch, anew in each epoch")
+    validation: float = setting(0.2, "number", "Share of ground held out to choose the epoch", 0.0, 0.5)
+    block_size: float = setting(25.0, "number", "Side of the blocks held out, meters", 0.1, 1e6)
+    patience: int = setting(20, "integer", "Most epochs without a better mean F1; 0: no limit", 0, 100_000)
+    checkpoint: str | None = setting(None, "filename", "Written each epoch; resumed from", check=_file)
     #: classes it shares keep their weights, others start afresh
-    start_from: str | None = setting(None, "filename", "Model file that training starts from", check=_file)
-    device: str = setting("auto", "string", "Where it is trained", choices=("auto", "cpu", "cuda"))
+    start_from: str | None = setting(None, "filename", "Model file to start from", check=_file)
+    device: str = setting("auto", "string", "Device to train on", choices=("auto", "cpu", "cuda"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -272,8 +272,8 @@ class _Session:
             options.pop(free)
         options["start_from"] = options["start_from"] and os.path.basename(options["start_from"])
         labels = [list(self.classes.codes), [list(part) for part in self.classes.labels]]
-        data = [[len(xyz), str(hash_of(xyz.T, 0).sum())] for xyz in self.clouds]
-        data.append([int(self.position.astype(np.int64).sum())])
+        values = (*self.xyz.T, *self.columns.T, self.position)
+        data = [*map(len, self.clouds), str(hash_of(values, 0).sum())]
         return json.dumps([FORMAT, options, self.seed, self.inputs, labels, data])
 
     def _save(self, path: str) -> None:

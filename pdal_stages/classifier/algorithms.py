@@ -27,8 +27,8 @@ from ..features.index import CellGrid
 #: What every point has: the feature engine takes these from the coordinates.
 COORDINATES = ("X", "Y", "Z")
 #: What a model is trained on by default: always this, and these where points have them.
-ALWAYS = ("HeightAboveGround",)
-WHERE_THERE = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
+DEFAULT_DIMENSIONS = ("HeightAboveGround",)
+OPTIONAL_DIMENSIONS = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
 #: 1 where a person has checked a point's class.
 CHECKED = "Checked"
 
@@ -102,12 +102,14 @@ class PredictionOptions(Settings):
     """How a cloud is classified."""
 
     threads: int | None = None
-    memory_mb: float = setting(256.0, "number", "For the blocks of features under way", 1, None, unit="MB")
+    memory_mb: float = setting(256.0, "number", "Memory for blocks of points", 1, None, unit="MB")
     probabilities: bool = False  #: whether to return them
     margin: bool = False
     #: points less reliable do not get the winning class, and are counted
-    reject_below: float | None = setting(None, "number", "Least reliability", 0, 1)
-    rejected_code: int | None = setting(None, "integer", "Class of rejected points, or their old one", 0, 255)
+    reject_below: float | None = setting(None, "number", "Points with a lower Reliability are rejected", 0, 1)
+    rejected_code: int | None = setting(
+        None, "integer", "Class code for rejected points; by default they keep theirs", 0, 255
+    )
     #: as `reject_below`, for points of each class; the larger one counts
     limits: Mapping[int, float] | None = None
 
@@ -215,6 +217,6 @@ def gather(
     return out
 
 
-def preparing() -> Any:
+def preparation_module() -> Any:
     """The module that knows the stages which make dimensions; it stands above this room, and is imported when asked for."""
     return pkgutil.resolve_name("pdal_stages.stages.preparation")

@@ -17,13 +17,13 @@ from ..base.messages import Progress
 from ..base.resources import free_memory
 from ..features.engine import fit_clouds
 from ..features.returns import SOURCES
-from .algorithms import WHERE_THERE, PredictRequest, gather, required
+from .algorithms import OPTIONAL_DIMENSIONS, PredictRequest, gather, required
 from .clouds import TrainingCloud, label_classes
 from .context import OWN, Context
 from .featureforest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
 from .forest import Forest, grow_forest
 from .model import Model
-from .passes import Asked, FoldForests, sample_context
+from .passes import FoldForests, WeightedPass, sample_context
 from .sampling import BLOCK, Folds, draw_samples, figures, split
 from .summary import Sureness
 from .trainoptions import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
@@ -35,7 +35,7 @@ PASS_FOLDS = 5
 #: In the counts: samples of tiles whose nearest neighbors lie beyond the halo of their features.
 SHORT = "short_of_neighbors"
 
-optional_inputs = {**{name: (name,) for name in WHERE_THERE}, "returns": SOURCES}
+optional_inputs = {**{name: (name,) for name in OPTIONAL_DIMENSIONS}, "returns": SOURCES}
 
 
 def outputs(options: TrainingOptions) -> list[Output]:
@@ -329,7 +329,7 @@ class _ForestTraining:
         """(samples, columns): what a pass reads of those before, a base's and forests that have not seen the samples."""
         o, context = self.options, self.reads[number]
         assert context is not None
-        base = [] if self.base is None else self.base.asked
+        base = [] if self.base is None else self.base.weighted_passes
         classes = len(self._codes_after(number - 1)) if number else base[-1].classes
         out = np.empty((len(self.samples), len(context.tokens) * classes), np.float32)
         with self.progress(
@@ -343,7 +343,7 @@ class _ForestTraining:
                 if folds is not None:
                     fold = folds.points(cloud.xyz, self.flights[place])
                     each = (FoldForests(forests, fold) for forests in held_out)
-                    mine = [Asked(one, len(self._codes_after(k))) for k, one in enumerate(each)]
+                    mine = [WeightedPass(one, len(self._codes_after(k))) for k, one in enumerate(each)]
                 request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
                 out[at] = sample_context([*base, *mine], request, context)
         return out

@@ -25,12 +25,12 @@ from .algorithms import (
     PredictRequest,
     algorithm,
     known,
-    preparing,
+    preparation_module,
     required,
     welcome,
 )
 from .featureforest import weighed
-from .passes import Asked, plan_of, predict
+from .passes import WeightedPass, plan_of, predict
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1
@@ -76,11 +76,11 @@ class Model:
         return None if priors is None else np.array(priors["factors"])
 
     @property
-    def asked(self) -> list[Asked]:
-        """Its passes, to ask what it says."""
+    def weighted_passes(self) -> list[WeightedPass]:
+        """Its passes, each with what its probabilities are weighted by."""
         given = [one.get("factors") for one in self.info["passes"][:-1]]
         factors = [*(None if one is None else np.array(one) for one in given), self.factors]
-        return list(map(Asked, self.passes, map(len, self.codes_of), factors))
+        return list(map(WeightedPass, self.passes, map(len, self.codes_of), factors))
 
     @property
     def required_dimensions(self) -> tuple[str, ...]:
@@ -216,7 +216,9 @@ class Model:
         request = PredictRequest(xyz, given, rows, how.threads, how.memory_mb, shown, grid)
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
-        for at, decided in predict(self.asked, request, lambda p: decide(weighed(p, factors), codes, how)):
+        for at, decided in predict(
+            self.weighted_passes, request, lambda p: decide(weighed(p, factors), codes, how)
+        ):
             place: Any = slice(None)
             if order is not None:
                 at = order[at]
@@ -258,7 +260,7 @@ class Model:
         if not missing:
             return given
         usable = None if ignore is None else ~np.asarray(ignore, bool)
-        made = preparing().made_of_coordinates(preparation, xyz, usable, threads)
+        made = preparation_module().made_of_coordinates(preparation, xyz, usable, threads)
         if made.keys() & given.keys() and made.keys() & set(missing):  # heights of two kinds would be mixed
             raise DimensionError(
                 f"the dimension {missing[0]} is missing",
@@ -334,14 +336,16 @@ def load_model(path: str | os.PathLike) -> Model:
     try:
         model = assemble(*modelfile.read(file, lambda name: algorithm(name).rules))
         if asked := model.info.get("preparation"):
-            model.info["preparation"] = preparing().check(asked)
+            model.info["preparation"] = preparation_module().check(asked)
         return model
     except ModelError as error:
         near = "" if os.path.lexists(name) else suggest(name, modelfile.shipped())
         error.cure = f"{near}{error.cure or modelfile.CURE}"
         raise error.at(file) from error.__cause__
     except OptionError as error:  # a feature of another release, say
-        raise ModelError("the model asks for what is not known here", where=file, found=error) from error
+        raise ModelError(
+            "the model needs what this release does not have", where=file, found=error
+        ) from error
 
 
 def loaded_model(path: str) -> Model:

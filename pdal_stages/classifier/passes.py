@@ -69,27 +69,27 @@ class FoldForests:
         return out
 
 
-class Asked(NamedTuple):
-    """A pass that is asked."""
+class WeightedPass(NamedTuple):
+    """A pass, and what its probabilities are weighted by."""
 
     #: It has `features` (None where it reads context alone), `context` (None for the first), and
     #: ``probabilities(read, rows)``, (b, classes) of points by their features and then their context, side by side.
-    #: A first one without features is asked as the kind it is.
-    one: Any
+    #: A first one without features is applied by its own ``predict``.
+    classifier: Any
     classes: int
     #: (classes,) what these probabilities are multiplied by before they are handed on
     factors: npt.NDArray[np.float64] | None = None
 
 
 def predict(
-    passes: Sequence[Asked], request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
+    passes: Sequence[WeightedPass], request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
 ) -> Iterator[tuple[Any, Any]]:
     """Classify by some passes: (rows, what `finish` made of them) block by block.
 
     `finish` makes the results of the (b, classes) float64 probabilities of a block, which it may change, in a worker's
     thread where there are any.
     """
-    last = passes[-1].one
+    last = passes[-1].classifier
     if len(passes) == 1 and last.features is None:
         yield from last.predict(request, finish)
         return
@@ -97,12 +97,12 @@ def predict(
 
 
 def sample_context(
-    passes: Sequence[Asked], request: PredictRequest, context: Context
+    passes: Sequence[WeightedPass], request: PredictRequest, context: Context
 ) -> npt.NDArray[np.float32]:
     """(m, columns): the context that some passes give the m points asked for, ascending."""
     asked: Any = request.rows
     out = np.empty((len(asked), len(context.tokens) * passes[-1].classes), np.float32)
-    last = Asked(SimpleNamespace(context=context, features=None), 0)
+    last = WeightedPass(SimpleNamespace(context=context, features=None), 0)
     for rows, columns in PassRun([*passes, last], request).blocks(lambda columns, rows: columns):
         out[np.searchsorted(asked, rows)] = columns
     return out
@@ -111,9 +111,9 @@ def sample_context(
 class PassRun:
     """Passes at work on one cloud; of the last only its features and context are looked at."""
 
-    def __init__(self, passes: Sequence[Asked], request: PredictRequest) -> None:
-        members = [asked.one for asked in passes]
-        self._members, self._request, self._factors = members, request, [asked.factors for asked in passes]
+    def __init__(self, passes: Sequence[WeightedPass], request: PredictRequest) -> None:
+        members = [each.classifier for each in passes]
+        self._members, self._request, self._factors = members, request, [each.factors for each in passes]
         wanted = [request.rows]  # of each pass
         for one in members[:0:-1]:
             wanted.insert(0, around(request.xyz, wanted[0], one.context))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..features.index import check_xyz
-from .algorithms import ALWAYS, WHERE_THERE, preparing, required, trainer
+from .algorithms import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS, preparation_module, required, trainer
 from .clouds import TrainingCloud, prepared, spooled
 from .context import Context
 from .model import Model
@@ -98,10 +98,12 @@ def _prepared(
     xyz: npt.NDArray[np.float64], labels: npt.ArrayLike, options: TrainingOptions
 ) -> tuple[dict[str, npt.NDArray[Any]], TrainingOptions, list[dict[str, Any]]]:
     """Heights of bare points, the options that use them, and the stage that makes them."""
-    if tuple(options.dimensions) == ALWAYS:
+    if tuple(options.dimensions) == DEFAULT_DIMENSIONS:
         more = trainer(options.algorithm).optional_inputs
-        options = replace(options, dimensions=(*ALWAYS, *(name for name in WHERE_THERE if name in more)))
-    preparation = preparing().preparation_of(required(options.inputs))
+        options = replace(
+            options, dimensions=(*DEFAULT_DIMENSIONS, *(name for name in OPTIONAL_DIMENSIONS if name in more))
+        )
+    preparation = preparation_module().preparation_of(required(options.inputs))
     usable = ~np.isin(np.asarray(labels), options.ignore)
-    made = preparing().made_of_coordinates(preparation, xyz, usable, options.threads)
+    made = preparation_module().made_of_coordinates(preparation, xyz, usable, options.threads)
     return made, options, preparation

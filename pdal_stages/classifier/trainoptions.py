@@ -50,13 +50,13 @@ class TrainingOptions(Settings):
     dimensions: Sequence[str] = setting(
         ("HeightAboveGround",),
         "list",
-        "Dimensions of the points that are used as features too, e.g. HeightAboveGround, Intensity, or returns (all return "
+        "Dimensions of the points to use as features as well, e.g. HeightAboveGround, Intensity, or returns (all return "
         "features)",
     )
     classes: Any = setting(
         None,
         "mapping",
-        'Codes, e.g. 2,5,6, or labels and what they become: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: '
+        'Class codes, e.g. 2,5,6, or labels and their classes: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: '
         "every label but 0, 1, 7, 12 and 18",
     )
     strategy: str = setting(
@@ -78,7 +78,8 @@ class TrainingOptions(Settings):
     max_samples: float | None = setting(
         None,
         "number",
-        f"Share of the samples a tree draws; default: a third, on average {LEAST_PER_TREE:,} to {PER_TREE:,} of each class",
+        f"Share of the samples drawn for each tree; default: a third, on average {LEAST_PER_TREE:,} to {PER_TREE:,} of each "
+        "class",
         *(0, 1),
         exclusive=True,
     )
@@ -90,23 +91,25 @@ class TrainingOptions(Settings):
     prior_weight: float = setting(
         0.2,
         "number",
-        "0: all classes count as equally frequent, as they are sampled; 1: each as frequent as in the training points",
+        "Weight of class frequency, from 0 (all equally frequent, as sampled) to 1 (as in the training points)",
         *(0, 1),
     )
     thin: Sequence[float] = setting(
         (),
         "numbers",
-        "Points per square meter of sparser copies to train on as well, so that the model bears sparse clouds",
+        "Densities of thinned copies to train on as well, points/m2, so that the model also works on sparse clouds",
     )
     voxel: float = setting(
         0.125,
         "number",
-        "Side of voxels: in training and in classifying one point represents each, and the others get its class; 0 for none",
+        "Voxel size: in training and classifying one point represents each voxel, the others get its class; 0 for none",
         *(0, LARGEST),
         unit="m",
     )
     ignore: Sequence[int] = setting(
-        NOISE, "list", "Labels whose points are not even neighbors, unless `classes` names them: noise"
+        NOISE,
+        "list",
+        "Labels of points to leave out, even as neighbors, unless 'classes' names them; default: noise",
     )
     folds: int | None = setting(
         None,
@@ -117,20 +120,20 @@ class TrainingOptions(Settings):
     groups: str = setting(
         "",
         "string",
-        "Dimension whose points of one value are held out together, such as the number of a tile or flight, so that the "
-        "score is of tiles or flights that the model has not seen",
+        "Dimension, such as the number of a tile or flight, whose points of the same value are held out together, so that "
+        "the score is for tiles or flights that the model has not seen",
     )
     passes: Any = setting(
         None,
         "integer",
-        "Forests one after the other, each reading what the one before says of the surroundings; default 2, on a base 1",
+        "Number of forests in succession, each using what the previous one found around a point; default 2, or 1 on a base",
         *(1, MOST_PASSES),
     )
     context: Any = setting(
         None,
         "list",
-        "What passes after the first read: own, or box, boxvotes, column, columnvotes and a cell's side (box0.5); default: "
-        f"{','.join(DEFAULT_CONTEXT)}, of one pass on top of a base {','.join(CONTEXT_OF_BASE)}, of several own besides",
+        "What passes after the first use: own, or box, boxvotes, column, columnvotes and a cell size (box0.5); default: "
+        f"{','.join(DEFAULT_CONTEXT)}; with a base {','.join(CONTEXT_OF_BASE)}, or for several passes own and the former",
     )
     base: Any = setting(
         None,
@@ -201,7 +204,7 @@ class TrainingOptions(Settings):
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
-            raise OptionError("'target' means something only with strategy 'binary'", found=self.target)
+            raise OptionError("'target' applies only to strategy 'binary'", found=self.target)
         m = self.max_features
         share = isinstance(m, float | np.floating) and 0.0 < m <= 1.0
         whole = isinstance(m, int | np.integer) and not isinstance(m, bool) and m >= 1
@@ -221,9 +224,7 @@ class TrainingOptions(Settings):
         checks.one_of("'algorithm'", self.algorithm, ALGORITHMS)
         for name in ALGORITHMS:  # an algorithm's own options stand under its name
             if name != self.algorithm and getattr(self, name, None):
-                raise OptionError(
-                    f"'{name}' means something only with algorithm '{name}'", found=self.algorithm
-                )
+                raise OptionError(f"'{name}' applies only to algorithm '{name}'", found=self.algorithm)
         own = trainer(self.algorithm).own_options(getattr(self, self.algorithm, None))
         if own is not None:
             object.__setattr__(self, self.algorithm, own)

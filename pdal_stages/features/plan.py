@@ -294,15 +294,16 @@ class FeaturePlan:
     def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
         """The plan that :meth:`to_dict` described; OptionError where it is not such a description."""
         lists = ("neighborhoods", "features", "dimensions")
-        tokens, words, dimensions = (data.get(name) if isinstance(data, Mapping) else None for name in lists)
-        for value in (tokens, words, dimensions):
+        given: list[Any] = [data.get(name) if isinstance(data, Mapping) else None for name in lists]
+        for value in given:
             if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
                 raise OptionError(
                     f"a feature plan needs lists of text: {', '.join(lists)}", found=repr(data)[:80]
                 )
+        tokens, words, dimensions = given
+        members = data.get("least_members", LEAST_MEMBERS)
+        least = checks.whole("'least_members' of a feature plan", members, 3, 100)
         parsed = tuple(parse_neighborhoods(tokens))
-        given = data.get("least_members", LEAST_MEMBERS)
-        least = checks.whole("'least_members' of a feature plan", given, 3, 100)
         return cls(parsed, parse_feature_set(words), tuple(dict.fromkeys(dimensions)), least)
 
 

@@ -31,31 +31,33 @@ class ObjectSettings(Settings):
         0.05,
         100,
     )
-    building_height: float = _setting(1.5, "A building's cells are at least so high above the ground", 0, 100)
-    building_area: float = _setting(4.0, "Smaller buildings are left out", 0, 10_000, "m2")
+    building_height: float = _setting(1.5, "Least height of a building's cells above the ground", 0, 100)
+    building_area: float = _setting(
+        4.0, "Least area of a building; smaller ones are left out", 0, 10_000, "m2"
+    )
     step: float = _setting(
         2.5,
-        "Roofs that differ by more along two thirds of their border are two buildings; 0 parts none",
+        "Height difference that separates two buildings, along two thirds of their roofs' border; 0 separates none",
         0,
         100,
     )
     roof_part: float = _setting(
-        10.0, "Smaller parts of a roof (dormers) go with their neighbor", 0, 10_000, "m2"
+        10.0, "Least area of a roof part; smaller ones (dormers) join their neighbor", 0, 10_000, "m2"
     )
-    tree_height: float = _setting(3.0, "Lower plants are not trees", 0, 100)
-    tree_area: float = _setting(1.0, "Trees with smaller crowns are left out", 0, 1000, "m2")
-    saddle: float = _setting(0.3, "Tops are of one tree where the way between them goes down by less", 0, 10)
+    tree_height: float = _setting(3.0, "Least height of a tree", 0, 100)
+    tree_area: float = _setting(1.0, "Least area of a tree's crown", 0, 1000, "m2")
+    saddle: float = _setting(0.3, "Depth of the saddle in the canopy that separates two trees", 0, 10)
     smoothing: float = _setting(0.3, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
     dbh_factor: float = _setting(
         0.557,
-        "Of `dbh`, a stem's diameter at breast height: factor times (height times crown's diameter) to the power of "
-        "`dbh_power`, by Jucker and others 2017, who give both for the forests of each region, too",
+        "For the stem diameter at breast height, `dbh`: dbh_factor times (height times crown diameter) to the power of "
+        "dbh_power (Jucker and others 2017, who also give both for the forests of each region)",
         0,
         10,
         "",
     )
-    dbh_power: float = _setting(0.809, "See `dbh_factor`", 0, 2, "")
-    span_gap: float = _setting(2.0, "Wires with larger gaps are two spans", 0.5, 20)
+    dbh_power: float = _setting(0.809, "See dbh_factor", 0, 2, "")
+    span_gap: float = _setting(2.0, "Gap between wires that separates two spans", 0.5, 20)
 
 
 @dataclass

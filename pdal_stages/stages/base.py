@@ -82,7 +82,7 @@ class Stage(ABC):
     where: str | None = option(
         "expression",
         None,
-        "Points the stage acts on; the others stay as they are but serve as neighbors (PDAL's own filters do not see them)",
+        "Points the stage acts on; the others are not changed but still serve as neighbors (unlike in PDAL's own filters)",
     )
     threads: int = option(
         "integer", 0, "Threads to use; 0 takes every available core", minimum=0, maximum=1024

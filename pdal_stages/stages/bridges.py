@@ -18,7 +18,7 @@ _MISTAKEN = (2, 6)
 
 class Bridges(ClassStage):
     type = "filters.bridges"
-    summary = "Give bridge decks their class, which leave ground and buildings"
+    summary = "Classify bridge decks, which are then no longer ground or building"
     where_help = "Points outside keep their class."
     code: int = code_option(BRIDGE, "Class code of bridge decks")
     ignore: Selection = ignore_option("Points that keep their class")

@@ -24,7 +24,7 @@ from .points import class_counts
 SURE = 0.95
 
 
-class Looked(NamedTuple):
+class CheckedPoints(NamedTuple):
     """Points of a part that samples may be drawn from."""
 
     wanted: NDArray[np.bool_]  #: (n,) those that a person checked
@@ -64,7 +64,7 @@ class CheckedChoice:
         """Whether any point was checked."""
         return self._checked > 0
 
-    def mask(self, looked: Looked, xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def mask(self, looked: CheckedPoints, xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which points of a part samples are drawn from."""
         out = looked.wanted.copy()
         for code, share in self._shares.items():
@@ -72,8 +72,8 @@ class CheckedChoice:
             out[mine[hash_of(xyz[mine].T, self._seed) / 2.0**64 < share]] = True
         return out
 
-    def say(self, report: Report) -> None:
-        """What is to be known of it."""
+    def report_to(self, report: Report) -> None:
+        """Note and count in a report what samples are drawn from."""
         number = report.figures["checked"] = self._wanted
         said = f"{number:,} of {self._points:,} points were checked by a person ({CHECKED}): samples are drawn from these"
         if self._known is not None:

@@ -15,7 +15,15 @@ from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
 from ..base.messages import Report
 from ..classifier import summary
-from ..classifier.algorithms import ALGORITHMS, ALWAYS, CHECKED, gather, required, trainer, welcome
+from ..classifier.algorithms import (
+    ALGORITHMS,
+    CHECKED,
+    DEFAULT_DIMENSIONS,
+    gather,
+    required,
+    trainer,
+    welcome,
+)
 from ..classifier.classes import ClassMap
 from ..classifier.clouds import TrainingCloud
 from ..classifier.foresttraining import SHORT
@@ -25,7 +33,7 @@ from ..classifier.summary import of_the_base
 from ..classifier.training import train
 from ..classifier.trainoptions import TrainingOptions
 from .base import Stage, files_read
-from .checked import SURE, CheckedChoice, Looked
+from .checked import SURE, CheckedChoice, CheckedPoints
 from .options import option
 from .points import Points
 from .preparation import check
@@ -84,26 +92,26 @@ class ClassifierModel(Stage):
     survey: str = option(
         "string",
         "",
-        "Dimension that tells surveys apart: points of another value are not neighbors, and surveys weigh alike",
+        "Dimension that numbers the surveys: points of different surveys are not neighbors, and surveys have equal weight",
     )
     checked_only: bool = option(
         "boolean",
         True,
-        f"Where points have the dimension {CHECKED} (of the command corrections), and it is not 0 everywhere, draw samples "
-        "only from those where it is 1",
+        f"If points have the dimension {CHECKED} (from the command corrections), and it is not 0 everywhere, draw samples "
+        "only where it is 1",
     )
     thin: list = trained("thin", may_be_empty=True)
     voxel: float = trained("voxel")
     ignore: Selection = option(
         "selection",
         UNWANTED,
-        "Points that are not even neighbors: labels (unless 'classes' names them), ranges of other dimensions such as "
+        "Points to leave out, even as neighbors: labels (unless 'classes' names them), ranges of other dimensions such as "
         "ReturnNumber[0:0], or the word withheld",
         may_be_empty=True,
     )
     passes: int | None = trained("passes")
     context: list | None = trained("context")
-    files: list = option("list", (), "Files that the model names; default: those of the readers")
+    files: list = option("list", (), "Input files that the model file names; default: those of the readers")
     memory: int = trained(
         "memory_mb", kind="integer", default=512, name="memory", minimum=16, exclusive=False, maximum=None
     )
@@ -144,7 +152,7 @@ class ClassifierModel(Stage):
         values = {name: value for name, value in self.options.items() if name in _TRAINING}
         values["max_features"] = _number(values["max_features"])
         if self.automatic:
-            values["dimensions"] = ALWAYS
+            values["dimensions"] = DEFAULT_DIMENSIONS
         values["ignore"] = self.ignore.codes
         values["base"] = None if self.base is None else loaded_model(self.base)
         return TrainingOptions(**values, memory_mb=self.memory)
@@ -170,7 +178,7 @@ class ClassifierModel(Stage):
             return self.training
         optional = self._trainer.optional_inputs
         there = [name for name, needs in optional.items() if all(one in points.arrays for one in needs)]
-        return replace(self.training, dimensions=(*ALWAYS, *there))
+        return replace(self.training, dimensions=(*DEFAULT_DIMENSIONS, *there))
 
     def check(self) -> None:
         self.training.inputs  # noqa: B018  words that mean nothing are refused
@@ -237,8 +245,8 @@ class ClassifierModel(Stage):
         report.figures |= {"model": self.filename, **shown}
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
-                f"{held:,} of {all_:,} samples of class {code} are, to the base, of a class that no label has, and stay it: "
-                "label some of that class too, or find this one alone (strategy binary, target)"
+                f"the base assigns {held:,} of {all_:,} samples of class {code} to classes without labels, where they stay: "
+                "label some of those classes too, or train this class alone (strategy binary, target)"
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(
@@ -257,18 +265,18 @@ class ClassifierModel(Stage):
             report.notes.append(report.figures["score"])
 
     def choice(self, parts: Iterable[Mapping[str, Any]]) -> CheckedChoice:
-        """What chooses points to draw samples from, where some were checked by a person; `parts` as `looked` counts them."""
+        """What chooses points to draw samples from, where some were checked by a person: by :meth:`CheckedPoints.counts`."""
         known = None if self.base is None else loaded_model(self.base).codes.tolist()
         return CheckedChoice(known, self.seed, parts)
 
-    def looked(self, points: Points) -> tuple[Looked, dict[str, Any]]:
+    def checked_points(self, points: Points) -> tuple[CheckedPoints, dict[str, Any]]:
         """Which points a person checked, and of which others the base is sure; their counts."""
         arrays, codes = points.arrays, points.codes_of(self.label)
         checked = np.asarray(arrays[CHECKED]) > 0 if CHECKED in arrays else np.zeros(points.count, np.bool_)
         sure = np.zeros(points.count, np.bool_)
         if self.base and "Reliability" in arrays:
             sure = np.asarray(arrays["Reliability"]) >= SURE
-        looked = Looked(checked & points.inside, sure & points.inside & ~checked, codes)
+        looked = CheckedPoints(checked & points.inside, sure & points.inside & ~checked, codes)
         return looked, looked.counts(int(np.count_nonzero(checked)))
 
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
@@ -276,11 +284,11 @@ class ClassifierModel(Stage):
         the checked ones alone."""
         if CHECKED not in points.arrays or not self.checked_only:
             return points.mask
-        looked, counts = self.looked(points)
+        looked, counts = self.checked_points(points)
         choice = self.choice([counts])
         if not choice:
             return points.mask
-        choice.say(points.report)
+        choice.report_to(points.report)
         return choice.mask(looked, points.xyz)
 
     def surveys(self, cloud: TrainingCloud) -> list[tuple[float, TrainingCloud]]:

@@ -19,21 +19,23 @@ class Consistency(ClassStage):
     ground: bool = option(
         "boolean",
         True,
-        "A building that a ground filter calls ground, below 0.3 m and 2 m from all that stands, is ground",
+        "Building points below 0.3 m that the ground filter calls ground, with nothing tall within 2 m, become ground",
     )
     islands: bool = option(
         "boolean",
         True,
-        "Ground more than 2 m above the terrain is what its neighbors are, building or vegetation",
+        "Ground points more than 2 m above the terrain take their neighbors' class, building or vegetation",
     )
     lone: bool = option(
-        "boolean", True, "A lone building or leaf among at least ten of the other is of their class"
+        "boolean",
+        True,
+        "A single building or vegetation point among ten or more of the other takes their class",
     )
     vegetation_heights: tuple[float, float] | None = vegetation_heights_option(
-        "what becomes vegetation is low (3) below the first, medium (4) below the second and high (5) above; without "
-        "heights it is what most vegetation around it is, high where there is none"
+        "points that become vegetation are low (3) below the first, medium (4) below the second and high (5) above; "
+        "without heights they take the class of most vegetation around, or high"
     )
-    ignore: Selection = ignore_option("Points that are neither neighbors nor changed")
+    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
     keep: Selection = keep_option()
 
     @property

@@ -20,14 +20,14 @@ class DetachedNoise(ClassStage):
     cluster: int = option(
         "integer",
         60,
-        "The most points of a cluster of noise; one that others lie above may have more",
+        "Most points of a noise cluster; clusters with points above them may have more",
         minimum=1,
         maximum=1_000_000,
     )
     gap: float = option(
         "number",
         2.5,
-        "How far above everything near high noise lies at least; more in clouds below 3 points/m2",
+        "Least height of high noise above everything nearby; more in clouds of less than 3 points/m2",
         minimum=0,
         exclusive=True,
         maximum=1000,
@@ -36,7 +36,7 @@ class DetachedNoise(ClassStage):
     depth: float = option(
         "number",
         1.0,
-        "How far below the ground low noise lies at least; more where the ground is rough",
+        "Least depth of low noise below the ground; more where the ground is rough",
         minimum=0,
         exclusive=True,
         maximum=1000,
@@ -44,7 +44,7 @@ class DetachedNoise(ClassStage):
     )
     low_class: int = code_option(NOISE[0], "Class code of low noise")
     high_class: int = code_option(NOISE[1], "Class code of high noise")
-    ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
+    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
 
     def halo_m(self) -> float:
         return REACH

@@ -77,7 +77,7 @@ class HagMorphological(Stage):
     threshold: float = option(
         "number",
         0.5,
-        "How far from the surface through the ground a point may lie and still be ground",
+        "Largest distance of a ground point from the ground surface",
         minimum=0,
         maximum=1000,
         unit="m",
@@ -85,7 +85,7 @@ class HagMorphological(Stage):
     scalar: float = option(
         "number", 1.25, "Added to the threshold per unit of the terrain's slope", minimum=0, maximum=1000
     )
-    ignore: Selection = ignore_option("Points that cannot be ground but still receive heights")
+    ignore: Selection = ignore_option("Points that are not ground but still receive heights")
     ground: bool = option(
         "boolean", False, "Also write Ground: 1 where the filter calls the point ground, else 0"
     )
@@ -93,14 +93,14 @@ class HagMorphological(Stage):
     openings: list[float] = option(
         "numbers",
         (),
-        "Also write heights above openings of the minimum grid with windows of these widths in meters, e.g. 5,9,17,33,65: "
-        "HeightAboveOpening_5, ...",
+        "Also write heights above morphological openings of the minimum grid with windows of these widths in meters, e.g. "
+        "5,9,17,33,65: HeightAboveOpening_5, ...",
         may_be_empty=True,
     )
     decks: bool = option(
         "boolean",
         False,
-        "Also find bridge decks, which then are not ground, and write Deck: 1 on a deck, 2 its parapets, flanks and what "
+        "Also find bridge decks, which then are not ground, and write Deck: 1 on a deck, 2 for its parapets, sides and what "
         "stands on it, else 0",
     )
 

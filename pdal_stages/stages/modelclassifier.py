@@ -49,7 +49,7 @@ class ModelClassifier(Stage):
     reject_below: float | None = option(
         "number",
         None,
-        "Points less reliable than this do not get the winning class; they are counted",
+        "Points with a lower Reliability are rejected: they do not get the winning class, and are counted",
         minimum=0,
         maximum=1,
     )
@@ -63,12 +63,10 @@ class ModelClassifier(Stage):
         minimum=0.5,
         maximum=0.999,
     )
-    ignore: Selection = ignore_option(
-        "Points that are neither neighbors nor classified, and keep their class"
-    )
+    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
     keep: Selection = keep_option(
-        "Points that are neighbors but keep the class they have, written as for ignore; 12 (overlap of strips) says of a "
-        "point what a class would overwrite"
+        "Points that are neighbors but keep their class, written as for ignore; default: 12, overlap of strips, which "
+        "classifying would overwrite"
     )
     vegetation_heights: tuple[float, float] | None = vegetation_heights_option(
         "vegetation (5) below them becomes low (3) and medium (4)"
@@ -76,8 +74,8 @@ class ModelClassifier(Stage):
     compact: bool = option(
         "boolean",
         False,
-        "Round the heights that the points have to 1/32 of Z's unit, Reliability and its like to 1/64: compressed, they "
-        "take a third of the bytes",
+        "Round HeightAboveGround to 1/32 of Z's unit, Reliability, Margin and probabilities to 1/64: compressed, they take "
+        "a third of the bytes",
     )
     memory: int = option(
         "integer", 256, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"

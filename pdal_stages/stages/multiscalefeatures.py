@@ -49,14 +49,14 @@ class MultiscaleFeatures(Stage):
         "filename",
         None,
         "JSON file with the thresholds of shape histograms and curvature: read if it exists, otherwise fitted to "
-        "these points and written, so that other tiles use the same ones",
+        "these points and written, so that other clouds can use the same ones",
     )
-    ignore: Selection = ignore_option("Points that are not neighbors and get no features")
+    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and get no features")
     voxel: float = option(
         "number",
         0.0,
-        "Side of voxels, for very dense clouds: features are those of a cloud of one point per voxel, and each point takes "
-        "its voxel's; 0 for none",
+        "Voxel size, for very dense clouds: features are computed for one point per voxel, and its other points get the "
+        "same; 0 for none",
         minimum=0,
         maximum=LARGEST,
         unit="m",

@@ -50,11 +50,11 @@ class ObjectOptions:
     refuse: list[str] = option(
         "list",
         (),
-        "Objects with one of these reasons to be checked are none (filters.objects: their points change their class), and "
+        "Reject objects with any of these reasons to be checked (filters.objects: their points get refused_class); they are "
         f"counted: {', '.join(REASONS)}",
         may_be_empty=True,
     )
-    ignore: Selection = ignore_option("Points of no object")
+    ignore: Selection = ignore_option("Points that belong to no object")
 
     options: dict[str, Any]
     own_points: str
@@ -129,9 +129,9 @@ class ObjectsFilter(ObjectOptions, Stage):
     judged: bool = option(
         "boolean",
         False,
-        "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area, of spans their length)",
+        "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area; of spans the length)",
     )
-    refused_class: int = code_option(1, "The class that they get")
+    refused_class: int = code_option(1, "Class code for the points of objects that 'refuse' rejects")
 
     def reads(self) -> list[str]:
         return ["Classification"]

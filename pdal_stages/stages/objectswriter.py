@@ -31,7 +31,7 @@ class ObjectsWriter(ObjectOptions, Stage):
     outlines: str = option(
         "string",
         STRAIGHT,
-        "Outlines of buildings and decks: straight, along walls, or along cells",
+        "Outlines of buildings and decks: straight, along walls, or along the grid's cells",
         choices=(STRAIGHT, CELLS),
     )
 

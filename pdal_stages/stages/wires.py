@@ -17,14 +17,14 @@ from .selection import Selection
 
 class Wires(ClassStage):
     type = "filters.wires"
-    summary = "Give wires their class, long thin lines that hang in the air, and the towers that hold them"
+    summary = "Classify wires, long thin lines in the air, and the towers that carry them"
     where_help = "Points outside keep their class but still serve as neighbors."
     code: int = code_option(WIRE, "Class code of wires")
     towers: bool = option(
         "boolean", False, "Also give towers and poles their class, where wires end and meet"
     )
     tower_code: int = code_option(TOWER, "Class code of towers and poles")
-    ignore: Selection = ignore_option("Points that are as good as not there, and keep their class")
+    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
     keep: Selection = keep_option()
 
     def reads(self) -> list[str]:

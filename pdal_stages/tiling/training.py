@@ -29,7 +29,7 @@ from ..pipeline.inputs_outputs import check_readers, is_ept, is_las, overridden,
 from ..pipeline.read import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views, python_filter
-from ..stages.checked import CheckedChoice, Looked
+from ..stages.checked import CheckedChoice, CheckedPoints
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
 from ..stages.preparation import preparation_of
@@ -260,7 +260,7 @@ class TrainTask:
         looked = (job.record["looked"] for job in run.tiles if "looked" in job.record)
         choice = self.stage.choice(looked) or None  # what samples are drawn from, where a person checked any
         if choice:
-            choice.say(report)
+            choice.report_to(report)
         for job in run.tiles:
             if "dimensions" in job.record:
                 assert job.outputs is not None
@@ -293,7 +293,7 @@ def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCl
     arrays = load_arrays(path)
     wanted, sure = (arrays.pop(f"d/{mark}", np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
     if choice is not None:
-        arrays["mask"] = choice.mask(Looked(wanted, sure, arrays["labels"]), arrays["xyz"])
+        arrays["mask"] = choice.mask(CheckedPoints(wanted, sure, arrays["labels"]), arrays["xyz"])
     return TrainingCloud(arrays["xyz"], arrays["labels"], name=name).having(arrays)
 
 
@@ -320,7 +320,7 @@ class Taking:
         marks: dict[str, NDArray] = {}
         looked: dict[str, Any] = {}
         if stage.checked_only:
-            found, counts = stage.looked(points)
+            found, counts = stage.checked_points(points)
             marks, looked = {_WANTED: found.wanted, _SURE: found.sure}, {"looked": counts}
         save_arrays(outputs[0], stage.cloud_of(points, training, marks).arrays)
         return {
