@@ -103,9 +103,10 @@ def _plane_under(low, j, i, radius, blocks, inner=-1):
 
 
 @njit
-def _supported(base, out):
+def _supported(base):
     """Columns with enough others of their level around."""
     h, w = base.shape
+    out = np.empty((h, w), np.bool_)
     for j in range(h):
         for i in range(w):
             level, seen = 0, 0
@@ -115,6 +116,7 @@ def _supported(base, out):
                         seen += base[b, a] < np.inf
                         level += abs(base[b, a] - base[j, i]) <= LEVEL
             out[j, i] = level > SUPPORT + SUPPORT_SHARE * seen
+    return out
 
 
 @device
@@ -161,15 +163,14 @@ def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -
     `low` (h, w) has the lowest of what may be in each column, `base` that of what is not, both ``inf`` where there is none;
     `side` is that of a column, and what is below the ground is so by `depth` at least; meters.
     """
-    limit, supported = np.full(low.shape, -np.inf), np.zeros(low.shape, bool)
-    _supported(base, supported)
+    limit, supported = np.full(low.shape, -np.inf), _supported(base)
     # Where all around lies lower, no plane through it runs above.
     highest = highest_around(np.where(np.isfinite(base), base, -HOLE).astype(np.float32), NEAR, 0)
     _limits(np.where(low < highest, low, np.inf), base, supported, side, depth, limit)
     deep = limit > -np.inf
     if deep.any():
         every = np.minimum(low, base)
-        _supported(np.where(deep, np.inf, every), supported)
+        supported = _supported(np.where(deep, np.inf, every))
         closed = deep & (sums_around(supported, NEAR) <= CLOSED * sums_around(every < np.inf, NEAR))
         _take_level(every, *np.nonzero(closed), side, depth, limit)
     return limit

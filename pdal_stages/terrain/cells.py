@@ -65,9 +65,6 @@ class CellWindow(NamedTuple):
         return slice(int(j0), int(j1)), slice(int(i0), int(i1))
 
 
-_Piece = tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]
-
-
 @device
 def root_of(parent, member):
     """The member that stands for a set, in sets that are joined one by one; the way to it gets shorter for who asks next."""
@@ -186,6 +183,17 @@ def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDAr
     return made
 
 
+def usable(*axes: NDArray[np.float64], mask: ArrayLike | None = None) -> NDArray[np.bool_]:
+    """Which points (n,) have finite coordinates, and are of the mask where one is given; StageError where that differs."""
+    use = np.logical_and.reduce([np.isfinite(axis) for axis in axes])
+    if mask is None:
+        return use
+    kept = np.asarray(mask, bool)
+    if kept.shape != use.shape:
+        raise StageError("'mask' must have one value per point", found=f"{kept.shape}, {len(use):,} points")
+    return use & kept
+
+
 def cell_numbers(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
     """Which cell coordinates fall in, counted from the origin; refuses those no survey has (they would wrap round)."""
     index = np.asarray(coordinate / cell)
@@ -263,7 +271,9 @@ def levels(z: NDArray[np.float64], cell: NDArray[np.int64]) -> tuple[NDArray[np.
     return order, begins_run(cell[order]) | (np.diff(z[order], prepend=-np.inf) > GAP)
 
 
-def patches(column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int) -> Iterator[_Piece]:
+def patches(
+    column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int
+) -> Iterator[tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]]:
     """Yield (points, own): the points of a piece and those round it that matter, and which of them are its own.
 
     Every point is some piece's own. Points more than `reach` cells away, along either axis, do not matter; nor do

@@ -292,26 +292,17 @@ def decks_of_levels(
     near = np.flatnonzero(use & there)
     steps = np.arange(-BESIDE, BESIDE + 1)
     around, held = places_among(cells, cells[:, None] + ((steps << 32)[:, None] + steps).ravel())
-    found = np.zeros(len(near), np.uint8)
-    _mark(
-        z[near],
-        cell[near],
-        np.where(held, around, -1),
-        heights,
-        np.append(start, len(keys)),
-        kind,
-        deck,
-        found,
-    )
-    out[near] = found
+    start = np.append(start, len(keys))
+    out[near] = _mark(z[near], cell[near], np.where(held, around, -1), heights, start, kind, deck)
     return out
 
 
 @njit
-def _mark(z, cell, around, heights, start, kind, deck, out):
-    """Say of points whether they are on a deck, or of its parts: in cells next to those that were found, and BESIDE cells
+def _mark(z, cell, around, heights, start, kind, deck):
+    """Whether points (n,) are on a deck, or of its parts: in cells next to those that were found, and BESIDE cells
     away among them, as around cars. `around` (cells, 25) numbers the cells round each, -1 where there is none.
     """
+    out = np.zeros(len(z), np.uint8)
     for p in range(len(z)):
         count = across = along = 0
         nearest = (BESIDE + 1) ** 2 * 2
@@ -335,6 +326,7 @@ def _mark(z, cell, around, heights, start, kind, deck, out):
             continue
         if not _on_land(z[p], around[cell[p]], heights, start, kind, deck, nearest, level):
             out[p] = SURFACE if abs(z[p] - level) <= (ON_RIM if nearest else ON_DECK) else PARTS
+    return out
 
 
 @device

@@ -23,12 +23,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.arrays import begins_run
-from ..base.errors import StageError
 from ..base.jit import device, njit
 from ..base.las import NOISE
 from .belowground import ENOUGH, below_ground
 from .belowground import reach as below_reach
-from .cells import HIGHEST, cell_numbers, columns, longest_sides, number_sets, patches, sums_around
+from .cells import HIGHEST, cell_numbers, columns, longest_sides, number_sets, patches, sums_around, usable
 
 LOW, HIGH = NOISE
 #: Side of a voxel, meters.
@@ -103,10 +102,7 @@ def detached_noise(
         If shapes differ.
     """
     x, y, z = columns(x, y, z)
-    use = np.ones(len(x), bool) if mask is None else np.array(mask, bool)
-    if use.shape != x.shape:
-        raise StageError("'mask' must have one value per point", found=f"{use.shape}, {len(x):,} points")
-    use &= np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    use = usable(x, y, z, mask=mask)
     codes = np.zeros(len(x), np.uint8)
     codes[use & (z >= HIGHEST)] = HIGH
     codes[use & (z <= -HIGHEST)] = LOW

@@ -206,10 +206,8 @@ def ground_raster(
     def near(cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
         """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
         blocks = planes_of_blocks(told, options.levels(block), STEEP * cell)
-        found = np.zeros(len(cells), bool)
         rest = np.isfinite(raster) & ~ground
-        _near(cells, place, rest, *blocks, left, bottom, cell, options.threshold, options.scalar, found)
-        return found
+        return _near(cells, place, rest, *blocks, left, bottom, cell, options.threshold, options.scalar)
 
     def within(cells: NDArray[np.int64], by: int) -> NDArray[np.int64]:
         """Those of the cells that are wanted, or so many away."""
@@ -236,9 +234,10 @@ def ground_raster(
 
 
 @njit
-def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar, out):
+def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar):
     """Which of the cells (n,), numbered row by row, lie near the surface of the ground found so far (see :mod:`.planes`)."""
     h, w = rest.shape
+    out = np.zeros(len(cells), np.bool_)
     for k in range(len(cells)):
         j, i = cells[k] // w, cells[k] % w
         height, across, along = from_parents(blocks, blocks_left, blocks_bottom, i + left, j + bottom, 1.0)
@@ -255,6 +254,7 @@ def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, 
                         sides |= 1 << (2 * (b > j) + (a > i))
         # A jump above others of the rest, which is no ground yet, on all four sides: a treetop.
         out[k] = sides != 15
+    return out
 
 
 @njit

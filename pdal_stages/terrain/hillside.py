@@ -31,9 +31,10 @@ LEVEL = 0.4
 
 
 @njit
-def _creases(raster, arm, cell, out):
-    """Mark the cells where the surface bends upward in one of four directions, between the farthest cells on both sides."""
+def _creases(raster, arm, cell):
+    """Cells where the surface bends upward in one of four directions, between the farthest cells on both sides."""
     h, w = raster.shape
+    out = np.zeros((h, w), np.bool_)
     for j in range(h):
         for i in range(w):
             for d in range(4 if raster[j, i] != HOLE else 0):
@@ -56,6 +57,7 @@ def _creases(raster, arm, cell, out):
                 if rise > most * 2.0 * before * after / (both * arm):
                     out[j, i] = True
                     break
+    return out
 
 
 @njit
@@ -97,8 +99,7 @@ def roofs_of_hillsides(
     `raster` (h, w) holds the heights of a minimum grid, in meters like `cell`, a cell's side; ground is measured everywhere.
     It looks less far than :func:`.openings.plateau_reach`.
     """
-    creases = np.zeros(raster.shape, bool)
-    _creases(raster, max(1.0, ARM / cell), cell, creases)
+    creases = _creases(raster, max(1.0, ARM / cell), cell)
     number, size, side = linked_cells(
         np.where(creases, HOLE, raster), 1.5, lambda away: np.maximum(STEP, GRADE * cell * away)
     )

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
 from ..base.errors import NoTerrainError, OptionError
-from .cells import cell_numbers, columns, keys_of, places_among
+from .cells import cell_numbers, columns, keys_of, places_among, usable
 
 
 class MinimaTerrain:
@@ -40,18 +40,16 @@ class MinimaTerrain:
         check_sizes(cell, resolution)
         self.cell, self.resolution = float(cell), float(resolution)
         x, y, z = columns(x, y, z)
-        usable = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
-        if mask is not None:
-            usable &= np.asarray(mask, bool)
-        key = keys_of(cell_numbers(x[usable], cell), cell_numbers(y[usable], cell))
+        use = usable(x, y, z, mask=mask)
+        key = keys_of(cell_numbers(x[use], cell), cell_numbers(y[use], cell))
         self.keys, number = np.unique(key, return_inverse=True)
         self.minima = np.full(len(self.keys), np.inf)
-        np.minimum.at(self.minima, number, z[usable])
+        np.minimum.at(self.minima, number, z[use])
         self.figures: dict[str, float] = {
             "cells": len(self.keys),
             "interpolated_cells": 0,
             "farthest_fill": 0.0,
-            "unused_points": int(x.size - np.count_nonzero(usable)),
+            "unused_points": int(x.size - np.count_nonzero(use)),
         }
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
@@ -61,7 +59,7 @@ class MinimaTerrain:
         """
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         out = np.full(x.shape, np.nan)
-        finite = np.isfinite(x) & np.isfinite(y)
+        finite = usable(x, y)
         if not finite.any():
             return out
         if self.keys.size == 0:

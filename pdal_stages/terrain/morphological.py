@@ -26,9 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.errors import StageError
 from ..base.resources import map_blocks
-from .cells import HIGHEST, CellWindow, columns, patches
+from .cells import HIGHEST, CellWindow, columns, patches, usable
 from .decks import decks_of_levels, find_decks
 from .groundblocks import GroundCells
 from .groundcells import (
@@ -113,10 +112,7 @@ def filtered_ground(
     """
     options = FilterOptions(cell, slope, window, threshold, scalar, openings, decks)
     x, y, z = columns(x, y, z)
-    use = np.ones(len(x), bool) if mask is None else np.array(mask, bool)
-    if use.shape != x.shape:
-        raise StageError("'mask' must have one value per point", found=f"{use.shape}, {len(x):,} points")
-    finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    finite, use = usable(x, y, z), usable(x, y, z, mask=mask)
     all_finite = bool(finite.all())
     if not all_finite:
         x, y, z, use = x[finite], y[finite], z[finite], use[finite]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
+from .cells import HOLE
 from .openings import highest_around
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
@@ -137,16 +138,19 @@ def _sum_around(moments, j, i, size, sums):
 
 
 @njit
-def _moments_of_cells(ground, place, left, bottom, out, out_left, out_bottom):
-    """Moments of the ground of each block of 2 x 2 cells, about its center."""
-    for j in range(ground.shape[0]):
-        for i in range(ground.shape[1]):
-            if ground[j, i]:
-                x = place[j, i, 0] + ((i + left) & 1) - 0.5
-                y, z = place[j, i, 1] + ((j + bottom) & 1) - 0.5, place[j, i, 2]
-                block = out[((j + bottom) >> 1) - out_bottom, ((i + left) >> 1) - out_left]
-                for k, value in enumerate((1.0, x, y, x * x, x * y, y * y, z, x * z, y * z)):
-                    block[k] += value
+def _moments_of_cells(held, place, height, level, left, bottom, out, out_left, out_bottom):
+    """Moments of the held cells of each block of a level, about its center; and sums of squares, where there is room."""
+    size, moments = 1 << level, out.shape[2]
+    for j in range(held.shape[0]):
+        for i in range(held.shape[1]):
+            if held[j, i]:
+                x = place[j, i, 0] + ((i + left) & (size - 1)) - (0.5 * size - 0.5)
+                y = place[j, i, 1] + ((j + bottom) & (size - 1)) - (0.5 * size - 0.5)
+                z = np.float64(height[j, i])
+                block = out[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
+                values = (1.0, x, y, x * x, x * y, y * y, z, x * z, y * z, z * z)
+                for k in range(moments):
+                    block[k] += values[k]
 
 
 @njit
@@ -158,20 +162,6 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
                 block = out[((j + bottom) >> 1) - out_bottom, ((i + left) >> 1) - out_left]
                 dx, dy = (((i + left) & 1) - 0.5) * size, (((j + bottom) & 1) - 0.5) * size
                 _add(block, fine[j, i], dx, dy, 1.0)
-
-
-@njit
-def _moments_of_floor(floor, lowest, level, left, bottom, out, out_left, out_bottom):
-    """The same of `floor` over the measured cells of each block of the coarsest level, and sums of its squares."""
-    size = 1 << level
-    for j in range(floor.shape[0]):
-        for i in range(floor.shape[1]):
-            if lowest[j, i] < np.inf:
-                x = ((i + left) & (size - 1)) + 0.5 - 0.5 * size
-                y, z = ((j + bottom) & (size - 1)) + 0.5 - 0.5 * size, np.float64(floor[j, i])
-                block = out[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
-                for k, value in enumerate((1.0, x, y, x * x, x * y, y * y, z, x * z, y * z, z * z)):
-                    block[k] += value
 
 
 @njit
@@ -254,14 +244,16 @@ def planes_of_blocks(raster: GroundRaster, levels: int, steep: float = np.inf) -
         h, w = ((b + h - 1) >> 1) + 2 - low_b, ((a + w - 1) >> 1) + 2 - low_a
         made = np.zeros((h, w, 9))
         if level == 1:
-            _moments_of_cells(raster.ground, raster.place, a, b, made, low_a, low_b)
+            heights = raster.place[..., 2]
+            _moments_of_cells(raster.ground, raster.place, heights, 1, a, b, made, low_a, low_b)
         else:
             _moments_of_blocks(moments[-1], 2.0 ** (level - 1), a, b, made, low_a, low_b)
         moments.append(made)
         spans.append((low_a, low_b))
     planes = np.empty((h, w, 3))
     made = np.zeros((h, w, 10))
-    _moments_of_floor(raster.floor, raster.lowest, levels, *spans[0], made, *spans[levels])
+    middle, measured = np.broadcast_to(0.0, (*raster.shape, 2)), raster.lowest != HOLE
+    _moments_of_cells(measured, middle, raster.floor, levels, *spans[0], made, *spans[levels])
     _coarsest(made, 2.0**levels, steep, planes)
     for level in range(levels, 0, -1):
         made = moments.pop()
