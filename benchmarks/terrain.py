@@ -11,9 +11,10 @@ Ground points should be at height 0. With hag_nn a point that SMRF calls ground 
 
     python benchmarks/terrain.py --data FOLDER [--json FILE] [--only isprs]
     python benchmarks/terrain.py --corners
+    python benchmarks/terrain.py --hillside
 
 With --corners: clips of 30, 50 and 100 m of generated woods on slopes, turned at random: ground missed, and where
-the surface is more than 1 m too high.
+the surface is more than 1 m too high. With --hillside: how much of the roofs of houses dug into a slope is called ground.
 """
 
 from __future__ import annotations

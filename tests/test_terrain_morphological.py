@@ -12,6 +12,7 @@ import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import cells, filtered_ground, groundcells, openings
+from pdal_stages.terrain.cells import CellWindow
 from pdal_stages.terrain.groundcells import FilterOptions
 from pdal_stages.terrain.hillside import roofs_of_hillsides
 from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii, remove_plateaus
@@ -141,13 +142,13 @@ def slow_planes(cells, level, floor, at):
 @pytest.mark.parametrize("slope", [0.0, 3.0])
 def test_planes_equal_the_slow_reference(slope):
     rng = np.random.default_rng(4)
-    left, bottom, h, w = -13, 40, 30, 26
+    left, bottom, w, h = window = CellWindow(-13, 40, 26, 30)
     ground = rng.random((h, w)) < 0.05
     place = rng.uniform(-0.5, 0.5, (h, w, 3)) * [1, 1, 40]
     floor = (rng.normal(0, 5, (h, w)) + slope * np.arange(w)).astype(np.float32)
     raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
     raster[ground] = floor[ground]
-    planes = planes_of_blocks(GroundRaster(left, bottom, raster, place, ground, floor, {}), 3, 0.5)
+    planes = planes_of_blocks(GroundRaster(window, raster, place, ground, floor, {}), 3, 0.5)
     places = [(j, i, (i + left, j + bottom)) for j in range(h) for i in range(w)]
     cells = {c: (place[j, i, :2], place[j, i, 2]) for j, i, c in places if ground[j, i]}
     known = {c: floor[j, i] for j, i, c in places if np.isfinite(raster[j, i])}

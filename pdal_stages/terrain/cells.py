@@ -58,11 +58,17 @@ class CellWindow(NamedTuple):
         """Numbers of cells in it, row by row."""
         return (row - self.bottom) * self.width + column - self.left
 
-    def on(self, left: int, bottom: int, h: int, w: int) -> tuple[slice, slice]:
-        """Rows and columns of what of it lies on a raster."""
-        i, j = self.left - left, self.bottom - bottom
-        (j0, j1), (i0, i1) = np.clip((j, j + self.height), 0, h), np.clip((i, i + self.width), 0, w)
-        return slice(int(j0), int(j1)), slice(int(i0), int(i1))
+    def within(self, other: CellWindow) -> CellWindow:
+        """What of it lies in another."""
+        left, bottom = max(self.left, other.left), max(self.bottom, other.bottom)
+        right = min(self.left + self.width, other.left + other.width)
+        top = min(self.bottom + self.height, other.bottom + other.height)
+        return CellWindow(left, bottom, max(right - left, 0), max(top - bottom, 0))
+
+    def on(self, other: CellWindow) -> tuple[slice, slice]:
+        """Rows and columns of its cells on the raster of another, which holds it."""
+        j, i = self.bottom - other.bottom, self.left - other.left
+        return slice(j, j + self.height), slice(i, i + self.width)
 
 
 @device

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,7 +72,6 @@ def detached_noise(
     cluster: int = 60,
     gap: float = 2.5,
     depth: float = 1.0,
-    figures: dict[str, Any] | None = None,
 ) -> NDArray[np.uint8]:
     """Which points are noise: 7 below the ground, 18 above everything, 0 all others.
 
@@ -88,8 +87,6 @@ def detached_noise(
         How far above everything near high noise lies at least, meters; more in clouds below 3 points/m2.
     depth : float, default 1.0
         How far below the ground low noise lies at least, meters; more where that is rough.
-    figures : dict, optional
-        Receives the counts ``low`` and ``high``.
 
     Returns
     -------
@@ -118,8 +115,6 @@ def detached_noise(
                 marks = _judge(*near, cluster, gap, depth)
                 found[points if isinstance(points, slice) else points[own]] = marks[own]
         codes[inside] = found
-    if figures is not None:
-        figures["low"], figures["high"] = (int(np.count_nonzero(codes == code)) for code in NOISE)
     return codes
 
 

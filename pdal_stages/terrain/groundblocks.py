@@ -67,8 +67,7 @@ class GroundCells(NamedTuple):
 
         opened = filled("opened", -np.inf, len(radii))
         raster = GroundRaster(
-            window.left,
-            window.bottom,
+            window,
             filled("lowest", HOLE),
             filled("place", 0.0, 3),
             filled("ground", False),
@@ -155,27 +154,26 @@ def cells_of_block(
         return GroundCells.of_blocks([], len(openings))
     raster, _ = ground_raster(low, options, margin=spill, wanted=own.grown(margin))
     inside = low.some(own.holds(low.column, low.row))
-    needed = around(inside.column, inside.row, raster.left, raster.bottom, raster.shape)
+    needed = around(raster.window, inside.column, inside.row)
     planes = surface(raster, options.levels(NEAR), needed)
     # With a ring around: points blend the four cells round them.
-    part = own.grown(1).on(raster.left, raster.bottom, *raster.shape)
-    raster, planes = raster.cut(part), planes[part].copy()
+    kept = own.grown(1).within(raster.window)
+    raster, planes = raster.cut(kept), planes[kept.on(raster.window)].copy()
+    left, bottom, _, _ = kept
     count, means = np.zeros(raster.shape, np.int64), np.zeros((*raster.shape, 3))
     for xyz in points:
         x, y, z = np.ascontiguousarray(xyz.T)
         some = given(x, y, z, z)
         height, gradient = np.empty((2, len(xyz)))
-        heights_above(*some[:3], cell, raster.left, raster.bottom, planes, height, gradient)
+        heights_above(*some[:3], cell, left, bottom, planes, height, gradient)
         is_ground = options.is_ground(some.use, some.deck, height, gradient)
-        add_ground(
-            *some[:3], is_ground, some.column, some.row, cell, raster.left, raster.bottom, count, means
-        )
+        add_ground(*some[:3], is_ground, some.column, some.row, cell, left, bottom, count, means)
     held = means_of(count, means)
     opened = np.empty((*raster.shape, len(openings)), np.float32)
     for k, radius in enumerate(openings):
         opened[..., k] = raster.opened[radius]
     there = np.zeros(raster.shape, bool)
-    there[own.on(raster.left, raster.bottom, *raster.shape)] = True
+    there[own.within(kept).on(kept)] = True
     there &= np.isfinite(raster.lowest) | held | np.isfinite(opened).any(axis=-1)
     j, i = np.nonzero(there)
     cells = np.empty(len(j), _record(len(openings)))
@@ -184,7 +182,7 @@ def cells_of_block(
         ("place", raster.place), ("means", means), ("opened", opened),
     ):  # fmt: skip
         cells[name] = values[there]
-    cells["column"], cells["row"] = i + raster.left, j + raster.bottom
+    cells["column"], cells["row"] = i + left, j + bottom
     # A level is of the block that holds the middle of its cell.
     middle = np.floor((levels[:, :2] + 0.5) * (CELL / cell)).astype(np.int64)
     return GroundCells(cells, levels[own.holds(*middle.T)])

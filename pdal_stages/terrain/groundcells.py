@@ -164,15 +164,14 @@ def ground_raster(
     """
     x, y, z, top, use, deck, column, row = points
     window = CellWindow.round(column, row).grown(margin)
-    left, bottom, w, h = window
-    shape = h, w
-    mine = np.flatnonzero(use)
+    shape = window.height, window.width
+    cells, mine = window.height * window.width, np.flatnonzero(use)
     inside = window.numbers(column[mine], row[mine])
-    low = lowest_points(x[mine], y[mine], z[mine], inside, h * w).reshape(shape)
+    low = lowest_points(x[mine], y[mine], z[mine], inside, cells).reshape(shape)
     lowest = np.append(mine, -1)[low]
     cell = options.cell
     raster = np.where(lowest >= 0, z[lowest], HOLE).astype(np.float32)
-    highest = np.full(h * w, -np.inf)
+    highest = np.full(cells, -np.inf)
     np.maximum.at(highest, inside, top[mine])
     bad = pits(raster, highest.reshape(shape), cell)
     pit_points = lowest[bad]
@@ -182,37 +181,33 @@ def ground_raster(
     )
     step = planes_reach(options.levels(NEAR))
     plateaus = plateau_reach(cell)
-
-    def grown(by: int) -> tuple[slice, slice]:
-        """The wanted cells and so many around, as far as there are any."""
-        return (slice(None), slice(None)) if wanted is None else wanted.grown(by).on(left, bottom, *shape)
-
-    part = grown(plateaus + ROUNDS * step)
+    wanted = wanted or window
+    kept = wanted.grown(plateaus + ROUNDS * step).within(window)
+    part = kept.on(window)
     cut_out: list = [np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor, wide)]
     lowest, raster, objects, floor, wide = cut_out
     del cut_out
     opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
-    left, bottom, shape = left + (part[1].start or 0), bottom + (part[0].start or 0), raster.shape
     held = lowest >= 0
-    low, place = lowest[held], np.zeros((*shape, 3))
-    for axis, (at, cells) in enumerate(((x, column), (y, row))):
-        place[held, axis] = at[low] / cell - cells[low] - 0.5
+    low, place = lowest[held], np.zeros((*raster.shape, 3))
+    for axis, (at, cells_of) in enumerate(((x, column), (y, row))):
+        place[held, axis] = at[low] / cell - cells_of[low] - 0.5
     place[held, 2] = z[low]
     on_deck = (deck != 0)[lowest] & held
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
-    told = GroundRaster(left, bottom, raster, place, ground, floor, opened)
+    told = GroundRaster(kept, raster, place, ground, floor, opened)
 
     def near(cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
         """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
         blocks = planes_of_blocks(told, options.levels(block), STEEP * cell)
         rest = np.isfinite(raster) & ~ground
-        return _near(cells, place, rest, *blocks, left, bottom, cell, options.threshold, options.scalar)
+        return _near(cells, place, rest, *blocks, *kept[:2], cell, options.threshold, options.scalar)
 
     def within(cells: NDArray[np.int64], by: int) -> NDArray[np.int64]:
         """Those of the cells that are wanted, or so many away."""
-        seen = np.zeros(shape, bool)
-        seen[grown(by)] = True
+        seen = np.zeros(raster.shape, bool)
+        seen[wanted.grown(by).within(kept).on(kept)] = True
         return cells[seen.ravel()[cells]]
 
     for number in range(1, ROUNDS + 1):

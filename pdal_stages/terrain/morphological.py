@@ -4,8 +4,8 @@ After SMRF [P13]: the grid of lowest points is opened with growing windows; a ce
 than `slope` times the window's radius is an object; what is left is ground, a surface is fitted through it, and a
 point is ground if it lies within `threshold` plus `scalar` times the terrain's slope of the surface. Unlike there:
 
-* the grid is anchored to absolute coordinates and every step reaches a bounded way (:func:`reach`), so that a tile
-  with its halo gets the bits of the whole cloud, and so does any order of the points;
+* the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile with its halo gets the
+  bits of the whole cloud, and so does any order of the points;
 * windows grow to the size of large halls, and a drop of a few meters is enough there (:mod:`.openings`);
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface, and
@@ -93,8 +93,8 @@ def filtered_ground(
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
         ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
     cells : GroundCells, optional
-        Cells whose ground was found before (:func:`.groundblocks.cells_of_block`), all within :func:`reach_of_cells` of the
-        points, which then need no others around them.
+        Cells whose ground was found before (:func:`.groundblocks.cells_of_block`), all within the `reach_of_cells` of
+        :class:`.FilterOptions` of the points, which then need no others around them.
 
     Returns
     -------
@@ -178,8 +178,8 @@ def _measured(
 ) -> dict[str, NDArray]:
     """Heights of points above the ground of a raster, and what they say of that themselves, where no `means` say it."""
     x, y, z, _, use, deck, column, row = points
-    cell, left, bottom = options.cell, raster.left, raster.bottom
-    needed = around(column, row, left, bottom, raster.shape)
+    cell, (left, bottom, _, _) = options.cell, raster.window
+    needed = around(raster.window, column, row)
     planes = surface(raster, options.levels(NEAR), needed)
     height, gradient = np.empty((2, len(x)))
 

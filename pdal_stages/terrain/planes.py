@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import HOLE
+from .cells import HOLE, CellWindow
 from .openings import highest_around
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
@@ -32,8 +32,7 @@ _PLANE, _MEASURED = 0.6, 0.3
 class GroundRaster(NamedTuple):
     """A minimum grid and what was found on it."""
 
-    left: int  #: number of the first column
-    bottom: int  #: of the first row
+    window: CellWindow  #: which cells
     #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
     lowest: NDArray[np.float32]
     #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
@@ -47,11 +46,11 @@ class GroundRaster(NamedTuple):
         """Rows and columns."""
         return self.ground.shape
 
-    def cut(self, part: tuple[slice, slice]) -> GroundRaster:
-        """A copy of some rows and columns."""
+    def cut(self, window: CellWindow) -> GroundRaster:
+        """A copy of some of the cells."""
+        part = window.on(self.window)
         return self._replace(
-            left=self.left + part[1].start,
-            bottom=self.bottom + part[0].start,
+            window=window,
             opened={radius: values[part].copy() for radius, values in self.opened.items()},
             **{name: getattr(self, name)[part].copy() for name in ("lowest", "place", "ground", "floor")},
         )
@@ -237,7 +236,7 @@ def planes_of_blocks(raster: GroundRaster, levels: int, steep: float = np.inf) -
     """
     h, w = raster.shape
     moments: list[np.ndarray] = []
-    spans = [(raster.left, raster.bottom)]
+    spans = [raster.window[:2]]
     for level in range(1, levels + 1):
         a, b = spans[-1]
         low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
@@ -277,7 +276,7 @@ def surface(
     blocks = planes_of_blocks(raster, levels)
     if planes is None:
         planes = np.zeros((*ground.shape, 3))
-    _finer(blocks.values, blocks.left, blocks.bottom, 1.0, raster.left, raster.bottom, needed, planes)
+    _finer(blocks.values, blocks.left, blocks.bottom, 1.0, *raster.window[:2], needed, planes)
     # Those of ground cells hold their cell's ground.
     np.copyto(planes[..., 0], place[..., 2], where=ground)
     for axis in (0, 1):
@@ -297,10 +296,8 @@ def heights_above(x, y, z, cell, left, bottom, planes, height, gradient):
         gradient[p] = np.sqrt(across * across + along * along) / cell
 
 
-def around(
-    column: NDArray, row: NDArray, left: int, bottom: int, shape: tuple[int, int]
-) -> NDArray[np.bool_]:
+def around(window: CellWindow, column: NDArray, row: NDArray) -> NDArray[np.bool_]:
     """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose planes points blend."""
-    held = np.zeros(shape, bool)
-    held[row - bottom, column - left] = True
+    held = np.zeros((window.height, window.width), bool)
+    held.ravel()[window.numbers(column, row)] = True
     return highest_around(held, 1, 0)
