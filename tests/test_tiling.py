@@ -504,6 +504,29 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
         assert kept.astype(int).sum() == sum(int(made[each][name].sum()) for each in of)
 
 
+@pytest.mark.parametrize("at_once", [10_000, 50])
+def test_a_reference_that_stands_after_the_points(tmp_path, random_cloud, write_las, monkeypatch, at_once):
+    """In feet: a piece without it would be taken for one in meters. Other records are kept too."""
+    monkeypatch.setattr("pdal_stages.tiling.outputs.MOST_AT_ONCE", at_once)
+    las = laspy.read(
+        write_las(tmp_path / "in.las", dict(zip("XYZ", random_cloud(200, seed=1).T, strict=True)), 6)
+    )
+    wkt = b'LOCAL_CS["feet",UNIT["foot",0.3048]]'
+    records = [laspy.VLR("LASF_Projection", 2112, "", wkt), laspy.VLR("mine", 7, "", b"hello")]
+    las.header.global_encoding.wkt, las.evlrs = True, laspy.vlrs.vlrlist.VLRList(records)
+    las.write(tmp_path / "in.las")
+    made = []
+    for name, run in (("whole", ps.run_pipeline), ("tiles", lambda job: run_tiled(job, 20, workers=0))):
+        out = str(tmp_path / f"{name}.las")
+        run([str(tmp_path / "in.las"), {"type": "filters.hag_minima", "cell": 5},
+             {"type": "writers.las", "filename": out, "forward": "all", "extra_dims": "all"}])  # fmt: skip
+        made.append(laspy.read(out))
+    heights = [np.asarray(one["HeightAboveGround"]) for one in made]
+    assert np.array_equal(*heights) and heights[0].any()
+    for one in made:
+        assert b"hello" in {record.record_data_bytes() for record in [*one.vlrs, *(one.evlrs or [])]}
+
+
 def test_odd_headers_are_said_of_the_inputs_alone(tmp_path, town_file):
     """Pieces that are cut out for tiles have the input's header; of many one is named."""
     data = bytearray(town_file.read_bytes())

@@ -92,14 +92,12 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         if not os.access(path, os.W_OK) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
             raise StageError(f"the {what} file is a device that cannot be written to", found=str(path))
         return
-    real = real_path(path)
+    real = Path(os.path.realpath(path))
     if len(real.name.encode(errors="surrogateescape")) > _LONGEST_NAME:
         raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
     if not real.parent.is_dir():
-        cure = "Create it first"
-        if not str(real.parent).isascii() and sys.getfilesystemencoding() != "utf-8":
-            cure = _locale_cure()
-        raise StageError(f"the folder of the {what} file does not exist", found=str(real.parent), cure=cure)
+        found = str(real.parent)
+        raise StageError(f"the folder of the {what} file does not exist", found=found, cure="Create it first")
     if real.is_symlink():
         raise StageError(f"the {what} file is a link that leads to itself", found=str(path))
     if real.is_dir():
@@ -123,19 +121,6 @@ def is_stream(path: str | os.PathLike) -> bool:
         return False
     opened = os.path.abspath(path).startswith(("/dev/std", "/dev/fd/", "/proc/"))
     return not stat.S_ISDIR(mode) and (opened or not stat.S_ISREG(mode))
-
-
-def real_path(path: str | os.PathLike) -> Path:
-    """The file that a name leads to."""
-    try:
-        return Path(os.path.realpath(path))
-    except UnicodeEncodeError as error:
-        what = "the name of the file cannot be written in this locale"
-        raise StageError(what, found=ascii(str(path)), cure=_locale_cure()) from error
-
-
-def _locale_cure() -> str:
-    return f"Set PYTHONUTF8=1: this locale's file names are {sys.getfilesystemencoding()}"
 
 
 @dataclass(frozen=True)
@@ -284,12 +269,22 @@ def whole_files(
             place.close()
 
 
+@contextlib.contextmanager
+def work_folder(target: str | os.PathLike) -> Iterator[Path]:
+    """A hidden folder beside a file that is to be written, for what is made on the way; removed at the end."""
+    place = _Place(Path(target))
+    try:
+        yield place.folder
+    finally:
+        place.close()
+
+
 class _Place:
     """A hidden folder in which one output is written: `partial`, until it gets its name, `path`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        parent = Path(tempfile.gettempdir()) if is_stream(path) else real_path(path).parent
+        parent = Path(tempfile.gettempdir()) if is_stream(path) else Path(os.path.realpath(path)).parent
         if str(parent) not in _swept:
             _swept.add(str(parent))
             sweep(parent)
@@ -316,7 +311,7 @@ def _give_name(made: Path, target: Path) -> None:
         with open(made, "rb") as file:
             _pour(file, target)
         return
-    real = real_path(target)
+    real = Path(os.path.realpath(target))
     with contextlib.suppress(FileNotFoundError):
         older = real.stat()
         if hasattr(os, "chown") and (older.st_uid, older.st_gid) != (os.geteuid(), os.getegid()):

@@ -104,7 +104,7 @@ def check_complete(
     """Refuse a file that a writer could not finish; whether it could be judged by its content.
 
     LAS and LAZ files are held against their own headers and the points there were; of other formats it is only known
-    that disk and limits left room.
+    that the disk has room.
 
     Parameters
     ----------
@@ -128,14 +128,14 @@ def check_complete(
         size = path.stat().st_size
         with open(path, "rb+") as file:
             os.fsync(file.fileno())  # some file systems report a full disk only here
-        whole = _is_whole(path, count) if las else not disk_is_full(path) and size < _largest_file()
+        whole = _is_whole(path, count) if las else not disk_is_full(path)
     except OSError as error:
         raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
     if not whole:
         raise StageError(
             "the output file could not be written completely",
             found=f"{name}: {size:,} bytes were written",
-            cure="Make room on the disk (or raise the limit on file sizes)",
+            cure="Make room on the disk",
         )
     return las
 
@@ -147,16 +147,6 @@ def _is_whole(path: Path, count: int | None) -> bool:
         return False
     header = read_header(path)
     return header is not None and count in (None, header.count)
-
-
-def _largest_file() -> float:
-    """Bytes that a file of this process may have."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return math.inf
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-    return math.inf if limit == resource.RLIM_INFINITY else limit
 
 
 def _end_of_points(header: LasHeader, size: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 import shlex
@@ -184,7 +185,7 @@ def _merge(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
             mine.setdefault(name, dict(value) if isinstance(value, dict) else value)
 
 
-class RunLog:
+class RunLog(logging.FileHandler):
     """A file to whose end go lines, each with its time.
 
     Parameters
@@ -193,7 +194,7 @@ class RunLog:
     arguments : sequence of str
         The command's, for the first line.
     stderr : text stream
-        Hears when the log cannot be written any more.
+        Where it is said that the log cannot be written any more.
 
     Raises
     ------
@@ -202,34 +203,30 @@ class RunLog:
     """
 
     def __init__(self, path: str, arguments: Sequence[str], stderr: Any) -> None:
-        self._stderr, self._one = stderr, threading.Lock()
         try:
-            self._file: Any = open(path, "a", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115
+            super().__init__(path, encoding="utf-8", errors="backslashreplace")
         except OSError as error:
             found = f"{path}: {error.strerror}"
             raise StageError("the log cannot be written", where="--log", found=found) from None
-        self._started = time.monotonic()
+        self.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
+        self._stderr, self._failed, self._started = stderr, False, time.monotonic()
         self.add(f"pdal-stages {__version__}: {shlex.join(arguments)}")
 
     def end(self, code: int) -> None:
         """Write the exit code and the time that was needed, and close the file."""
         self.add(f"exit code {code} after {time.monotonic() - self._started:.1f} s")
-        if self._file is not None:
-            self._file.close()
+        with contextlib.suppress(OSError):
+            self.close()
 
     def add(self, line: str) -> None:
         """Write a line, from any thread."""
-        with self._one:
-            if self._file is None:
-                return
-            try:
-                self._file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {one_line(line.strip())}\n")
-                self._file.flush()
-            except OSError as error:  # the run goes on without its log
-                with contextlib.suppress(OSError):
-                    self._file.close()
-                self._file = None
-                self._stderr.write(f"pdal-stages: the log cannot be written any more: {error.strerror}\n")
+        if not self._failed:
+            self.handle(logging.makeLogRecord({"msg": one_line(line.strip())}))
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """The run goes on without its log."""
+        self._failed = True
+        self._stderr.write(f"pdal-stages: the log cannot be written any more: {sys.exc_info()[1]}\n")
 
 
 class LoggedStream(PlainStream):

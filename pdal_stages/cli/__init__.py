@@ -54,7 +54,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     shown = os.environ.get("PDAL_STAGES_PROGRESS")
     code = 1
     try:
-        _refuse_little_room()
         options = parsed(arguments, is_program=argv is None)
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = str(int(options.progress))
@@ -124,19 +123,13 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     return options
 
 
-def _refuse_little_room() -> None:
-    """Refuse a limit on addresses under which libraries end the process, or wait forever for threads."""
-    with contextlib.suppress(ImportError):  # Windows
-        import resource
-
-        if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < 2**30:
-            raise StageError("too little memory", found=f"ulimit -v {limit // 1024}", cure="Allow 1 GB")
-
-
 def _unforeseen(error: Exception) -> StageError:
     """An unforeseen error, as a message of one paragraph."""
     if isinstance(error, MemoryError):
         return StageError("memory ran out", cure="Work in tiles (--tile), or lower 'memory'")
+    if isinstance(error, UnicodeEncodeError):
+        found, cure = ascii(error.object), "Set PYTHONUTF8=1"
+        return StageError("a name cannot be written in this locale", found=found, cure=cure)
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename is not None else ""
         return StageError("the system refused", found=f"{name}{error.strerror or error}")

@@ -108,7 +108,9 @@ def _classify(options: argparse.Namespace) -> int:
         beside=tuple(beside(options)),
     )
     then = None
-    if options.objects:
+    if options.objects and not options.dry_run:
+        if Path(options.objects).absolute().parent == Path(options.output).absolute():
+            task.make_folders()
         stage = writer(options.objects, own)
         refuse_tiles(task, options.objects)
         then = partial(write_objects, task.outputs, stage, max(1, task.options.local_workers))

@@ -179,12 +179,12 @@ def stages_of(thing: Any) -> list[dict[str, Any]] | None:
     return [{"type": stage.type, **stage.options} for stage in stages]
 
 
-def writer_type(filename: str) -> str:
-    """The writer that PDAL takes for a file's name; empty where it knows none."""
+def inferred_type(filename: str, kind: str) -> str:
+    """The ``reader`` or ``writer`` that PDAL infers from a file's name; empty where it knows none."""
     bindings()
     from pdal import libpdalpython
 
-    return str(libpdalpython.infer_writer_driver(filename))
+    return str(getattr(libpdalpython, f"infer_{kind}_driver")(filename))
 
 
 def validate(stages: list[dict[str, Any]]) -> None:

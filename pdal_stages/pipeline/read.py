@@ -4,15 +4,13 @@ the files that PDAL's stages name."""
 from __future__ import annotations
 
 import glob
-import io
 import json
 import os
 import re
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
@@ -72,24 +70,10 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
 
 
 def _content(path: Path) -> bytes:
-    """What a file holds, or what comes through a pipe, if somebody writes into it within some seconds."""
-    if not path.is_fifo():
-        with open(path, "rb") as file:
-            return _bounded(file)
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as pipe:
-        until = time.monotonic() + 5.0
-        while (first := pipe.read(1)) == b"":  # None where a writer is there, but has written nothing yet
-            if time.monotonic() > until:
-                raise OSError("nobody writes into this pipe")
-            time.sleep(0.05)
-        os.set_blocking(pipe.fileno(), True)
-        return (first or b"") + _bounded(io.BufferedReader(pipe))
-
-
-def _bounded(file: BinaryIO) -> bytes:
-    """All that a file holds; devices have no end."""
-    if len(data := file.read(_LARGEST)) == _LARGEST:
-        raise OSError(f"{_LARGEST >> 20} MB and more are no pipeline")
+    """What a file or pipe holds; devices have no end."""
+    with open(path, "rb") as file:
+        if len(data := file.read(_LARGEST)) == _LARGEST:
+            raise OSError(f"{_LARGEST >> 20} MB and more are no pipeline")
     return data
 
 

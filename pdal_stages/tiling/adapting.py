@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from ..base import checks, las
 from ..base.errors import StageError
-from ..base.files import MODEL, Output, check_outputs
+from ..base.files import MODEL, Output, check_outputs, work_folder
 from ..classifier.model import load_model
 from ..classifier.modelfile import digest_of
 from ..pipeline.classify_request import ClassifyRequest
@@ -54,10 +53,8 @@ class AdaptTask:
         teacher, files = load_model(self.teacher), input_files(self.inputs)
         check_outputs([Output(self.model, "model", MODEL)], files)
         chosen, told = spread(files)
-        model = Path(self.model).absolute()
-        place = model.parent if model.is_file() or not model.exists() else None  # not beside a device
-        with TemporaryDirectory(prefix=".pdal-stages-adapt-", dir=place) as folder:
-            classified = self._classified(chosen, Path(folder))
+        with work_folder(self.model) as folder:
+            classified = self._classified(chosen, folder)
             found = sure_points(classified, sure, teacher.codes.tolist())
             codes = [code for code, count in found.items() if count >= FEWEST]
             if len(codes) < 2:
@@ -74,7 +71,7 @@ class AdaptTask:
                 "count": COUNT,
                 "folds": 0,  # a score by the teacher's own answers would be none
             }
-            made = str(Path(folder) / "adapted.model")
+            made = str(folder / "adapted.model")
             TrainTask(classified, made, (), given, self.options).run()
             new, name = load_model(made), Path(self.teacher).stem
             of = {"name": name, "sha256": digest_of(self.teacher), "sure": sure}

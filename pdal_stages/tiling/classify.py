@@ -69,7 +69,7 @@ class ClassifyTask:
         target = str(Path(self.output) / "#") if is_folder(self.output) else self.output
         return outputs_of(self.files, target, copc=self.in_one_piece)
 
-    def _make_folders(self) -> None:
+    def make_folders(self) -> None:
         """Make the output folder, and those in it that outputs lie in."""
         if not is_folder(self.output):
             return
@@ -83,7 +83,7 @@ class ClassifyTask:
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
         (source,), (target,) = self.files, self.outputs
-        self._make_folders()
+        self.make_folders()
         pipeline = self.request.pipeline(source, target)
         pipeline.check_outputs(*self.beside)
         count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
@@ -131,7 +131,7 @@ class ClassifyTask:
             name=self.request.model,
         )
         if not dry_run:
-            self._make_folders()
+            self.make_folders()
         outputs = [Output(name) for name in self.outputs if Path(name).parent.is_dir()]
         check_outputs([*outputs, *self.beside], self.files)
         return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)

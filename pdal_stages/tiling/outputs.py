@@ -291,6 +291,8 @@ class FileTask:
                     for points in made.chunk_iterator(BLOCK):
                         out.write_points(points)
                     count += int(made.header.point_count)
+            if out.header.evlrs:
+                out.write_evlrs(out.header.evlrs)
         return {"outputs": written(self.outputs), "written": count, "classes": dict(classes)}
 
 

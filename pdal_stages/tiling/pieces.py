@@ -45,12 +45,14 @@ def record_blocks(path: str, start: int = 0, end: int | None = None, most: int =
 
 
 def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]) -> None:
-    """Write points uncompressed, with the header of the file that they are from."""
+    """Write points uncompressed, with the header and all records of the file that they are from."""
     import laspy
 
     with laspy.open(path, mode="w", header=copy.deepcopy(header), do_compress=False) as writer:
         for block in records:
             writer.write_points(laspy.PackedPointRecord(block, header.point_format))
+        if header.evlrs:  # of which one may be the spatial reference
+            writer.write_evlrs(header.evlrs)
 
 
 # ---- the copy, sorted by place -------------------------------------------------------------------------------

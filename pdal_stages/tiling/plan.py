@@ -199,14 +199,9 @@ def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
     """A stage as an object with a type; bare names become readers and the writer that PDAL would take."""
     out = dict(stage) if isinstance(stage, dict) else {"filename": stage}
     if not out.get("type"):
-        name = str(out.get("filename", ""))
-        if writes := 0 < index == count - 1:
-            out["type"] = pdal_env.writer_type(name)
-        else:
-            suffix = "ept" if name.endswith("ept.json") else Path(name).suffix.lower().lstrip(".")
-            out["type"] = f"readers.{'las' if suffix == 'laz' else suffix}" if suffix else ""
+        name, kind = str(out.get("filename", "")), "writer" if 0 < index == count - 1 else "reader"
+        out["type"] = pdal_env.inferred_type(name, kind)
         if not out["type"]:
-            kind = "writer" if writes else "reader"
             raise PipelineError(
                 f"the {kind} of '{name}' cannot be inferred from the file name",
                 cure=f'Give the stage a type: "{kind}s.las"',

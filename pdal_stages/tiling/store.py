@@ -52,13 +52,7 @@ class Store:
                         cure="Remove it, or write to another folder",
                     )
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-            lock = os.open(self.folder / "lock", flags, 0o622)
-            # Who can read a lock can hold it, so those may who can write, and nobody else.
-            if hasattr(os, "fchmod"):
-                writers = os.fstat(lock).st_mode & 0o022
-                with contextlib.suppress(OSError):  # of another user, whose folder this is
-                    os.fchmod(lock, 0o600 | writers | writers << 1)
-            self._lock = os.fdopen(lock, "r+", encoding="utf-8")
+            self._lock = os.fdopen(os.open(self.folder / "lock", flags, 0o666), "r+", encoding="utf-8")
             if not try_lock(self._lock):
                 with self._lock:
                     who = self._lock.read().strip()

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
-from ..base.files import check_outputs
+from ..base.files import check_outputs, work_folder
 from ..base.messages import Report
 from ..classifier.clouds import TiledCloud, TrainingCloud
 from ..classifier.model import Model
@@ -214,13 +213,11 @@ class TrainTask:
     # ---- in tiles ----------------------------------------------------------------------------------------
 
     def _tiled(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
-        model = Path(self.model).absolute()
-        place = model.parent if model.is_file() or not model.exists() else None  # not beside a device
         clouds: list[TiledCloud] = []
         dimensions: list[str] | None = None
-        with TemporaryDirectory(prefix=".pdal-stages-train-", dir=place) as folder:
+        with work_folder(self.model) as folder:
             for number, task in enumerate(self._each()):
-                made = Path(folder) / f"survey{number}"
+                made = folder / f"survey{number}"
                 made.mkdir()
                 found, parts, names = task._in_tiles(made, heights)
                 _check_same(names, dimensions or names)
@@ -231,7 +228,7 @@ class TrainTask:
             if self.stage.automatic:
                 training = replace(training, dimensions=tuple(dimensions or ()))
             tiles = (tile for cloud in clouds for tile in cloud.clouds(reach(training)))
-            return train(tiles, training, folder=Path(folder))
+            return train(tiles, training, folder=folder)
 
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]

@@ -185,9 +185,3 @@ def test_signals(command, tmp_path, name, ours):
 def test_a_closed_pipe(command):
     done = command.process(command=["sh", "-c", f"{sys.executable} -m pdal_stages.cli drivers | head -1"])
     assert "BrokenPipe" not in command.runs(done).err
-
-
-def test_little_room(command):
-    words = f"ulimit -v 600000; {sys.executable} -m pdal_stages.cli doctor"
-    done = command.process(command=["sh", "-c", words])
-    assert done.code == 1 and "Allow 1 GB" in done.err
