@@ -247,8 +247,11 @@ def test_table_is_ascii_and_aligned():
             {"reference": [1, 1], "predicted": [2, 2], "ignore": [1]},
             "every reference point is left out.*1: 2",
         ),
-        ({"reference": [2, 6], "predicted": [2]}, "another length.*1 and 2"),
-        ({"reference": [2, 6], "predicted": [2, 6], "reliability": [1.0]}, "reliability has another length"),
+        ({"reference": [2, 6], "predicted": [2]}, "a different length.*1 and 2"),
+        (
+            {"reference": [2, 6], "predicted": [2, 6], "reliability": [1.0]},
+            "reliability has a different length",
+        ),
         ({"reference": [2.0, np.nan], "predicted": [2, 2]}, "not class codes.*nan"),
         ({"reference": [2], "predicted": [2], "classes": ["ground"]}, "a class in 'classes'.*'ground'"),
         (
@@ -257,7 +260,7 @@ def test_table_is_ascii_and_aligned():
         ),
         ({"reference": [2], "predicted": [2], "merge": {3: 5}}, "lists of classes.*5"),
         ({"reference": [2], "predicted": [2], "reliability": [87.0]}, "not between 0 and 1.*87"),
-        ({"reference": np.arange(300), "predicted": np.zeros(300, int)}, "more different values.*300"),
+        ({"reference": np.arange(300), "predicted": np.zeros(300, int)}, "too many different values.*300"),
     ],
 )
 def test_misuse_is_told(arguments, message):

@@ -82,6 +82,6 @@ def test_files_of_one_name_are_compared_by_their_folders():
     made = ["out/2023/c_t1.laz", "out/2024/c_t1.laz", "out/2024/t2.laz"]
     true = ["truth/2024/t1.laz", "truth/2023/t1.laz", "truth/2024/t2.laz"]
     assert sorted(paired(made, true)) == sorted(zip(made, [true[1], true[0], true[2]], strict=True))
-    with pytest.raises(StageError, match="no reference of its name") as caught:
+    with pytest.raises(StageError, match="no reference with its name") as caught:
         paired(made, [*true[:2], "truth/2023/t2.laz"])
     assert "2023/t2" in str(caught.value)

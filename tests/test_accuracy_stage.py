@@ -147,7 +147,7 @@ def test_files_without_a_partner_are_refused(tmp_path):
         ("o/c_a.laz", "a.laz"),
         ("o/c_ab.laz", "ab.laz"),
     ]
-    with pytest.raises(StageError, match=r"no reference of its name.*c\.laz"):
+    with pytest.raises(StageError, match=r"no reference with its name.*c\.laz"):
         paired(["a.laz", "c.laz"], ["a.laz", "b.laz"])
     with pytest.raises(StageError, match="the same reference"):
         paired(["c_a.laz", "d_a.laz"], ["a.laz"])

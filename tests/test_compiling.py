@@ -28,4 +28,4 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     assert "Traceback" not in said("import os; os.environ['PDAL_STAGES_PROGRESS'] = '0'; " + code)
     assert not said()
     index.parent.chmod(0o777)
-    assert "other users may put code into" in said()
+    assert "other users can write to" in said()

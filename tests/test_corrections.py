@@ -156,7 +156,7 @@ def test_areas_that_were_looked_at(town, tmp_path):
     none = tmp_path / "none.gpkg"
     pyogrio.raw.write(none, shapes, [np.zeros(2, np.int32)], ["done"], driver="GPKG", layer="patches",
                       geometry_type="Polygon", crs=None)  # fmt: skip
-    with pytest.raises(StageError, match="no patch is marked as looked at"):
+    with pytest.raises(StageError, match="no patch is marked as checked"):
         write_corrections(str(town), str(tmp_path / "x.laz"), areas=(str(none),))
     assert not (tmp_path / "x.laz").exists()
 

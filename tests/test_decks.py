@@ -391,7 +391,7 @@ def test_classify_finds_decks_unless_told_not_to(tmp_path, capsys):
     write(tmp_path / "in.las", xyz)
     out = tmp_path / "out.las"
     assert main(["classify", str(tmp_path / "in.las"), str(out), "--no-progress"]) == 0
-    assert "put on bridge decks (bridges)" in capsys.readouterr().out
+    assert "bridge decks (bridges)" in capsys.readouterr().out
     made = laspy.read(out)
     assert f1(np.asarray(made.classification) == 17, codes == DECK, codes != OTHER) > 0.85
     assert set(made.point_format.extra_dimension_names) == {"HeightAboveGround", "Reliability"}

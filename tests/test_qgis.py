@@ -345,7 +345,7 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), said
     marked = {"BEFORE": cloud, "AFTER": ready_town, "OUTPUT": out / "k.laz", "AROUND": 2}
     said = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
-    assert "no patch is marked as looked at" in said and not (out / "k.laz").exists()
+    assert "no patch is marked as checked" in said and not (out / "k.laz").exists()
     said = algorithm("corrections", **marked)
     words = ["corrections", str(cloud), str(ready_town), "--around", "2"]
     assert main([*words, "--out", str(tmp_path / "k.laz")]) == 0

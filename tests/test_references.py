@@ -100,7 +100,7 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
     whole.execute()
     writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
     for messages in (whole.messages, run_tiled([*stages, writer], 40, workers=0).messages):
-        said = [one for one in messages if "taken to have that of the other inputs" in one]
+        said = [one for one in messages if "assumed to have that of the other inputs" in one]
         assert len(said) == (1 if any(references) else 0)
         for line in said:
             assert f"{tmp_path / 'in1.las'}, {tmp_path / 'in3.las'} have no spatial reference" in line

@@ -151,7 +151,7 @@ def test_what_is_missing_is_made_and_said(folder, tmp_path, capsys):
     pytest.importorskip("pyogrio")
     out = str(tmp_path / "r.gpkg")
     assert cli.main(["review", str(folder / "town.laz"), out]) == 0
-    assert "has no Reliability: made now by the model standard" in capsys.readouterr().err
+    assert "has no Reliability: now computed by the model standard" in capsys.readouterr().err
 
 
 @pytest.mark.pdal

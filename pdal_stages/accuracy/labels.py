@@ -45,7 +45,7 @@ def same_length(reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[An
     for what, values in others.items():
         if len(values) != len(reference):
             raise StageError(
-                f"the {what} has another length than the reference",
+                f"the {what} has a different length than the reference",
                 found=f"{len(values):,} and {len(reference):,} values",
                 cure="Compare two classifications of the same points, in the same order",
             )
@@ -87,13 +87,13 @@ class Merge:
         for key, value in (mapping or {}).items():
             if not isinstance(value, list | tuple | set | np.ndarray):
                 raise StageError(
-                    "'merge' names lists of classes", found=repr(value), cure="As in {5: [3, 4]}"
+                    "'merge' maps a class to a list of classes", found=repr(value), cure="As in {5: [3, 4]}"
                 )
             (target,), sources = code_list([key], "merge"), code_list(value, "merge")
             for source in sources:
                 if to[source] not in (source, target):
                     raise StageError(
-                        "'merge' sends one class to two others",
+                        "'merge' maps one class to two others",
                         found=f"class {source} to {to[source]} and {target}",
                     )
                 to[source] = target
@@ -130,7 +130,7 @@ def pair_counts(
         positions.append(np.cumsum(there) - 1)
         if len(codes[-1]) > MAX_CLASSES:
             raise StageError(
-                f"the {what} has more different values than a class dimension has",
+                f"the {what} has too many different values for class codes",
                 found=f"{len(codes[-1]):,} values",
                 cure="Check which dimension is compared",
             )

@@ -86,7 +86,7 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         write-protected file, a file that is known to be of another kind.
     """
     if not os.fspath(path) or "\0" in os.fspath(path):
-        raise StageError(f"the {what} file has no name", found=ascii(path), cure="Is a variable not set?")
+        raise StageError(f"the {what} file has no name", found=ascii(path), cure="Is a shell variable unset?")
     if is_stream(path):
         mode = os.stat(path).st_mode
         if not os.access(path, os.W_OK) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
@@ -160,7 +160,7 @@ def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]
             raise StageError(
                 f"the {output.what} file is the {seen[one].what} file too"
                 if output.what != seen[one].what
-                else f"two {output.what} files are one",
+                else f"two {output.what} files are the same file",
                 found=output.path,
                 cure="Give each its own name",
             )

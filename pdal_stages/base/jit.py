@@ -179,9 +179,9 @@ def _refuse_shared(folder: str) -> None:
         return
     if (found := os.stat(folder)).st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
         raise DependencyError(
-            "other users may put code into the folder of compiled kernels",
+            "other users can write to the folder of compiled kernels",
             found=folder,
-            cure="Name a folder of your own in NUMBA_CACHE_DIR, or take this one from the others",
+            cure="Set NUMBA_CACHE_DIR to a folder of your own, or take write permission from the others",
         )
 
 

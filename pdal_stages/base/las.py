@@ -93,7 +93,7 @@ class LasHeader:
 def refuse_pipe(path: str | os.PathLike) -> None:
     """Refuse an input that would be waited for, and can be read only once."""
     if stat.S_ISFIFO(os.stat(path).st_mode):
-        raise StageError("the input is a pipe", where=str(path), cure="Write it into a file first")
+        raise StageError("the input is a pipe", where=str(path), cure="Save it to a file first")
 
 
 def read_header(path: str | os.PathLike) -> LasHeader | None:
@@ -217,7 +217,7 @@ def check_texts(path: str | os.PathLike) -> None:
             text.decode()
         except UnicodeDecodeError:
             what = f"the {what} in the LAS file is not UTF-8, which PDAL's filters.python cannot take"
-            cure = f"Write the file anew first: pdal translate {path} clean.laz"
+            cure = f"Rewrite the file first: pdal translate {path} clean.laz"
             raise PipelineError(what, where=str(path), found=str(text)[1:], cure=cure) from None
 
 

@@ -62,7 +62,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
             "PDAL does not read points with waveforms",
             where=where,
             found=f"point format {header.point_format}",
-            cure=f"Write the file anew in format {without}, which has all but the waveforms: "
+            cure=f"Convert the file to format {without}, which has everything but the waveforms: "
             f"laspy.convert(laspy.read(IN), point_format_id={without}).write(OUT)",
         )
     beyond = _end_of_points(header, size) - header.offset - header.count * header.point_bytes
@@ -73,8 +73,8 @@ def check_readable(path: str | os.PathLike) -> str | None:
         )
     if header.count > 1 and not header.boxed:
         return (
-            f"{path}: the box in its header is all zeros, as where a program ends while it writes the header; look whether "
-            "the points lie where they should"
+            f"{path}: the bounding box in its header is all zeros, as when a program was stopped while writing it; check "
+            "that the points lie where they should"
         )
     return None
 
@@ -93,8 +93,8 @@ def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) 
         return None
     say = "x {0:.12g} to {2:.12g}, y {1:.12g} to {3:.12g}"
     return (
-        f"{path}: points lie beyond the box in the header, so the file may be damaged (found {say.format(*lie)}; the header "
-        f"says {say.format(*header.box)}). {DAMAGED}"
+        f"{path}: points lie outside the bounding box in the header, so the file may be damaged (found {say.format(*lie)}; "
+        f"the header says {say.format(*header.box)}). {DAMAGED}"
     )
 
 
@@ -209,7 +209,7 @@ def _wrong_count(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
 
 
 def _none_counted(size: int) -> Wrong:
-    what = "its header counts no points, but holds some, as programs leave it that end before they are done"
+    what = "its header counts no points, but the file holds some, as when a program was stopped before it finished"
     return what, f"{size:,} bytes where points are"
 
 
@@ -264,7 +264,10 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
         held += int.from_bytes(file.read(4), "little") - of_chunk
     exact = varies or header.point_format >= 6
     if held < header.count or (exact and held > header.count):
-        return "its header counts other points than it holds", f"{header.count:,} counted, {held:,} held"
+        return (
+            "its header counts a different number of points than it holds",
+            f"{header.count:,} counted, {held:,} held",
+        )
     return None
 
 

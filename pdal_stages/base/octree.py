@@ -74,7 +74,7 @@ def check_copc(path: str | os.PathLike) -> None:
             "the octree of the COPC file is damaged",
             where=str(path),
             found=str(error),
-            cure="Get the file again; named in.laz, not in.copc.laz, it is read as the LAZ file that it is, too",
+            cure="Get the file again; renamed to .laz, it is read as a plain LAZ file",
         ) from None
 
 
@@ -91,7 +91,7 @@ def read_ept(path: str) -> dict[str, Any]:
         there = left - 1 <= x0 <= x1 <= right + 1 and low - 1 <= y0 <= y1 <= high + 1
         named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
         if int(found["points"]) < 0 or not there or not named:
-            raise ValueError("a description of nothing, or of points beyond its octree")
+            raise ValueError("not a valid description, or its points lie outside its octree")
         return found
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
@@ -127,7 +127,7 @@ def check_ept(path: str) -> dict[str, Any]:
                 raise ValueError(f"{count:,} points in {file.name}, of {held:,} bytes")
     except (OSError, ValueError, TypeError, RecursionError) as error:
         what = "the EPT source is damaged"
-        cure = "Get it again from its source, or build it anew"
+        cure = "Get it again from its source, or build it again"
         raise StageError(what, where=path, found=str(error), cure=cure) from None
     return described
 

@@ -86,7 +86,7 @@ def units_of_wkt(
     for meters in (across, upward):
         if meters is not None and not _SMALLEST <= meters <= _LARGEST:
             raise StageError(
-                "the spatial reference has a unit of length that no survey is in",
+                "the spatial reference has an implausible unit of length",
                 found=f"{meters:g} m",
                 cure="Set horizontal_unit and vertical_unit",
             )
@@ -102,17 +102,17 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
     centered = geodetic.keyword == "GEOCCS" or (system is not None and system.name.lower() == "cartesian")
     zone = utm_code(*place, root.name) if place is not None and not centered else None
     code = f"EPSG:{zone or 'CODE'}"
-    what = "the UTM zone of the points; or take the national grid of the area"
+    what = "the UTM zone of the points; or use the national grid of the area"
     if not zone:
-        what = "the UTM zone or national grid of the area in place of CODE"
+        what = "with the UTM zone or national grid of the area as CODE"
     raise StageError(
-        "the coordinates are geocentric (from the earth's center); heights need an axis that is up"
+        "the coordinates are geocentric (from the earth's center); heights need a vertical axis"
         if centered
         else "the coordinates are geographic (degrees); neighborhoods and grids need meters",
         found=root.name or wkt[:60],
         cure=f'Add a reprojection before this stage, {{"type": "filters.reprojection", "out_srs": "{code}"}}, or '
         "reproject the files first, pdal translate IN OUT reprojection "
-        f"--filters.reprojection.out_srs={code}; with {what}",
+        f"--filters.reprojection.out_srs={code} ({what})",
     )
 
 
@@ -124,7 +124,7 @@ def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float
             "the coordinates look like degrees, and there is no spatial reference that says otherwise",
             found=f"x {x0:.6f} to {x1:.6f}, y {y0:.6f} to {y1:.6f}",
             cure="Reproject the files first: pdal translate IN OUT reprojection --filters.reprojection.in_srs=EPSG:4326 "
-            f"--filters.reprojection.out_srs=EPSG:{code}; of meters, set horizontal_unit",
+            f"--filters.reprojection.out_srs=EPSG:{code}; if they are meters, set horizontal_unit",
         )
 
 

@@ -110,7 +110,7 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     command, *rest = rest
     for before, word in itertools.pairwise([command, *rest]):
         if not word or re.fullmatch("--[a-z-]+=", word):  # as a path it would be the current folder
-            lacking = f"what follows '{word or before}' is empty: is a variable not set?"
+            lacking = f"what follows '{word or before}' is empty: is a shell variable unset?"
             parser.commands[command].error(lacking)
     options, unknown = parser.commands[command].parse_known_intermixed_args(rest)
     if unknown:

@@ -104,7 +104,7 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
         inside = [one for one in by_name if one[0] == place and one[1] in stem]
         if not inside:
             raise StageError(
-                "a file has no reference of its name",
+                "a file has no reference with its name",
                 found=source,
                 cure="Name the references like the files they belong to, not "
                 + ", ".join([os.path.join(*one) for one in by_name][:5]),

@@ -80,10 +80,10 @@ class ClassifyRequest:
         """What marks noise, what makes what the model reads, and the classifier."""
         if by_hand := self.loaded.info.get("by_hand"):
             raise ModelError(
-                "what the model reads was made by stages that a model file does not carry",
+                "the model reads dimensions of stages that a model file does not hold",
                 where=self.model,
                 found=", ".join(by_hand),
-                cure="Write a pipeline: the reader, these stages with their options of training, "
+                cure="Write a pipeline: the reader, these stages with the options of the training, "
                 "filters.modelclassifier, and the writer",
             )
         prepared = self._prepared
@@ -169,7 +169,7 @@ class ClassifyRequest:
             writer |= {"extra_dims": listed} if listed else {}
         elif self.dimensions != WRITTEN and "all" not in self.dimensions:
             raise OptionError(
-                "--dimensions is for LAS and LAZ; other formats take all there are",
+                "--dimensions is for LAS and LAZ; other formats get all dimensions",
                 found=target,
                 cure="Leave it out, or write a pipeline",
             )

@@ -41,8 +41,8 @@ def write_corrections(
     checks.number("'--around'", around, 0, 100, unit="m")
     if not after and not areas:
         raise OptionError(
-            "there is nothing to mark: neither corrected points nor an area that was looked at",
-            cure="Give the corrected file as the second, or --area patches.gpkg",
+            "there is nothing to mark: neither corrected points nor a checked area",
+            cure="Give the corrected file as the second argument, or --area patches.gpkg",
         )
     for name in filter(None, (before, after)):
         if not reads_in_parts(name):
@@ -67,7 +67,7 @@ def write_corrections(
         raise StageError(f"'{CHECKED}' is a dimension of another kind", where=before)
     if not checked.any():
         raise StageError(
-            "nothing was changed, and no point lies in an area that was looked at",
+            "nothing was changed, and no point lies in a checked area",
             found=", ".join(filter(None, (after, *areas))),
         )
     if las.header.point_format.id < 6 and new.max() > LEGACY_LIMIT:
@@ -124,7 +124,7 @@ def _codes_of(
     if lost:
         notes.append(f"{lost:,} points are missing in {after}: they keep their class, unchecked")
     if extra:
-        notes.append(f"{extra:,} points of {after} are in no place of {before}: left out")
+        notes.append(f"{extra:,} points of {after} are not in {before}: left out")
     return np.where(found >= 0, np.asarray(other.classification).astype(np.uint8)[found], codes)
 
 
@@ -142,19 +142,19 @@ def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> 
     shapes, note = polygons_of(Overlay(file, layer, 0, ()), wkt, box, where=done)
     if done and not shapes:
         raise StageError(
-            "no patch is marked as looked at",
+            "no patch is marked as checked",
             where=area,
-            cure=f"Set '{_DONE}' to 1 where all that is wrong was corrected, e.g. in the table of attributes of QGIS",
+            cure=f"Set '{_DONE}' to 1 where all errors were corrected, e.g. in the attribute table of QGIS",
         )
     if not shapes:
         raise StageError(
-            "no polygon of the area lies over the points",
+            "no polygon of the area overlaps the points",
             where=area,
-            found=note or "none in the box of the points",
+            found=note or "none within the bounding box of the points",
             cure="Check its reference system; GeoJSON without one is in degrees",
         )
     inside = points_inside(x, y, shapes)
-    told = f"{inside.sum():,} points lie in the polygons of {file} that were looked at"
+    told = f"{inside.sum():,} points lie in the checked polygons of {file}"
     notes += [*filter(None, [note]), told]
     return inside
 

@@ -101,8 +101,8 @@ def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
     readers = [number for number in range(len(stages)) if is_reader(stages, number)]
     if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
         raise PipelineError(
-            "this PDAL brings the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into other files only where all "
-            "readers stand first and no stage has 'inputs'",
+            "this PDAL carries the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into other files only where all "
+            "readers come first and no stage has 'inputs'",
             found=f"PDAL {pdal_env.dotted_version()}",
             cure="Leave 'inputs' out, write one file at a time, or use PDAL 2.6",
         )
@@ -147,10 +147,10 @@ def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str])
             " ".join(str(stages[n][key]) for key in ("type", "filename") if key in stages[n]) for n in ends
         ]
         raise PipelineError(
-            "a pipeline with several ends: PDAL runs only what leads to the first of them",
+            "the pipeline has several ends, and PDAL runs only what leads to the first of them",
             found=", ".join(f"{name} ({where[n]})" for n, name in list(zip(ends, named, strict=True))[:5]),
-            cure="Write one file after the other (a writer hands on what it gets, so leave its 'inputs' out), or put a last "
-            'stage there that has all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}',
+            cure="Write one file after the other (a writer passes its points on, so leave its 'inputs' out), or add a last "
+            'stage that takes all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}',
         )
 
 
@@ -223,7 +223,7 @@ def check_dimensions(expanded: Expanded) -> None:
                 for index, stage in before
             ):
                 raise DimensionError(
-                    f"the dimension '{name}' is missing: no stage before makes it, and no input has it",
+                    f"the dimension '{name}' is missing: no stage before creates it, and no input has it",
                     where=ours.place,
                     cure=ours.stage.hint or MAKERS.get(name),
                 )
@@ -252,8 +252,8 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
             if header is not None and header.minor < 4 and names:
                 listed = ", ".join(names[:5]) + ", ..." * (len(names) > 5)
                 warnings.append(
-                    f"{path}: its extra dimensions are not read: {listed}. Of LAS 1.{header.minor} PDAL reads them "
-                    'where the reader has "use_eb_vlr": true'
+                    f"{path}: its extra dimensions are not read: {listed}. In LAS 1.{header.minor}, PDAL reads them "
+                    'only if the reader has "use_eb_vlr": true'
                 )
     return warnings
 

@@ -44,7 +44,7 @@ def input_files(names: Sequence[str]) -> list[str]:
 def _meant(name: str) -> list[str]:
     """The inputs that one name stands for."""
     if not name:  # which for a path is the current folder
-        cure = "Name a file, or '.' for the current folder; is a variable not set?"
+        cure = "Name a file, or '.' for the current folder; is a shell variable unset?"
         raise StageError("the name of an input is empty", cure=cure)
     path = Path(name)
     if "://" in name:
@@ -69,7 +69,7 @@ def _inside(folder: Path) -> list[str]:
     inside = sorted(str(path) for path in folder.iterdir() if is_las(str(path)))
     if not inside:
         deeper = next(folder.rglob("*.la[sz]"), None)
-        cure = f"There are some further down: '{folder}/**/*{deeper.suffix}'" if deeper else None
+        cure = f"There are some in subfolders: '{folder}/**/*{deeper.suffix}'" if deeper else None
         raise StageError("the folder holds no LAS or LAZ files", found=str(folder), cure=cure)
     return inside
 
@@ -152,9 +152,9 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
     for source, output in zip(sources, outputs, strict=True):
         if (other := first.setdefault(output, source)) is not source:
             raise PipelineError(
-                "two inputs have one name and would be written to one file",
+                "two inputs have the same name and would be written to one file",
                 found=f"{other} and {source}: {output}",
-                cure="Name a folder (with a slash at its end), in which each lies in the folder of its input; or rename one",
+                cure="Name a folder (with a slash at its end), which keeps the inputs' folders; or rename one",
             )
     return outputs
 
@@ -260,7 +260,7 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
     heights: dict[object, str] = {}
     for path, one in found.items():
         across, upward = one.units.horizontal, one.units.vertical
-        assumed = ", as no reference says otherwise" if one.units.assumed else ""
+        assumed = ", as there is no spatial reference" if one.units.assumed else ""
         units.setdefault((across, upward), f"{across:g} m across and {upward:g} m upward in {path}{assumed}")
         for kinds, said in ((planes, one.plane), (heights, one.height)):
             if said:
@@ -279,7 +279,7 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
         return []
     named = ", ".join(paths[:3]) + (f" and {len(paths) - 3:,} more" if len(paths) > 3 else "")
     has, taken = ("has", "it is") if len(paths) == 1 else ("have", "they are")
-    return [f"{named} {has} {NO_REFERENCE} {taken} taken to have that of the other inputs"]
+    return [f"{named} {has} {NO_REFERENCE} {taken} assumed to have that of the other inputs"]
 
 
 def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:

@@ -158,7 +158,7 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
     together, apart = any(one <= 5 for one in written), any(one > 5 for one in written)
     if together and (apart or mixed):
         raise PipelineError(
-            "this PDAL cannot bring the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
+            "this PDAL cannot carry the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
             found=f"PDAL {pdal_env.dotted_version()}",
             cure=f"Give all LAS writers {_AS_LAS_14}, or use PDAL 2.6",
         )

@@ -73,7 +73,7 @@ def _content(path: Path) -> bytes:
     """What a file or pipe holds; devices have no end."""
     with open(path, "rb") as file:
         if len(data := file.read(_LARGEST)) == _LARGEST:
-            raise OSError(f"{_LARGEST >> 20} MB and more are no pipeline")
+            raise OSError(f"{_LARGEST >> 20} MB or more, too much for a pipeline")
     return data
 
 
@@ -101,7 +101,7 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             f"the pipeline is not valid JSON: {error.msg}",
             where=f"{name or 'pipeline'}, line {error.lineno}, column {error.colno}",
             found=repr(clean[max(0, error.pos - 20) : error.pos + 20].strip()),
-            cure="JSON is one list or object, with double quotes, a comma between values, and none before a bracket",
+            cure="JSON is one list or object, with double quotes, a comma between values, and none before a closing bracket",
         ) from None
     except (ValueError, RecursionError) as error:
         found = str(error)[:200]
@@ -176,7 +176,7 @@ def _check_values(stage: Any, where: str) -> None:
         cure = "If it is a file's name, rename the file"
         raise PipelineError("a text is not valid UTF-8", where=where, found=found, cure=cure) from None
     except (TypeError, ValueError, RecursionError) as error:
-        raise PipelineError("a stage holds what PDAL cannot be given", where=where, found=error) from None
+        raise PipelineError("a stage holds a value that PDAL cannot take", where=where, found=error) from None
 
 
 # The closing quote is optional, so that a match never fails: searching stays linear whatever the text.

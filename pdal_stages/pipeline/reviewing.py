@@ -150,7 +150,7 @@ def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[
             found.append(ReviewCells.of(part["xyz"], part["codes"], part["Reliability"], side, number))
     if whole:
         print_messages(
-            f"{path} has no Reliability: made now by the model {model}, which takes as long as classifying"
+            f"{path} has no Reliability: now computed by the model {model}, which takes as long as classifying"
         )
         every = {name: np.concatenate([part[name] for part in whole]) for name in whole[0]}
         found.append(ReviewCells.of(every["xyz"], every["codes"], reliability_of(every, model), side, number))

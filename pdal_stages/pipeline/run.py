@@ -40,10 +40,10 @@ LEFT_ALONE = {
     "ignored": "left out: noise, withheld (ignore)",
     "kept": "class kept (keep)",
     "outside_where": "outside where",
-    "decks": "put on bridge decks (bridges)",
-    "wires": "found to be wires (wires)",
-    "towers": "found to be towers and poles (wires)",
-    "changed": "mended by rules (consistency)",
+    "decks": "bridge decks (bridges)",
+    "wires": "wires (wires)",
+    "towers": "towers and poles (wires)",
+    "changed": "corrected by rules (consistency)",
 }
 
 

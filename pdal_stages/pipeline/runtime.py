@@ -308,9 +308,9 @@ def _check_ground(where: str, module: dict[str, Any], ins: Mapping[str, Any], ou
     if codes is None or not len(codes) or (np.asarray(codes) == 2).any():
         return
     raise StageError(
-        "no ground was found: none of the points is of class 2",
+        "no ground was found: none of the points has class 2",
         where=where,
         found=f"{len(codes)} points of class {', '.join(map(str, np.unique(codes)[:10].tolist()))}",
-        cure="Find ground before, with filters.smrf or filters.csf, or take filters.hag_morphological, which reads no "
+        cure="Classify ground first, with filters.smrf or filters.csf, or use filters.hag_morphological, which needs no "
         "classes",
     )

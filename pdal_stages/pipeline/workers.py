@@ -26,7 +26,7 @@ from ..base.resources import CORES, available_threads
 from .pdal import check_interrupt, gentle
 
 #: Of a worker that died.
-KILLED = "it killed its worker: too little memory, or a crash in a library"
+KILLED = "its worker process died: too little memory, or a crash in a library"
 #: One task at a time in a process: PDAL's threads are ours, and memory is stated for one.
 _one = threading.Lock()
 

@@ -27,7 +27,7 @@ SUFFIX = ".dylib" if sys.platform == "darwin" else ".so"
 _PYTHON_FILTER = f"libpdal_plugin_filter_python{SUFFIX}"
 #: A function of PDAL's library, in every version: its address tells which file the library is.
 _OF_PDAL = "_ZN4pdal12StageFactoryC1Eb"
-_OTHER_DOORS = "every other door works: pdal-stages pipeline, pdal-stages expand"
+_STILL_WORK = "pdal-stages pipeline and pdal-stages expand still work"
 
 
 def libraries() -> list[str]:
@@ -55,7 +55,7 @@ def install(folder: Path | None = None) -> list[Path]:
             folder.mkdir(parents=True, exist_ok=True)
     if not target.is_dir() or not os.access(target, os.W_OK):
         raise StageError(
-            "the folder of PDAL's plugins cannot be written",
+            "the folder of PDAL's plugins cannot be written to",
             found=target,
             cure="Run this as its owner, or give --folder a folder of your own and add it to PDAL_DRIVER_PATH",
         )
@@ -128,7 +128,7 @@ def compiler() -> list[str]:
         "there is no C++ compiler",
         found=f"CXX={' '.join(named)}" if named else "neither c++, g++ nor clang++ on PATH",
         cure="Debian, Ubuntu: apt-get install g++. Fedora: dnf install gcc-c++. macOS: xcode-select --install. conda: "
-        f"conda install -c conda-forge cxx-compiler. Without one {_OTHER_DOORS}",
+        f"conda install -c conda-forge cxx-compiler. Without one, {_STILL_WORK}",
     )
 
 
@@ -142,7 +142,7 @@ def pdal() -> Pdal:
         found = _headers_version(headers)
         if found not in (version, ""):
             raise DependencyError(
-                "PDAL's headers are of another version than its library",
+                "PDAL's headers and library are of different versions",
                 found=f"{headers / 'pdal'}: {found}, {library}: {version}",
                 cure="Install both from one place",
             )
@@ -151,7 +151,7 @@ def pdal() -> Pdal:
         "PDAL's headers are missing",
         found=f"no include/pdal beside {library}",
         cure="Debian, Ubuntu: apt-get install libpdal-dev. conda-forge: conda install -c conda-forge libpdal-core. "
-        f"Without them {_OTHER_DOORS}",
+        f"Without them, {_STILL_WORK}",
     )
 
 
@@ -193,7 +193,7 @@ def _library_folder() -> Path:
     raise DependencyError(
         "the library that python-pdal uses is not found",
         found=extension,
-        cure=f"On this system the plugin cannot be built; {_OTHER_DOORS}",
+        cure=f"On this system the plugin cannot be built; {_STILL_WORK}",
     )
 
 
@@ -215,6 +215,5 @@ def _run(command: Sequence[str]) -> None:
         raise StageError(
             "the plugin does not compile",
             found=f"{command[0]}: {'; '.join([line for line in lines if 'error' in line][:3] or lines[-1:])}",
-            cure="Report it with PDAL's version; every other door works without the plugin: pdal-stages pipeline, "
-            "pdal-stages expand",
+            cure=f"Report it with PDAL's version; without the plugin, {_STILL_WORK}",
         )

@@ -137,7 +137,7 @@ def object_frames(
         import geopandas
     except ImportError as error:
         raise DependencyError(
-            "frames of objects need geopandas",
+            "GeoDataFrames need geopandas",
             found=str(error),
             cure="pip install geopandas; without it find_objects and object_layers give plain geometries",
         ) from None

@@ -60,7 +60,7 @@ class AdaptTask:
             if len(codes) < 2:
                 counts = ", ".join(f"{count:,} of class {code}" for code, count in found.items())
                 raise StageError(
-                    f"'{self.teacher}' is sure of {FEWEST:,} points or more of fewer than two of its classes",
+                    f"'{self.teacher}' is sure of {FEWEST:,} points or more in fewer than two of its classes",
                     found=counts,
                     cure="Adapt to more of the survey, or use that model itself",
                 )
@@ -79,7 +79,7 @@ class AdaptTask:
         missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
         if missing:
             told.append(
-                f"'{self.teacher}' is sure of too few points of a class ({', '.join(missing)}): the model does not know it"
+                f"'{self.teacher}' is sure of too few points of a class ({', '.join(missing)}): the new model leaves it out"
             )
         return told
 
@@ -94,7 +94,7 @@ class AdaptTask:
             raise StageError(
                 f"{len(run.failures):,} parts of the survey cannot be classified",
                 found="; ".join(str(one) for one in run.failures[:3]),
-                cure="Mend or leave out what is named",
+                cure="Repair these files, or leave them out",
             )
         return sorted(str(one) for one in (folder / "classified").rglob("*.la[sz]"))
 
@@ -108,7 +108,7 @@ def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]
         return list(files), []
     chosen = list(files[step // 2 :: step])
     return chosen, [
-        f"{len(chosen):,} of {len(files):,} files are looked at, one in {step}: so many points are enough"
+        f"{len(chosen):,} of {len(files):,} files are used, one in {step}: their points are enough"
     ]
 
 

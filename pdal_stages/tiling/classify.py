@@ -78,7 +78,7 @@ class ClassifyTask:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 found = f"{folder}: {error.strerror}"
-                raise StageError("the output folder cannot be made", found=found) from None
+                raise StageError("the output folder cannot be created", found=found) from None
 
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
@@ -103,17 +103,17 @@ class ClassifyTask:
 
         if odd := [name for name in self.files if not is_las(name) and not is_ept(name)]:
             raise OptionError(
-                "several inputs, and the options of tiles, are for LAS, LAZ, COPC and EPT: others cannot be cut into tiles",
+                "several inputs, and the options of tiles, need LAS, LAZ, COPC or EPT, which can be cut into tiles",
                 found=odd[0],
-                cure="Convert them first (pdal translate INPUT input.laz), or classify one after the other without options "
-                "of tiles",
+                cure="Convert them first (pdal translate INPUT input.laz), or classify them one at a time without "
+                "tile options",
             )
         target = named = self.output
         if is_folder(self.output):
             target, named = str(Path(self.output) / ("#.laz" if self._per_tile else "#")), "x.laz"
         if target.lower().endswith(".copc.laz"):
             raise OptionError(
-                "outputs of tiles are plain LAS or LAZ",
+                "runs in tiles write plain LAS or LAZ",
                 found=target,
                 cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. Tiles are for "
                 "several inputs, clouds too large for the memory, --tile, --per, --resume and --report",

@@ -20,7 +20,7 @@ from ..pipeline.workers import TaskResult, perform
 _CONNECT, _WAIT = 10.0, 120.0
 #: Seconds after which it is asked whether scheduler and workers are still there.
 _ASK = 10.0
-_RESUME = "Once it is there again, --resume goes on"
+_RESUME = "Once it is back, continue with --resume"
 
 
 class Cluster(contextlib.AbstractContextManager):
@@ -98,8 +98,8 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
     here, theirs = socket.gethostname(), _versions()
     if theirs != wanted:
         return (
-            f"a worker of the scheduler has other versions than this program (found pdal-stages {theirs[0]} and PDAL "
-            f"{theirs[1]} on {here}, there {wanted[0]} and {wanted[1]}). Install the same on all hosts"
+            f"a worker of the scheduler runs other versions than this program (found pdal-stages {theirs[0]} and PDAL "
+            f"{theirs[1]} on {here}, here {wanted[0]} and {wanted[1]}). Install the same on all hosts"
         )
     for _ in range(5):  # network file systems may show a new folder late
         if os.path.isdir(folder):
@@ -108,7 +108,7 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
     else:
         return (
             f"a worker of the scheduler does not see the output folder (found no {folder} on {here}). Inputs, model and "
-            "outputs must be there under the same paths on all hosts"
+            "outputs must have the same paths on all hosts"
         )
     answer = perform(pickle.loads(task))
     if answer.reason and here != host:

@@ -85,7 +85,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
         if kind == "readers.tindex":
             if ignored := [o for o in _TINDEX_QUERIES if o in reader]:
                 raise PipelineError(
-                    "in tiles all files of a tile index are read, whole, in their own reference",
+                    "in tiles, all files of a tile index are read whole and in their own spatial reference",
                     where=kind,
                     found=", ".join(ignored),
                     cure="Leave these options out, or make an index of the files you mean",
@@ -101,7 +101,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
         elif paths == [name] and not os.path.exists(name) and any(c in name for c in "*?["):
             paths = sorted(glob.glob(name, recursive=True))
             if not paths:
-                raise PipelineError("no file fits the reader's pattern", where=kind, found=name)
+                raise PipelineError("no file matches the reader's pattern", where=kind, found=name)
         for path in map(os.path.abspath, paths):
             found.setdefault(path, InputSource(path, {**options, "type": "readers.las"}, "las"))
     return list(found.values())
@@ -231,7 +231,7 @@ class Survey:
         self.messages += [f"{said}{more}" for said in odd[:1]]
         if lost := len(self.sources) - len(self.extents):
             self.messages.append(
-                f"{lost:,} of the inputs without a readable header: where they lie is not known, and tiles beside them may "
+                f"{lost:,} of the inputs have no readable header: where they lie is not known, and tiles beside them may "
                 "lack neighbors. Once they can be read, --resume runs those tiles again"
             )
 

@@ -90,7 +90,7 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
     for one in overrides:
         if one.by_tag or one.selector not in OPTIONS_OF:
             raise OptionError(
-                "objects takes options of writers.objects and filters.objects alone", found=one.flag
+                "objects takes only options of writers.objects and filters.objects", found=one.flag
             )
         given[one.option] = one.value
     stage = ObjectsWriter({**given, "filename": output})
@@ -112,7 +112,7 @@ def _objects_of_files(
     if thin:
         too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
         print_messages(
-            f"{too_few}, so cells of {cells.size:g} m are taken; --cell {size:g} keeps to them"
+            f"{too_few}, so cells of {cells.size:g} m are used; --cell {size:g} keeps the smaller ones"
             if stage.widens
             else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
         )

@@ -115,7 +115,7 @@ def read_results(tiles: Iterable[str], source: InputSource, count: int, start: i
                 columns.setdefault(dimension[4:], []).append((mine, column[first:last].copy()))
     if seen != count:
         raise StageError(
-            "the tiles do not hold all points of the file: it changed while it was worked on",
+            "the tiles do not hold all points of the file: the file changed during the run",
             where=source.path,
             found=f"{seen:,} of {count:,} points",
             cure="Start the run again with --resume",
@@ -151,7 +151,7 @@ def run_tail(
 
     def finish(made: Path, final: Path, number: int) -> None:
         if not Path(scratch).is_dir():  # of a run that was killed: another one may write here now
-            raise StageError("the run that wanted this has ended", found=scratch)
+            raise StageError("the run that this belonged to has ended", found=scratch)
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         las.supersede_copc(made)
 

@@ -216,7 +216,7 @@ def _check_row(steps: list[_Step]) -> None:
         before = steps[number - 1] if number else None
         if before and step.rank < before.rank:
             raise PipelineError(
-                "a pipeline in tiles is a row: readers, then filters, then writers",
+                "a pipeline in tiles is linear: readers, then filters, then writers",
                 where=step.where,
                 found=f"{step.type} after {before.type}",
             )
@@ -225,7 +225,7 @@ def _check_row(steps: list[_Step]) -> None:
             names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))
             if names not in (readers, {str(before.given.get("tag"))}):
                 raise PipelineError(
-                    "a pipeline in tiles is a row; this stage takes only some of the points before it",
+                    "a pipeline in tiles is linear; this stage takes only some of the points before it",
                     where=step.where,
                     found=f"inputs {sorted(names)}",
                     cure="Run one pipeline for each branch",
@@ -240,10 +240,10 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
         raise PipelineError("the pipeline has no writer", cure=cure)
     for step in writers:
         if not isinstance(step.given.get("filename"), str) or "://" in step.given["filename"]:
-            raise PipelineError("in tiles, a writer writes files", where=step.type)
+            raise PipelineError("in tiles, writers write local files", where=step.type)
         if step.type == "writers.gdal":
             raise PipelineError(
-                "rasters are not written in tiles, where each would lack what lies beyond its edge",
+                "rasters are not written in tiles: each would lack the points beyond its edge",
                 where=step.where,
                 cure="Write LAS files, and give these to PDAL: pdal pipeline pipelines/terrain-and-surface.json",
             )
@@ -275,7 +275,7 @@ def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
         )
     if in_head and step.type in MOVING:
         raise PipelineError(
-            f"{step.type} moves points before stages that see neighbors, and tiles are cut before it",
+            f"{step.type} moves points, but tiles are cut before it, and stages after it see neighbors",
             where=step.where,
             cure="Reproject the files first, or put it after the last stage of pdal_stages",
         )

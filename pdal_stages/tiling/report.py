@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 #: Most different warnings of tiles that a run repeats.
 _MOST_MESSAGES = 20
 _CHANGED = (
-    "it changed while it was worked on, so outputs may hold results from before and after. Once it stays as it is, "
-    "run it again with --resume"
+    "it changed during the run, so outputs may hold results from before and after. Once it no longer changes, run "
+    "it again with --resume"
 )
 
 
@@ -94,8 +94,8 @@ class TiledRun:
         if not tiles and not outputs:
             return ""
         return (
-            f" ({counted(tiles, 'tile')} and {counted(outputs, 'output')} are not made because of it. Move it out of the "
-            "inputs to make them without it)"
+            f" ({counted(tiles, 'tile')} and {counted(outputs, 'output')} depend on it and are not made. Remove it from "
+            "the inputs to make them without it)"
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -210,7 +210,7 @@ class _Run:
                 yield job
                 if not done and len(failures) >= _HOPELESS and len(set(failures)) == 1:
                     raise StageError(
-                        f"the first {len(failures)} tiles all failed for one reason, so the run was stopped",
+                        f"the first {len(failures)} tiles all failed for the same reason, so the run was stopped",
                         found=failures[0],
                     )
 

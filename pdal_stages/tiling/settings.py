@@ -178,7 +178,7 @@ def settled(
         return options  # as it was asked for
     least = needed(sides[0]) * max(1, local if fixed else 1) + (PARENT if local else 0)
     raise OptionError(
-        "the memory does not suffice for tiles" + ("" if options.tile is None else " of this size"),
+        "there is not enough memory for tiles" + ("" if options.tile is None else " of this size"),
         found=f"{whole / 1e9:.1f} GB; about {least / 1e9:.1f} GB are needed",
         cure="Give more with --memory, or fewer --workers"
         + (", or a smaller --tile" if options.tile else ""),
@@ -204,7 +204,7 @@ class TileGrid:
             where = np.floor(coordinate / self.size)
         if where.size and not np.abs(where).max() < _FARTHEST:  # not finite too
             raise StageError(
-                "coordinates are too far away to be counted in tiles",
+                "coordinates are too large for tiles of this size",
                 found=f"{coordinate[np.abs(where).argmax()]:g}, tiles of {self.size:g}",
                 cure="Take larger tiles, or repair the coordinates",
             )

@@ -151,7 +151,7 @@ def load_arrays(path: str | Path, only: Collection[str] | None = None, under: st
     except Exception as error:  # zipfile and numpy raise many types
         Path(path).unlink(missing_ok=True)
         raise StageError(
-            "what the run kept cannot be read back, and was removed",
+            "a temporary result of the run cannot be read back, and was removed",
             found=f"{path}: {error}",
             cure="Run it again with --resume",
         ) from error

@@ -177,7 +177,7 @@ def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceRe
         rows = rows[order]
         if (np.diff(rows) == 0).any():
             raise PipelineError(
-                "a stage makes new points, which have no place in the input files",
+                "a stage creates new points, which belong to no input file",
                 cure="Run the pipeline without --tile",
             )
         values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
@@ -251,7 +251,7 @@ class TileTask:
             halo_m, short = need + 1e-6, False
         if head is None:
             raise NoTerrainError(
-                "no terrain: no point near the tile may form one", found=f"within {halo_m:.0f} m"
+                "no terrain: no point near the tile can be part of it", found=f"within {halo_m:.0f} m"
             )
         given = (one.values["Classification"] for one in head.results if "Classification" in one.values)
         return head.results, {

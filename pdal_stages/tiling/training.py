@@ -119,7 +119,7 @@ class TrainTask:
         told = {name: value for name in ("survey", "groups") if (value := writer.get(name))}
         if told and (self.surveys or self.survey):
             raise OptionError(
-                "surveys are told by files or by a dimension, not both",
+                "surveys are given by files or by a dimension, not by both",
                 found=", ".join(f"{name}={value}" for name, value in told.items()),
             )
         forest = writer.get("algorithm", TrainingOptions.algorithm) == "random_forest"

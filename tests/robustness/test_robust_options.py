@@ -75,7 +75,7 @@ STAGES = {
     "stage that is a number": ([7], ["line 3", "a stage is an object, or a file name", "7"]),
     "dimension that is missing": ([{"type": ACCURACY}], ["'Reference' is missing", "filters.ferry"]),
     "where with a missing dimension": ([{**HAG, "where": "Hight > 2"}], ["names the dimension 'Hight'"]),
-    "two writers of one file": ([HAG, OUT], ["two output files are one"]),
+    "two writers of one file": ([HAG, OUT], ["two output files are the same file"]),
     "output named as a folder": ([{**OUT, "filename": "."}], ["names a folder"]),
     "output name of 300 characters": ([{**OUT, "filename": "x" * 296 + ".las"}], ["longer than 255 bytes"]),
     "input that is not there": ([{"type": "readers.las", "filename": "nix.las"}], ["nix.las"]),
