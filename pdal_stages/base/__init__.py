@@ -1,1 +1,1 @@
-"""What every room stands on: errors, checks, files, LAS headers, threads, messages, units."""
+"""What all other packages build on: errors, checks, files, LAS headers, threads, messages, units."""

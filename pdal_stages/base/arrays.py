@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 
 def begins_run(ascending: npt.NDArray) -> npt.NDArray[np.bool_]:
-    """Which values of a sorted array (n,) are not those before them."""
+    """Which values of a sorted array (n,) differ from the one before."""
     new = np.ones(len(ascending), np.bool_)
     np.not_equal(ascending[1:], ascending[:-1], out=new[1:])
     return new
@@ -22,12 +22,12 @@ def begins_run(ascending: npt.NDArray) -> npt.NDArray[np.bool_]:
 def places_among(
     ascending: npt.NDArray, wanted: npt.NDArray
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Where wanted values are among others, ascending and some; and whether they are."""
+    """The index of each wanted value in a non-empty ascending array, and whether it is there."""
     place = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
     return place, ascending[place] == wanted
 
 
-#: Values hashed in one go: they stay in a core's cache, and take no memory to speak of.
+#: Values hashed at a time: few enough to stay in a core's cache.
 _TOGETHER = 1 << 16
 #: What splitmix64 adds before it mixes.
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -43,7 +43,7 @@ def finalise(h):
 def hash_of(columns: Iterable[npt.ArrayLike], seed: int) -> npt.NDArray[np.uint64]:
     """A 64-bit hash of each point's values and the seed: every bit counts, but -0.0 is 0.0.
 
-    The values lie in an array each, (n,) of any type, such as the axes of coordinates; there must be one at least.
+    Each column is an array (n,) of any type, such as one axis of the coordinates; there must be at least one.
     """
     arrays = [np.asarray(column) for column in columns]
     out = np.empty(len(arrays[0]), np.uint64)

@@ -1,4 +1,4 @@
-"""Checks of single values, with one wording: what must be what, and what was found; and JSON that is strict."""
+"""Checks of single values, worded alike: what was expected and what was found; and strict JSON."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .errors import OptionError, suggest
 
 
 def whole(what: str, value: Any, low: int | None = None, high: int | None = None, *, unit: str = "") -> int:
-    """A whole number within bounds, both included; also where it is given as 2.0.
+    """A whole number within bounds, both included; 2.0 is one, too.
 
     Parameters
     ----------
     what : str
-        What it is the value of, as the message says it, e.g. ``'count'`` with its quotes.
+        The name of the value in messages, e.g. ``'count'`` with its quotes.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def flag(what: str, value: Any) -> bool:
 
 
 def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
-    """One of the values there are. See :func:`whole`."""
+    """One of the given choices. See :func:`whole`."""
     known = list(choices)
     if not any(type(value) is type(choice) and value == choice for choice in known):
         raise OptionError(
@@ -67,7 +67,7 @@ def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
 
 
 def names(what: str, value: Any) -> tuple[str, ...]:
-    """Names, each once, from a list or from text with commas. See :func:`whole`."""
+    """Names without duplicates, from a list or from comma-separated text. See :func:`whole`."""
     if isinstance(value, str):
         value = [part.strip() for part in value.split(",") if part.strip()]
     found = list(value) if isinstance(value, Iterable) else None
@@ -77,7 +77,7 @@ def names(what: str, value: Any) -> tuple[str, ...]:
 
 
 def bounds(low: float | None, high: float | None, above: bool = False, unit: str = "") -> str:
-    """Bounds as words that follow "a number"."""
+    """Bounds in words, to follow "a number"."""
     unit = f" {unit}" if unit else ""
     if low is None:
         return "" if high is None else f" of at most {_plain(high)}{unit}"
@@ -89,7 +89,7 @@ def bounds(low: float | None, high: float | None, above: bool = False, unit: str
 
 
 def finite(value: Any) -> int | float | None:
-    """A number that is finite as a double, as it is; None for anything else, true and false too."""
+    """The value where it is a number that is finite as a double; None for anything else, booleans too."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
     try:
@@ -127,7 +127,7 @@ def strict_json(text: str | bytes) -> Any:
 
 
 def refuse_constant(word: str) -> None:
-    """Refuse NaN and Infinity, which JSON has not."""
+    """Refuse NaN and Infinity, which are not JSON."""
     raise ValueError(f"{word} is not a JSON number")
 
 

@@ -1,4 +1,4 @@
-"""The one error base of the package: what is wrong, where, what was found, and the cure."""
+"""The errors of the package: what is wrong, where, what was found, and how to fix it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class StageError(Exception):
     where : str, optional
         The stage type and tag, the file, or the option.
     found : object, optional
-        The value that was found; an OSError, for what the system said.
+        The value that was found; of an OSError, the system's message.
     cure : str, optional
         What to do about it.
     """
@@ -69,7 +69,7 @@ class DimensionError(StageError):
 
 
 class ModelError(StageError):
-    """A model file cannot be read, is not trustworthy, or does not fit the cloud."""
+    """A model file cannot be read, is damaged, or does not fit the cloud."""
 
 
 class PipelineError(StageError):
@@ -81,7 +81,7 @@ class InterruptedStage(StageError):
 
 
 class NoTerrainError(StageError):
-    """None of the points may form a terrain; with more points around them some may."""
+    """None of the points can be terrain; with more points around them, some may be."""
 
 
 class DependencyError(StageError):
@@ -95,7 +95,7 @@ def suggest(word: str, known: Iterable[str]) -> str:
 
 
 def how_to_add(extra: str) -> str:
-    """The command that brings an extra of ours."""
+    """The command that installs one of our extras."""
     root = Path(__file__).resolve().parents[2]
     if Path(sys.prefix) == root / ".venv" and (root / "scripts" / "setup").is_file():
         return f"{root}/scripts/setup {extra}"
@@ -103,7 +103,7 @@ def how_to_add(extra: str) -> str:
 
 
 def optional_import(module: str, extra: str, purpose: str):
-    """Import a heavy optional package, or say which extra of ours brings it."""
+    """Import a heavy optional package, or say which of our extras installs it."""
     import importlib
 
     try:

@@ -1,11 +1,11 @@
-"""Output files: held against what is read and what is there already, then written whole or not at all.
+"""Output files: checked against inputs and existing files, then written whole or not at all.
 
-They are written in a hidden folder beside their place, then renamed. It has a random name, only its owner may enter it, and
-it is locked while its writer lives: what a killed writer left is known to be dead, and goes with the next file there.
+They are written in a hidden folder beside their final place, then renamed. The folder has a random name, is private to its
+owner and locked while its writer runs, so what a killed writer left is recognized and removed by the next one.
 
-* An existing file is replaced; the new one takes over its mode, and its owner where that may be given.
-* A link is followed: the file it leads to is replaced, the link stays.
-* A device, pipe or terminal (``/dev/stdout``) is written into, once all is there.
+* An existing file is replaced; the new one keeps its mode, and its owner where permitted.
+* A link is followed: its target is replaced, the link stays.
+* A device, pipe or terminal (``/dev/stdout``) gets the content once it is complete.
 * A write-protected file, a file of another kind, a folder, a socket and a block device are refused.
 """
 
@@ -28,7 +28,7 @@ from .errors import StageError
 
 LAS, MODEL, CHECKPOINT = "a LAS or LAZ file", "a model file", "a training's checkpoint"
 JSON, HTML, PNG = "a JSON file", "an HTML page", "a PNG picture"
-#: The first bytes of files that people would miss.
+#: The first bytes of files that must not be replaced by another kind.
 _BEGINNINGS = {
     b"LASF": LAS,
     b"\x89PNG": PNG,
@@ -64,7 +64,7 @@ def kind_of(path: str | os.PathLike) -> str:
     return JSON if text.startswith((b"{", b"[")) else ""
 
 
-#: Bytes a file's name may have, on every usual file system.
+#: The longest file name, in bytes, on common file systems.
 _LONGEST_NAME = 255
 
 
@@ -82,8 +82,8 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     Raises
     ------
     StageError
-        If its folder is missing or read-only, its name is too long, or what is there must not be replaced: a folder, a
-        write-protected file, a file that is known to be of another kind.
+        If its folder is missing or read-only, its name is too long, or what exists there must not be replaced: a folder, a
+        write-protected file, a file of another kind.
     """
     if not os.fspath(path) or "\0" in os.fspath(path):
         raise StageError(f"the {what} file has no name", found=ascii(path), cure="Is a shell variable unset?")
@@ -114,7 +114,7 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
 
 
 def is_stream(path: str | os.PathLike) -> bool:
-    """Whether a name stands for something to write into: a device, a pipe, or what this process has open."""
+    """Whether a path is written into, not replaced: a device, a pipe, or an open file of this process."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -135,7 +135,7 @@ class Output:
 def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]) -> None:
     """Refuse outputs that cannot be written, that are read, that are one file, or that would replace another kind.
 
-    Links are followed and hard links seen through.
+    Symbolic and hard links are recognized.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def _numbered(output: Path, inputs: list[Path]) -> Path | None:
 
 #: How the hidden folders' names begin.
 PREFIX = ".pdal-stages-partial-"
-#: What the system says where a file has no room, or none is left to this user.
+#: The system's errors for a full disk, an exceeded quota or file-size limit.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _swept: set[str] = set()
 
@@ -213,8 +213,8 @@ def whole_files(
     Parameters
     ----------
     *paths : path
-        Where the files shall be. A name that holds '#' may become any number of files, as PDAL's writers
-        number them; files that a writer makes beside its own go with it.
+        The final paths. A name with '#' may become any number of files, as PDAL's writers number them; files that a
+        writer creates beside its own are moved with it.
     what : str
         What messages call them.
     check : callable, optional
@@ -224,12 +224,12 @@ def whole_files(
     Yields
     ------
     list of Path
-        The same names in other folders. Nothing exists there yet.
+        Paths with the same names in hidden folders. Nothing exists there yet.
 
     Raises
     ------
     StageError
-        If a file cannot be written, or was not. Errors that come from inside name the true file, not the hidden one.
+        If a file cannot be written, or was not. Errors raised inside name the final path, not the hidden one.
     """
     places: list[_Place] = []
     inside = False
@@ -306,7 +306,7 @@ class _Place:
 
 
 def _give_name(made: Path, target: Path) -> None:
-    """Move a file to its place, or write it into what is there."""
+    """Move a file to its final path, or write it into a device or pipe."""
     if is_stream(target):
         with open(made, "rb") as file:
             _pour(file, target)
@@ -322,7 +322,7 @@ def _give_name(made: Path, target: Path) -> None:
 
 
 def _pour(file: Any, target: Path) -> None:
-    """Write a file into a device, a pipe, or what this process has open, at the place where that stands."""
+    """Copy a file into a device, a pipe, or an open file of this process, at its current position."""
     there = os.stat(target)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, OSError, ValueError):
@@ -336,7 +336,7 @@ def _pour(file: Any, target: Path) -> None:
 
 
 def _locked_folder(parent: Path) -> tuple[Path, int | None]:
-    """A new folder that only we may enter, and what holds it locked; None where folders have no locks."""
+    """A new private folder, and the descriptor that locks it; None where folders cannot be locked."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
         try:
@@ -353,7 +353,7 @@ def _locked_folder(parent: Path) -> tuple[Path, int | None]:
 
 
 def sweep(folder: str | os.PathLike) -> None:
-    """Remove what writers that live no more left in a folder; other users' and live writers' files stay."""
+    """Remove hidden folders of writers that were killed; those of running writers and other users stay."""
     with contextlib.suppress(OSError):
         for left in Path(folder).glob(f"{PREFIX}*"):
             with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
 """LAS: headers and records of LAS and LAZ files, and the class codes of ASPRS (LAS 1.4-R15, tables 9 and 17).
 
-Not laspy's reader: its import takes 0.15 CPU seconds of every start, and it reads all records before the size is held
-against them.
+Not laspy's reader: its import takes 0.15 CPU seconds of every start, and it reads all records before their sizes are
+checked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .errors import PipelineError, StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-#: Point formats with waveforms, and what has all else that they have.
+#: Point formats with waveforms, and the same formats without.
 WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
 
 _CLASSES: dict[int, tuple[str, tuple[int, int, int]]] = {
@@ -57,13 +57,13 @@ NAMES = {code: name for code, (name, _) in _CLASSES.items()}
 NOISE = (7, 18)
 #: ASPRS codes of low, medium and high vegetation.
 LOW, MEDIUM, HIGH = 3, 4, 5
-#: Wires that carry current, what holds them, and bridge decks.
+#: Conductors, towers and bridge decks.
 WIRE, TOWER, BRIDGE = 14, 15, 17
 #: Codes that say nothing about the object: never classified, unclassified.
 UNLABELED = (0, 1)
 #: Overlap of strips, before LAS 1.4 had a flag for it.
 OVERLAP = 12
-#: Codes that do not say what kind of thing a point is. They are neither trained on nor scored unless they are named.
+#: Codes that say nothing about the object. They are neither trained on nor scored unless they are named.
 UNINFORMATIVE = (*UNLABELED, *NOISE, OVERLAP)
 #: Largest code LAS 1.0-1.3 point formats (0-5) hold: five bits.
 LEGACY_LIMIT = 31
@@ -71,7 +71,7 @@ LEGACY_LIMIT = 31
 
 @dataclass(frozen=True)
 class LasHeader:
-    """What a header says of the size of its file."""
+    """The fields of a header that the layout of the file follows from."""
 
     minor: int
     point_format: int
@@ -84,14 +84,14 @@ class LasHeader:
     after: int  #: where the records after the points begin
     count: int
     waveforms: int  #: where waveforms inside the file begin, 0 where there are none
-    boxed: bool  #: whether its box is more than zeros
+    boxed: bool  #: whether its bounding box is not all zeros
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
     box: tuple[float, float, float, float]  #: (min x, min y, max x, max y)
 
 
 def refuse_pipe(path: str | os.PathLike) -> None:
-    """Refuse an input that would be waited for, and can be read only once."""
+    """Refuse a pipe as an input: it may block, and can be read only once."""
     if stat.S_ISFIFO(os.stat(path).st_mode):
         raise StageError("the input is a pipe", where=str(path), cure="Save it to a file first")
 
@@ -118,7 +118,7 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
 
 
 def header_there(path: str | os.PathLike) -> LasHeader | None:
-    """The same; None too where the file cannot be read, which is said when its points are."""
+    """The same; also None where the file cannot be read, which is reported when its points are read."""
     try:
         return read_header(path)
     except (OSError, ValueError):
@@ -132,7 +132,7 @@ def holds_flags(path: str | os.PathLike) -> bool:
 
 
 class Record(NamedTuple):
-    """A variable-length record: where its head is, whose it is, where its data are; `after` the points or before."""
+    """A variable-length record: the offsets of its head and data, its user id, and whether it stands `after` the points."""
 
     place: int
     user: bytes
@@ -144,7 +144,7 @@ class Record(NamedTuple):
 
 
 def records(file: BinaryIO, header: LasHeader) -> Iterator[Record]:
-    """The records of a file, as far as they are all there."""
+    """The records of a file, up to the first that is cut short."""
     place = header.header_bytes
     for index in range(header.records + header.records_after):
         after = index >= header.records
@@ -168,12 +168,12 @@ def _text(field: bytes) -> bytes:
     return field.split(b"\0")[0]
 
 
-#: Records that are looked through, and bytes of one that is read.
+#: Most records that are searched, and the largest one that is read, in bytes.
 _MOST_RECORDS, LARGEST_RECORD = 10_000, 1 << 20
 
 
 def records_of(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, bytes]]:
-    """The records of a user (``LASF_Spec``) in a file, with their data; none where it is no LAS file."""
+    """The records of a user id (``LASF_Spec``) in a file, with their data; none where it is not a LAS file."""
     header = read_header(path)
     if header is None:
         return
@@ -185,7 +185,7 @@ def records_of(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, b
 
 
 def supersede_copc(path: str | os.PathLike) -> None:
-    """Mark COPC records that do not describe this file, which PDAL forwards from a COPC input with the others.
+    """Mark COPC records that do not describe this file; PDAL forwards them from a COPC input like any other.
 
     Readers of COPC would look for an octree where there is none. The records get the id with which LAS 1.4 (R15,
     section 2.5, "Superseded") negates a record in place.
@@ -248,12 +248,12 @@ def geotiff_code(path: str | os.PathLike) -> str:
     return f"EPSG:{across}{height}" if 0 < across < 32767 else ""
 
 
-#: Types of extra dimensions by number, 1 to 10, in PDAL's words (LAS 1.4 R15, table 24).
+#: PDAL's names of the types of extra dimensions, by number, 1 to 10 (LAS 1.4 R15, table 24).
 _TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float", "double")
 
 
 def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
-    """Extra dimensions that a LAS file describes, by name: the types PDAL holds them in. Empty where there are none.
+    """The extra dimensions of a LAS file: name -> the type PDAL holds it in. Empty where there are none.
 
     Scaled ones are ``double``; those that are not valid numbers are left out.
     """
@@ -272,18 +272,18 @@ def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
 
 
 def number_type(kind: str) -> np.dtype:
-    """The NumPy type of one that PDAL writes so: ``double``, ``float``, ``uint8`` or ``uint8_t``."""
+    """The NumPy type of a PDAL type: ``double``, ``float``, ``uint8`` or ``uint8_t``."""
     return np.dtype({"float": "f4", "double": "f8"}.get(kind, kind.removesuffix("_t")))
 
 
 def class_name(code: int) -> str:
-    """The class's name: ASPRS's own, ``Reserved`` up to 63, ``User defined`` up to 255."""
+    """The class's name: the ASPRS name, ``Reserved`` up to 63, ``User class`` up to 255."""
     code = int(code)
     return NAMES.get(code, f"Reserved {code}" if code < 64 else f"User class {code}")
 
 
 def class_color(code: int) -> tuple[int, int, int]:
-    """An sRGB color (0-255) for maps; other codes get a stable one of their own."""
+    """An sRGB color (0-255) for maps; codes without an ASPRS class get a fixed color."""
     code = int(code)
     if code in _CLASSES:
         return _CLASSES[code][1]
@@ -294,7 +294,7 @@ def class_color(code: int) -> tuple[int, int, int]:
 def by_height(
     codes: NDArray[np.uint8], chosen: NDArray[np.bool_], height: NDArray, limits: tuple[float, float]
 ) -> None:
-    """Make those of the chosen points that are high vegetation low or medium, in place; `height` in meters."""
+    """Reclassify the chosen points of high vegetation as low or medium by height in meters, in place."""
     high = chosen & (codes == HIGH)
     low, medium = limits
     codes[high & (height < medium)] = MEDIUM

@@ -1,7 +1,7 @@
-"""LAS and LAZ files held against what their headers say, before PDAL reads one and after it wrote one.
+"""LAS and LAZ files checked against their headers, before PDAL reads one and after it wrote one.
 
-PDAL reads a file that is cut short as if it were whole, giving points made of nothing; some damaged headers and chunk
-tables end the process, or let it wait forever. Its writers do not notice that a disk is full.
+PDAL reads a truncated file as if it were whole, with made-up points; some damaged headers and chunk tables crash it or
+make it hang. Its writers do not notice a full disk.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from .las import LARGEST_RECORD, POINT_BYTES, WAVES, LasHeader, read_header, rec
 
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
-#: Steps of the coordinates that points may lie beyond the box: programs round it differently.
+#: Steps of the coordinates by which points may lie outside the bounding box: programs round it differently.
 _BOX_STEPS = 100
-#: Scales below and offsets above are no lengths, but bytes of a header that was written in part.
+#: Smaller scales and larger offsets come from a header that was only partly written.
 _SMALLEST, _LARGEST = 1e-30, 1e15
-#: Bytes that a header has at least, by its version.
+#: The least size of a header in bytes, by minor version.
 _HEADER_BYTES = (227, 227, 227, 235, 375, 375)
 #: More chunks than this (ten billion points in chunks of the usual size) are not decoded one by one.
 _MOST_CHUNKS = 200_000
-#: Points of a chunk, for which lazrs takes memory at once; 50,000 are usual.
+#: Most points of a chunk, since lazrs allocates memory for all of them; 50,000 are usual.
 _LARGEST_CHUNK = 2**24
 
 #: What is wrong, and what was found.
@@ -36,13 +36,13 @@ Wrong = tuple[str, str]
 
 
 def check_readable(path: str | os.PathLike) -> str | None:
-    """Refuse a LAS or LAZ file whose header cannot be right; a warning where it only looks odd.
+    """Refuse a LAS or LAZ file whose header cannot be right; return a warning where it is only unusual.
 
     Raises
     ------
     StageError
-        What is wrong with the file, or why it cannot be opened: PDAL says little then, or crashes. Or that no PDAL reads
-        its point format.
+        If the file is damaged or cannot be opened, where PDAL says little or crashes; or if no PDAL reads its point
+        format.
     """
     where = str(path)
     try:
@@ -80,7 +80,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
 
 
 def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) -> str | None:
-    """A warning where a file's points lie (min x, min y, max x, max y) beyond the box in its header: None where they do not.
+    """A warning where the extent `lie` of a file's points exceeds the bounding box in its header; None where it does not.
 
     LAZ has no checksums: a damaged file may decode to points anywhere, without an error.
     """
@@ -101,26 +101,26 @@ def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) 
 def check_complete(
     path: str | os.PathLike, name: str | os.PathLike, writer: Mapping[str, Any], count: int | None = None
 ) -> bool:
-    """Refuse a file that a writer could not finish; whether it could be judged by its content.
+    """Refuse a file that was not written completely; return whether its content could be checked.
 
-    LAS and LAZ files are held against their own headers and the points there were; of other formats it is only known
-    that the disk has room.
+    LAS and LAZ files are checked against their headers and the number of points; for other formats, only whether the
+    disk is full.
 
     Parameters
     ----------
     path : path
         The file as it was written.
     name : path
-        The name it is to get, for the message.
+        Its final name, for the message.
     writer : mapping
         The stage that wrote it.
     count : int, optional
-        The points it must hold, where that is known.
+        The number of points it must hold, where known.
 
     Raises
     ------
     StageError
-        If it is not whole.
+        If it is incomplete.
     """
     path = Path(path)
     las = writer.get("type") in ("writers.las", "writers.copc") or path.suffix.lower() in (".las", ".laz")
@@ -150,13 +150,13 @@ def _is_whole(path: Path, count: int | None) -> bool:
 
 
 def _end_of_points(header: LasHeader, size: int) -> int:
-    """Where the first of what may follow the points begins, or the file ends."""
+    """The end of the point data: the offset of what follows, or the size of the file."""
     after = [header.after] * bool(header.records_after) + [header.waveforms] * bool(header.waveforms)
     return min([size, *(place for place in after if place >= header.offset)])
 
 
 def _wrong_header(header: LasHeader, size: int) -> Wrong | None:
-    """What no header has, whatever follows."""
+    """What is wrong with the header itself."""
     least = POINT_BYTES[header.point_format] if header.point_format < len(POINT_BYTES) else 0
     if header.minor > 5:
         return "its version is not known", f"LAS 1.{header.minor}"
@@ -201,7 +201,7 @@ def _wrong_records(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None
 
 
 def _wrong_count(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
-    """What is wrong with the number of points that are not compressed."""
+    """What is wrong with the number of uncompressed points."""
     held = max(0, _end_of_points(header, size) - header.offset) // header.point_bytes
     if held < header.count:
         return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
@@ -214,7 +214,7 @@ def _none_counted(size: int) -> Wrong:
 
 
 def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
-    """What is wrong with the chunks of a LAZ file and the table of them, which is written last.
+    """What is wrong with the chunks of a LAZ file and their table, which is written last.
 
     Layout: "LAZ specification 1.4", chunk table.
     """
@@ -272,7 +272,7 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
 
 
 def _decoded(table: bytes, varies: bool) -> tuple[list[int], list[int]]:
-    """Bytes of each chunk, and its points where they vary; EOFError where the table does not end."""
+    """The bytes of each chunk, and its points where they vary; EOFError where the table is truncated."""
     import lazrs
 
     if any(table[4:8]) and table[8:12] == b"\xff" * 4:  # which no encoder writes, and where lazrs panics

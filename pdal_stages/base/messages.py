@@ -1,4 +1,4 @@
-"""What the user is told: messages that are safe for terminals, progress, what was found on the way, and a run's log."""
+"""Output for the user: messages that are safe for terminals, progress, reports of stages, and the log of a run."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2
 
 
 def plain(text: str) -> str:
-    """Text with such characters written as their codes; only line breaks and tabs stay."""
+    """Text with control characters escaped, except line breaks and tabs."""
     return _COMMANDS.sub(lambda match: ascii(match.group())[1:-1], text)
 
 
 def one_line(text: str) -> str:
-    """The same with line breaks as codes too, so that a name cannot pass for lines of its own."""
+    """The same with line breaks escaped as well, so that a file name cannot look like separate lines."""
     return plain(text).replace("\n", "\\n")
 
 
 def print_messages(*lines: str) -> None:
-    """Print messages for the user on standard error, as the command does."""
+    """Print messages for the user on standard error."""
     for line in lines:
         print(f"pdal-stages: {line}", file=sys.stderr)
 
@@ -43,7 +43,7 @@ def counted(count: int, word: str) -> str:
 
 
 class PlainStream:
-    """A text stream whose text is :func:`plain`; all else is the stream's."""
+    """A text stream that passes text through :func:`plain`; everything else is delegated."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -69,7 +69,7 @@ def duration(seconds: float) -> str:
 
 
 class Progress(AbstractContextManager):
-    """A line of progress: what is done (`label`), so many `unit` of `total` (0: not known), rate, time left.
+    """A line of progress: `label`, the number of `unit` of `total` (0: unknown), rate, time left.
 
     Silent until `delay` seconds have passed. On a terminal the line is redrawn; elsewhere (a log) a new line is written
     every 15 seconds. The environment variable ``PDAL_STAGES_PROGRESS=0`` silences it, as ``enabled=False`` does;
@@ -122,7 +122,7 @@ class Progress(AbstractContextManager):
         self._shown = True
 
     def clear(self) -> None:
-        """Take the line away, for something else to be printed; it comes back when it is due."""
+        """Clear the line so that something else can be printed; it is redrawn when due."""
         if self._terminal and self._shown and self.enabled:
             self.stream.write("\r\x1b[K")
             self.stream.flush()
@@ -141,7 +141,7 @@ class Progress(AbstractContextManager):
 
 @dataclass
 class Report:
-    """What a stage, a prediction or a feature engine reports beside its results."""
+    """What a stage, a prediction or the feature engine reports besides its results."""
 
     #: counts and other JSON-able values by name, e.g. ``points`` or ``classes``
     figures: dict[str, Any] = field(default_factory=dict)
@@ -155,7 +155,7 @@ class Report:
     codes: dict[str, int] | None = None
 
     def merge(self, other: Report) -> None:
-        """Take over what another has. Of figures of one name, its own stay; dicts are merged by their keys."""
+        """Merge another report into this one. Existing figures are kept; dicts are merged by key."""
         _merge(self.figures, other.figures)
         _merge(self.beyond_halo, other.beyond_halo)
         self.reach = max(self.reach, other.reach)
@@ -186,7 +186,7 @@ def _merge(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
 
 
 class RunLog(logging.FileHandler):
-    """A file to whose end go lines, each with its time.
+    """A log file to which timestamped lines are appended.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class RunLog(logging.FileHandler):
     arguments : sequence of str
         The command's, for the first line.
     stderr : text stream
-        Where it is said that the log cannot be written any more.
+        Where a failure to write the log is reported.
 
     Raises
     ------
@@ -224,13 +224,13 @@ class RunLog(logging.FileHandler):
             self.handle(logging.makeLogRecord({"msg": one_line(line.strip())}))
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """The run goes on without its log."""
+        """Report it once; the run goes on without its log."""
         self._failed = True
         self._stderr.write(f"pdal-stages: the log cannot be written any more: {sys.exc_info()[1]}\n")
 
 
 class LoggedStream(PlainStream):
-    """The same, whose lines go to a log as well."""
+    """A plain stream whose lines also go to a log."""
 
     def __init__(self, stream: Any, log: RunLog) -> None:
         super().__init__(stream)

@@ -1,7 +1,7 @@
-"""Octrees held against themselves before PDAL walks them: of COPC files, and of EPT sources on this disk.
+"""Checks of octrees before PDAL walks them: of COPC files, and of local EPT sources.
 
-PDAL takes what they say as it is. Pages that lie elsewhere or hold themselves end the process, or are walked forever, and
-points that no page names are left out without a word. Layouts: COPC 1.0 (copc.io), EPT 1.1 (entwine.io).
+PDAL trusts them. Pages at wrong offsets or that contain themselves crash it or make it loop, and points that no page lists
+are silently left out. Layouts: COPC 1.0 (copc.io), EPT 1.1 (entwine.io).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from .las import read_header, records_of
 
 #: Level, x, y and z of a node.
 Key = tuple[int, int, int, int]
-#: Number of points of each node, and where they are.
+#: Number of points of each node, and their location.
 Nodes = dict[Key, tuple[int, Any]]
-#: What a page lists: nodes, or with -1 points the pages in which they are.
+#: Entries of a page: nodes, or with -1 points other pages.
 Entries = Iterator[tuple[Key, int, Any]]
 
 #: Deeper nodes would be smaller than a step of the coordinates, which have 32 bits.

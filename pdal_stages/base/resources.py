@@ -1,4 +1,4 @@
-"""What the machine offers: threads over blocks of work, stopping at once on Ctrl-C, and memory.
+"""Resources of the machine: threads over blocks of work, and memory.
 
 Kernels are compiled with ``nogil``, so plain Python threads use every core. numba's own parallel loops are not used: its
 portable threading layer aborts the process when two Python threads enter it together, and users do run pipelines in threads.
@@ -28,7 +28,7 @@ from .errors import OptionError
 #: Where a cgroup of version 2, and one of version 1, says how many microseconds of CPU it may use in how many.
 _QUOTAS = ("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")
 
-#: By which a worker is told how many cores are its own; joblib, and so scikit-learn, heeds it too.
+#: The environment variable with the number of cores of a worker, which joblib and so scikit-learn respect as well.
 CORES = "LOKY_MAX_CPU_COUNT"
 
 
@@ -84,9 +84,9 @@ def map_blocks(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-#: Taken where the system does not say what is free.
+#: Assumed free memory where the system does not say.
 _UNKNOWN = 4 * 10**9
-#: Nobody means so few bytes.
+#: The least amount of memory that is accepted, in bytes.
 _FEWEST = 1e6
 
 
@@ -108,14 +108,14 @@ def parse_size(text: str) -> int:
 
 
 def free_memory() -> int:
-    """Bytes that can be had without swapping: what the system has left, within what a container allows."""
+    """Bytes available without swapping, within the limit of a container."""
     found = [_available(), _left_in_container()]
     known = [size for size in found if size]
     return min(known) if known else _UNKNOWN
 
 
 def give_back(array: np.ndarray) -> None:
-    """Give the memory of an array, whose values are lost, back to the system; who allocated it still has to free it.
+    """Return the memory of an array to the system; its values are lost, and its owner still has to free it.
 
     For arrays that someone else holds longer than they are needed. Whole pages, on Linux; nothing happens elsewhere.
     """

@@ -1,4 +1,4 @@
-"""Settings: fields of dataclasses that say what they are and within which bounds, and are checked when one is made."""
+"""Settings: dataclass fields with a description and bounds, checked when an object is created."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from . import checks
 
 
 def setting(default: Any, kind: str, help: str, *bounds: float | None, **rule: Any) -> Any:
-    """Declare a field: what it is in a sentence, for help texts too, and the `bounds` of a number.
+    """Declare a field with a one-sentence description, also for help texts, and the `bounds` of a number.
 
     `kind` and `rule` (``exclusive``, ``unit``, ``choices``) are those of an option of a stage; or `rule` has a ``check``,
-    which makes of a name and the value what the field holds. MISSING as `default`: it must be given.
+    a function of a name and the value that returns what the field holds. With MISSING as `default` it is required.
     """
     if bounds:
         rule |= {"minimum": bounds[0], "maximum": bounds[1]}

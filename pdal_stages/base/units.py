@@ -21,7 +21,7 @@ NAMED = {
 }
 
 
-#: Meters of the smallest and the largest unit that is believed.
+#: The smallest and largest plausible unit, in meters.
 _SMALLEST, _LARGEST = 1e-6, 1e6
 
 
@@ -94,7 +94,7 @@ def units_of_wkt(
 
 
 def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) -> None:
-    """Refuse a reference in which no axis is up: degrees, or meters from the earth's center."""
+    """Refuse a reference without a projected plane: degrees, or meters from the earth's center."""
     geodetic = root.find("GEOCCS", "GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS")
     if geodetic is None:
         return
@@ -117,7 +117,7 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
 
 
 def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float) -> None:
-    """Refuse the box of a thousand points and more, without a reference, that can hardly be in meters."""
+    """Refuse points without a reference, a thousand or more, whose bounding box looks like degrees."""
     if count >= 1000 and max(-x0, x1) <= 180.0 and max(-y0, y1) <= 90.0 and max(x1 - x0, y1 - y0) < 0.2:
         code = utm_code(x0, y0) or "CODE"
         raise StageError(
@@ -129,7 +129,7 @@ def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float
 
 
 def utm_code(longitude: float, latitude: float, name: str = "") -> int | None:
-    """EPSG's code of the UTM zone of a place, on ETRS89 or NAD83 where a reference's name says so, else WGS 84."""
+    """The EPSG code of the UTM zone of a place, on ETRS89 or NAD83 where a reference's name says so, else WGS 84."""
     if not (-180.0 <= longitude <= 180.0 and -80.0 <= latitude <= 84.0):
         return None
     zone = min(60, int((longitude + 180.0) // 6.0) + 1)

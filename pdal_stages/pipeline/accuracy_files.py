@@ -1,4 +1,4 @@
-"""What is behind ``accuracy``: two dimensions of files, or files against others of the same points."""
+"""The command ``accuracy``: two class dimensions of files, or files against reference files of the same points."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .read import Override, apply_overrides
 from .run import Pipeline
 from .runtime import points_of_views
 
-#: What to do where nothing tells the true classes.
+#: What to do where the true classes are not known.
 WHAT_IS_TRUE = (
     "Say where the true classes are: --reference FILE, of the same points, or --reference-dimension NAME, which "
     "filters.ferry may have kept before classifying"
@@ -38,10 +38,11 @@ def compare_files(
     model: str = "",
     **outputs: str,
 ) -> list[str]:
-    """Compare files with others that hold the same points in the same order, in pairs of the same name; what is to be told.
+    """Compare files with others that hold the same points in the same order, paired by name.
 
-    Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``. Without references the true classes
-    are another dimension of the files; with a `model` its classes are judged, and the files' own are the truth.
+    Returns messages for the user. Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``.
+    Without references the true classes are another dimension of the files; with a `model` its classes are judged, and the
+    files' own are the truth.
     """
     files = input_files(sources)
     pairs = paired(files, input_files(references)) if references else [(file, "") for file in files]
@@ -87,7 +88,7 @@ def compare_files(
     return report.messages
 
 
-#: Where the files' own classes are kept while a model gives others.
+#: Dimension that keeps the files' own classes while a model assigns new ones.
 _TRUTH = "TrueClass"
 
 

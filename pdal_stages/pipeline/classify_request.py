@@ -1,4 +1,4 @@
-"""What ``classify`` is asked for, and the pipeline of one file."""
+"""The request of ``classify``, and the pipeline for one file."""
 
 from __future__ import annotations
 
@@ -18,27 +18,29 @@ from .las_output import extra_dims_option
 from .read import LAS_WRITERS, Override
 from .run import Pipeline
 
-#: What finds bridge decks along with the heights.
+#: The stage that finds bridge decks along with the heights.
 _DECKS = "filters.hag_morphological"
 
-#: Dimensions that are written beside the input's own.
+#: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
 
 
 @dataclass(frozen=True)
 class ClassifyRequest:
-    """How points are classified, whichever they are."""
+    """How points are to be classified, independent of the inputs."""
 
     model: str = STANDARD  #: a model file, or the name of a shipped one
-    overrides: tuple[Override, ...] = ()  #: options of stages set from outside; they may name another model
+    overrides: tuple[
+        Override, ...
+    ] = ()  #: options of stages from the command line; they may name another model
     where: str | None = None  #: classify only the points for which this holds
-    #: Dimensions made on the way that are written beside the input's own; ``all`` and ``none`` are known.
+    #: Created dimensions to write besides the input's own; ``all`` and ``none`` are allowed.
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True  #: mark low and high noise first
-    bridges: bool = True  #: find bridge decks, where heights are made by ``filters.hag_morphological``
-    wires: bool = False  #: find wires, where heights are made
-    towers: bool = False  #: and what holds them
-    consistency: bool = True  #: mend classes that contradict their surroundings
+    bridges: bool = True  #: find bridge decks, where heights come from ``filters.hag_morphological``
+    wires: bool = False  #: find wires, where heights are computed
+    towers: bool = False  #: find wires, and towers and poles
+    consistency: bool = True  #: correct classes that contradict their surroundings
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     #: Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
     vegetation_heights: str = ""
@@ -63,7 +65,7 @@ class ClassifyRequest:
 
     @property
     def cost(self) -> list[str]:
-        """What `keep_sure` is expected to cost, in lines; none without it."""
+        """The expected cost of `keep_sure`, as lines of text; none without it."""
         given = overridden(self._classifier, self.overrides)
         if given.get("keep_sure") is None:
             return []
@@ -72,12 +74,12 @@ class ClassifyRequest:
 
     @cached_property
     def loaded(self) -> Any:
-        """The model that will be applied, which overrides may have changed."""
+        """The model that will be applied, after overrides."""
         return loaded_model(overridden(self._classifier, self.overrides)["model"])
 
     @cached_property
     def stages(self) -> list[dict[str, Any]]:
-        """What marks noise, what makes what the model reads, and the classifier."""
+        """The stages: noise, preparation of what the model reads, the classifier, corrections."""
         if by_hand := self.loaded.info.get("by_hand"):
             raise ModelError(
                 "the model reads dimensions of stages that a model file does not hold",
@@ -88,11 +90,11 @@ class ClassifyRequest:
             )
         prepared = self._prepared
         if self._with_bridges:
-            # The last one's heights and flags are those that stay.
+            # The heights and flags of the last one are those that remain.
             at = max(n for n, stage in enumerate(prepared) if stage["type"] == _DECKS)
             prepared = [{**stage, "decks": True} if n == at else stage for n, stage in enumerate(prepared)]
         noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
-        return [*noise, *prepared, self._classifier, *self._mending]
+        return [*noise, *prepared, self._classifier, *self._corrections]
 
     @property
     def _prepared(self) -> list[dict[str, Any]]:
@@ -102,19 +104,19 @@ class ClassifyRequest:
 
     @cached_property
     def _with_bridges(self) -> bool:
-        """Whether decks are looked for: not where the model knows bridges itself, or heights are made otherwise."""
+        """Whether to look for decks: not where the model knows bridges itself, or heights come from another stage."""
         known = {code for code, _ in self.loaded.classes}
         there = any(stage["type"] == _DECKS for stage in self._prepared)
         return self.bridges and there and known >= {2, 6} and BRIDGE not in known and not self._by_class
 
     @property
     def _by_class(self) -> bool:
-        """Whether `where` asks for classes, which are others after the classifier."""
+        """Whether `where` refers to classes, which the classifier changes."""
         return "Classification" in (self.where or "")
 
     @property
-    def _mending(self) -> list[dict[str, Any]]:
-        """The rules at the end, for models whose classes they are of, and polygons over all."""
+    def _corrections(self) -> list[dict[str, Any]]:
+        """The corrections after the classifier, for models with the classes they need, and polygons last."""
         known = {code for code, _ in self.loaded.classes}
         if self._by_class and self.polygons:
             raise OptionError(
@@ -142,7 +144,7 @@ class ClassifyRequest:
 
     @cached_property
     def beside(self) -> dict[str, str]:
-        """What is written beside the input's own dimensions: name -> PDAL type."""
+        """The dimensions that are written besides the input's own: name -> PDAL type."""
         made: dict[str, str] = {}
         for stage in self.stages:
             if stage["type"] in preparation.OF_PDAL:
@@ -162,7 +164,7 @@ class ClassifyRequest:
         return {name: kind for name, kind in made.items() if name in self.dimensions}
 
     def pipeline(self, source: str, target: str) -> Pipeline:
-        """Read a file, make heights where the model wants them, classify, write with everything else kept."""
+        """Read a file, compute heights where the model needs them, classify, and write with everything else kept."""
         writer = writer_of(target)
         if writer.get("type") in LAS_WRITERS:
             listed = extra_dims_option([source], self.beside)

@@ -1,4 +1,4 @@
-"""What is behind ``corrections``: what a person changed, or looked at and found right, marked in the points."""
+"""The command ``corrections``: points whose class a person changed or confirmed, marked as checked."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from ..objects.overlay import Overlay, points_inside, polygons_of
 from .inputs_outputs import reference_of_file
 from .parts import header_of, las_chunks, reads_in_parts
 
-#: Points without a partner beyond this share: the files are of other points.
+#: If more than this share of the points has no partner, the files hold different points.
 _MOST_LOST = 0.1
-#: The layer of ``review``, and its column of what was looked at.
+#: The layer of ``review``, and its column for patches that were checked.
 _PATCHES, _DONE = "patches", "done"
 
 
 def write_corrections(
     before: str, output: str, after: str = "", areas: Sequence[str] = (), around: float = 1.0
 ) -> list[str]:
-    """Mark what was checked, and write the points of `before` with the classes of `after`; what is to be told.
+    """Mark what was checked, and write the points of `before` with the classes of `after`; returns messages.
 
-    All else stays as it is in `before`, whatever the program of the person dropped.
+    Everything else stays as in `before`, whatever the editing program dropped.
 
-    `after` is a file of the same points as a person left them, empty for none; `areas` are files of polygons inside of which
-    all was looked at, and what was not changed is right; so is all within `around` meters of a changed point.
+    `after` is a file of the same points after editing, empty for none. `areas` are files of polygons in which everything was
+    checked, so what was not changed is right; the same holds within `around` meters of a changed point.
     """
     import laspy
 
@@ -91,7 +91,7 @@ def write_corrections(
 
 
 def _read(path: str) -> Any:
-    """A whole file, as laspy holds it; a COPC file as the LAZ file that it is."""
+    """A whole file as laspy holds it; a COPC file as plain LAZ."""
     import laspy
 
     header = header_of(path)
@@ -105,7 +105,7 @@ def _read(path: str) -> Any:
 def _codes_of(
     before: str, after: str, las: Any, xyz: NDArray[np.float64], codes: NDArray[np.uint8], notes: list[str]
 ) -> NDArray[np.uint8]:
-    """The classes that the same points have in another file; their own where they are not there."""
+    """The classes of the same points in another file; their own where they are missing there."""
     other = _read(after)
     theirs = np.column_stack([other.x, other.y, other.z])
     step = float(max(*las.header.scales, *other.header.scales))
@@ -129,7 +129,7 @@ def _codes_of(
 
 
 def _inside(area: str, xyz: NDArray[np.float64], wkt: str, notes: list[str]) -> NDArray[np.bool_]:
-    """Which points lie in the polygons of a file; of the patches of ``review`` those that were looked at."""
+    """Which points lie in the polygons of a file; for patches of ``review``, only in those marked as checked."""
     file, _, layer = area.partition("|layername=")
     pyogrio = vector("pyogrio")
     with reading(file) as name:
@@ -166,11 +166,11 @@ def partners(
     more: Sequence[tuple[NDArray, NDArray]] = (),
     apart: float = 0.0,
 ) -> NDArray[np.int64]:
-    """For each point of `before` its place in `after`, -1 where there is none; each of `after` is taken once.
+    """For each point of `before` its index in `after`, -1 where there is none; each of `after` is used once.
 
-    Coordinates, (n, 3) and (m, 3), are whole numbers of `step`, the coarser of both files'. Pairs of arrays, `more`, tell
-    points of one place apart: times, return numbers, then classes; values that no longer agree only change which of them
-    are paired. Points without a partner at their place take the nearest that is left within `apart`.
+    Coordinates, (n, 3) and (m, 3), are multiples of `step`, the coarser of both files'. Pairs of arrays, `more`, distinguish
+    points at the same coordinates: times, return numbers, then classes; where these no longer agree, only the pairing
+    changes. Points without a partner at their coordinates take the nearest unused one within `apart`.
     """
     from scipy.spatial import cKDTree
 
@@ -201,7 +201,7 @@ def partners(
 
 
 def near_any(xyz: NDArray[np.float64], chosen: NDArray[np.bool_], within: float) -> NDArray[np.bool_]:
-    """(n,) points that lie `within` so many meters of a chosen one."""
+    """(n,) whether each point lies `within` so many meters of a chosen one."""
     from scipy.spatial import cKDTree
 
     if within <= 0 or not chosen.any():

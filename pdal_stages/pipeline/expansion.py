@@ -1,7 +1,7 @@
-"""Our pipeline JSON to plain PDAL JSON: each stage of ours becomes a ``filters.python`` in place.
+"""From our pipeline JSON to plain PDAL JSON: each stage of ours becomes a ``filters.python`` in place.
 
 The pipeline is never split, so the LAS header, metadata, spatial reference, tags and
-inputs work as PDAL makes them work.
+inputs work as in PDAL.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .las_output import check_copc_outputs, check_writers, files_with_flags_to_s
 from .read import PipelineSource, is_reader, reader_files
 from .runtime import TRAMPOLINE, made, place, python_filter
 
-#: Options of every PDAL stage that an expanded stage hands on.
+#: Options of every PDAL stage that an expanded stage passes on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
 #: Stages after which several views are what the user asked for.
 _SPLITS = {f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns")}
@@ -37,15 +37,15 @@ class ExpandedStage:
     stage: Stage
     place: str  #: its type and tag, for messages
     label: str  #: the unique `module` label, under which the runtime knows it
-    number: int  #: its place in the given list
-    index: int  #: its place in the expanded list
+    number: int  #: its index in the given list
+    index: int  #: its index in the expanded list
     given: dict[str, Any]  #: the stage as it was written
     plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
 
 
 @dataclass
 class Expanded:
-    """A plain PDAL pipeline, which of its stages are ours, and what the user should know of it."""
+    """A plain PDAL pipeline, those of its stages that are ours, and warnings for the user."""
 
     stages: list[dict[str, Any]]
     ours: list[ExpandedStage] = field(default_factory=list)
@@ -53,8 +53,8 @@ class Expanded:
 
 
 def expand(source: PipelineSource, whole: bool = True) -> Expanded:
-    """Expand a pipeline; not `whole`: to be cut into tiles, whose outputs part flags from classes themselves."""
-    # File names stand for readers and writers; PDAL tells which, so they stay without a type.
+    """Expand a pipeline. Not `whole`: it will be run in tiles, which separate flags from classes themselves."""
+    # File names stand for readers and writers. PDAL infers which, so they stay without a type.
     stages = [copy.deepcopy(one) if isinstance(one, dict) else {"filename": one} for one in source.stages]
     places = [source.where(number) for number in range(len(stages))]
     _refuse_several_ends(stages, places)
@@ -90,7 +90,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
 
 
 def _each_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
-    """A reader for each file of a pattern, in their order: PDAL takes them as the folder lists them."""
+    """A reader for each file of a pattern, sorted by name: PDAL reads them in the order of the folder's listing."""
     names = reader_files(reader)
     named = {name: value for name, value in reader.items() if name != "tag"}
     return [{**named, "filename": name} for name in names] if len(names) > 1 else [reader]
@@ -154,16 +154,16 @@ def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str])
         )
 
 
-# ---- what stages read, and whether it will be there ----------------------------------------------
+# ---- the dimensions that stages read, and whether they will exist ----------------------------------------------
 
 
 def settle_upstream(
     stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]
 ) -> tuple[list[dict[str, Any]], str | None]:
-    """Let a stage know which stages before it made what it reads: these, and a warning for the user.
+    """Tell a stage which earlier stages created what it reads; returns these, and a warning for the user.
 
-    `before` are the stages before it in their order, as they are written, each with what :meth:`Stage.creates` says of it;
-    for PDAL's own, :func:`heights_of`.
+    `before` are the earlier stages in order, as written, each with the dimensions it creates: :meth:`Stage.creates`, or
+    :func:`heights_of` for PDAL's own.
     """
     wanted = set(stage.reads()) - {"Classification"}  # which noise is marked in, too: it is no preparation
     makers = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
@@ -172,12 +172,12 @@ def settle_upstream(
 
 
 def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
-    """What a stage of PDAL's own makes that ours may read."""
+    """The dimensions of a PDAL stage that ours may read."""
     return {"HeightAboveGround": "double"} if stage.get("type") in preparation.OF_PDAL else {}
 
 
 def _follow_preparations(expanded: Expanded) -> None:
-    """Let each stage of ours know which stages before it made what it reads."""
+    """Tell each of our stages which earlier stages created what it reads."""
     numbered = {ours.index: ours for ours in expanded.ours}
     before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
     for index, plain in enumerate(expanded.stages):
@@ -194,9 +194,9 @@ def _follow_preparations(expanded: Expanded) -> None:
         before.append(({"type": ours.stage.type, **ours.given}, ours.stage.creates()))
 
 
-#: How dimensions begin that no reader has of itself, but a stage or a file's extra bytes.
+#: Prefixes of dimensions that come only from a stage or from extra bytes.
 _MADE = ("HeightAbove", "Ground", "Slope", "Reference")
-#: Stages of PDAL that make dimensions of any name, or name them in files.
+#: Stages of PDAL that may create dimensions of any name.
 _MAKES_ANY = {f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")}
 _DEGREES = re.compile(
     r"^\s*EPSG:\s*4\d{3}\s*$|longlat|latlong|^\s*(OGC:)?CRS:?84|^\s*(GEOGCS|GEOGCRS|GEODCRS)", re.IGNORECASE
@@ -204,11 +204,11 @@ _DEGREES = re.compile(
 
 
 def check_dimensions(expanded: Expanded) -> None:
-    """Refuse a stage that reads heights or labels that no stage makes and no input has, and one that would get degrees."""
+    """Refuse a stage that reads heights or labels that nothing provides, and one that would get degrees."""
     of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
     for ours in expanded.ours:
         before = list(enumerate(expanded.stages[: ours.index]))
-        # Scripts are told the reader's reference
+        # Scripts only get the reader's reference
         moved = [s.get("out_srs", "") for _, s in before if s.get("type") == "filters.reprojection"]
         if moved and _DEGREES.search(str(moved[-1])):
             raise PipelineError(
@@ -230,7 +230,7 @@ def check_dimensions(expanded: Expanded) -> None:
 
 
 def _may_make(name: str, stage: Mapping[str, Any]) -> bool:
-    """Whether a stage of PDAL may make a dimension: readers of other formats than LAS may make any."""
+    """Whether a stage of PDAL may create a dimension; readers of other formats than LAS may create any."""
     kind = str(stage.get("type") or "readers.")
     if kind.startswith("readers."):
         files = reader_files(dict(stage), las=True)
@@ -242,7 +242,7 @@ def _may_make(name: str, stage: Mapping[str, Any]) -> bool:
 
 
 def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
-    """A warning for each file of LAS 1.0-1.3 with extra dimensions, which PDAL reads only when told."""
+    """A warning for each file of LAS 1.0-1.3 with extra dimensions, which PDAL reads only on request."""
     warnings = []
     for stage in stages:
         if str(stage.get("use_eb_vlr", "")).lower() == "true" or "extra_dims" in stage:

@@ -1,4 +1,4 @@
-"""What is read and written: files by name, folder or pattern, their readers and writers, the inputs' reference systems."""
+"""Inputs and outputs: files by name, folder or pattern, their readers and writers, the inputs' reference systems."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..stages.base import Stage
 from . import pdal as pdal_env
 from .read import Override, apply_overrides, is_writer, reader_files, readers_files
 
-#: What the description of an EPT source is called.
+#: File name of the description of an EPT source.
 EPT = "ept.json"
 
 #: Tile indexes, by suffix.
@@ -28,7 +28,7 @@ _INDEXES = (".gpkg", ".sqlite", ".shp", ".geojson")
 
 
 def input_files(names: Sequence[str]) -> list[str]:
-    """The inputs that files, folders, patterns, tile indexes and EPT sources stand for: each once, sorted by name within."""
+    """The inputs behind files, folders, patterns, tile indexes and EPT sources: each once, sorted by name within each."""
     found: list[str] = []
     for name in names:
         try:
@@ -42,7 +42,7 @@ def input_files(names: Sequence[str]) -> list[str]:
 
 
 def _meant(name: str) -> list[str]:
-    """The inputs that one name stands for."""
+    """The inputs behind one name."""
     if not name:  # which for a path is the current folder
         cure = "Name a file, or '.' for the current folder; is a shell variable unset?"
         raise StageError("the name of an input is empty", cure=cure)
@@ -75,7 +75,7 @@ def _inside(folder: Path) -> list[str]:
 
 
 def locations(path: str, column: str = "location") -> list[str]:
-    """The files a tile index names, made by ``pdal tindex create``; relative ones count from its folder, then from here."""
+    """The files a tile index names, made by ``pdal tindex create``; relative ones from its folder, then from here."""
     from ..objects.outlines import reading
 
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")
@@ -99,7 +99,7 @@ def is_ept(name: str) -> bool:
 
 
 def ept_address(name: str) -> str:
-    """Where the description of an EPT source is."""
+    """The path or address of the description of an EPT source."""
     name = name.removeprefix("ept://")
     name = name if name.endswith(EPT) else f"{name.rstrip('/')}/{EPT}"
     return name if "://" in name else os.path.abspath(name)
@@ -118,7 +118,7 @@ def is_folder(target: str) -> bool:
 
 
 def _output_name(source: str, copc: bool) -> str:
-    """The input's name; what is not written as COPC becomes plain LAZ."""
+    """The input's name; COPC becomes plain LAZ unless it is written as COPC."""
     name = Path(source).name
     return name[: -len(".copc.laz")] + ".laz" if _is_copc(name) and not copc else name
 
@@ -128,7 +128,7 @@ def _is_copc(name: str) -> bool:
 
 
 def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
-    """What outputs are called in a folder; where two names are one, with the inputs' folders below the one they share."""
+    """The names of outputs in a folder; where two are equal, with the inputs' folders below their common one."""
     if len(set(names)) == len(names) or any("://" in source for source in sources):
         return list(names)
     folders = [os.path.dirname(os.path.abspath(source)) for source in sources]
@@ -138,9 +138,9 @@ def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[str]:
-    """An output for each input, whose name stands for ``#``; for ``#`` alone with its suffix (see :func:`in_folders`).
+    """An output for each input, with its name in place of ``#``; for ``#`` alone, with its suffix (see :func:`in_folders`).
 
-    `copc`: octrees may be written as such, where this PDAL can.
+    `copc`: COPC inputs may be written as COPC, where this PDAL can.
     """
     path = Path(target)
     if path.name == "#":
@@ -173,7 +173,7 @@ def named_outputs(target: str, names: Sequence[str]) -> list[str]:
 
 
 def reader_of(source: str, tag: str) -> dict[str, Any]:
-    """A reader; of LAS 1.0-1.3 it takes the extra dimensions too, which PDAL leaves out unless told."""
+    """A reader; it also reads the extra dimensions of LAS 1.0-1.3, which PDAL leaves out by default."""
     stage: dict[str, Any] = {"filename": str(source), "tag": tag}
     if is_ept(source):
         stage["type"] = "readers.ept"
@@ -196,20 +196,20 @@ def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str
     return apply_overrides([stage], [o for o in overrides if not o.by_tag and o.selector == stage["type"]])[0]
 
 
-# ---- the reference systems of several inputs, which must be one: PDAL merges meters and feet as they are -
+# ---- reference systems of several inputs, which must be the same: PDAL merges meters and feet as they are -
 
-#: Stages that may give points of several references one.
+#: Stages that may bring points into one reference.
 MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
-#: What differs between references whose coordinates lie within a meter: units are compared apart.
+#: Differences between references that move coordinates by less than a meter; units are compared separately.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
 _ASIDE = re.compile(r"\+(v?units|v?to_meter|towgs84|geoidgrids|no_defs|type|wktext)")
-#: In what is said of inputs that have none, beside others.
+#: Part of the message about inputs that have none, next to others.
 NO_REFERENCE = "no spatial reference;"
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What an input's coordinates mean."""
+    """The spatial reference of an input."""
 
     units: Units
     plane: frozenset[str] = frozenset()  #: the projection's parameters; empty where they are not known
@@ -219,9 +219,9 @@ class Reference:
 
 
 def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
-    """The reference of what a reader reads, as PDAL says; `horizontal`: the unit of x and y, where it is known better.
+    """The reference of what a reader reads, according to PDAL; `horizontal` overrides the unit of x and y.
 
-    The reader is restricted to as few points as it can be.
+    The reader should be restricted to as few points as possible.
     """
     said = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
     node: Any = next((node for kind, node in said.items() if kind.startswith("readers.")), {})
@@ -251,9 +251,9 @@ def reference_of_file(path: str, horizontal: str = "") -> Reference:
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
-    """Refuse inputs, by path, of different units or reference systems; where one names none, only units are compared.
+    """Refuse inputs, by path, with different units or reference systems; where one has none, only units are compared.
 
-    What is to be told is given back: which inputs have no reference, while others have one.
+    Returns messages: which inputs have no reference, while others have one.
     """
     units: dict[object, str] = {}
     planes: dict[object, str] = {}
@@ -283,7 +283,7 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
 
 
 def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:
-    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points; what is to be told."""
+    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points; returns messages."""
     if any(stage.get("type") in MOVING for stage in stages):
         return []
     readers: dict[str, tuple[str, dict[str, Any]]] = {}
@@ -301,7 +301,7 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
 
 
 def check_octrees(stages: list[dict[str, Any]]) -> None:
-    """Refuse damaged octrees that readers of COPC and EPT would walk; StageError."""
+    """Refuse damaged octrees of COPC and EPT inputs; StageError."""
     for stage in [stage for stage in stages if not is_writer(stage, stages)]:
         name, kind = str(stage.get("filename", "")), stage.get("type", "")
         if kind == "readers.ept" or (not kind and is_ept(name)):

@@ -1,4 +1,4 @@
-"""What LAS writers can hold, and where old PDAL writes LAS files wrongly.
+"""Limits of LAS outputs, and workarounds where old PDAL writes LAS files wrongly.
 
 PDAL before 2.3 cannot compress LAS 1.4 with class codes above 31. PDAL before 2.6 reads the flags of LAS 1.0-1.3
 (synthetic, key-point, withheld) as the upper bits of the class: written as LAS 1.4, a withheld point of class 2 would
@@ -35,7 +35,7 @@ def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) 
     ):
         try:
             found.append(int(writer[option]))
-        except (KeyError, TypeError, ValueError, OverflowError):  # of a wrong one PDAL tells
+        except (KeyError, TypeError, ValueError, OverflowError):  # PDAL reports wrong ones
             found.append(of_headers.pop() if forwards and len(of_headers) == 1 else None)
     # PDAL is asked only then: it is another process
     defaults: Sequence[int] = pdal_env.las_writer_defaults() if None in found else (0, 0)
@@ -44,13 +44,13 @@ def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) 
 
 
 def las_headers(readers: Iterable[Mapping[str, Any]]) -> list[LasHeader]:
-    """Headers of the LAS files that stages read, as far as they can be read here."""
+    """Headers of the LAS files that stages read, where they can be read."""
     paths = [name for stage in readers for name in reader_files(dict(stage), las=True)]
     return [header for header in map(header_there, paths) if header is not None]
 
 
 def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
-    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the own are not known."""
+    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the inputs' own are not known."""
     own: dict[str, str] = {}
     for source in sources:
         if Path(source).suffix.lower() not in (".las", ".laz"):
@@ -89,7 +89,7 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
 
 
 def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[str, str] | None:
-    """What to say of codes above 31, and the cure; None for point formats that hold all codes."""
+    """The message for codes above 31, and the cure; None for point formats that hold all codes."""
     if writer.get("type") == "writers.copc":
         return None
     minor, format_id = las_version(writer, before)
@@ -137,10 +137,10 @@ def stage(ins, outs):
 
 
 def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool = True) -> list[bool]:
-    """Of each file that is read, whether flags must be split from the class; empty where nothing is to be done.
+    """For each input file, whether flags must be split from the class; empty where nothing is to be done.
 
-    A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: stages of ours are among them, or
-    work on the points besides; without, text and rasters come out as PDAL makes them.
+    A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: our stages are involved;
+    without them, text and rasters come out as PDAL makes them.
     """
     if pdal_env.splits_class_flags():
         return []
@@ -167,7 +167,7 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
 
 
 def flag_splitter(old: Sequence[bool], **wiring: Any) -> dict[str, Any]:
-    """A filter that gives flags the dimension that they have in LAS 1.4; `old`: see :func:`files_with_flags_to_split`."""
+    """A filter that moves flags to the dimension that they have in LAS 1.4; `old`: see :func:`files_with_flags_to_split`."""
     adds = {"ClassFlags": "uint8_t"}
     return {**python_filter("pdal_stages_class_flags", _SPLIT, {"old": list(old)}, adds), **wiring}
 
@@ -179,7 +179,7 @@ _BLOCK = 1_000_000
 
 
 def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """The writer, or one that leaves compressing to :func:`compress` where PDAL would fail to."""
+    """The writer, or an uncompressed one followed by :func:`compress` where PDAL would fail to compress."""
     named = str(writer.get("filename", "")).lower().endswith(".laz")
     compresses = named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
     if (
@@ -194,7 +194,7 @@ def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]
 
 
 def compress(partials: Iterable[Path]) -> dict[str, str]:
-    """Compress what was left uncompressed; the names that files had -> those that they have now."""
+    """Compress files that were left uncompressed; returns their old names -> their new names."""
     names: dict[str, str] = {}
     folders = {partial.parent for partial in partials}
     for made in [one for folder in folders for one in sorted(folder.glob(f"*{UNCOMPRESSED}"))]:

@@ -1,4 +1,4 @@
-"""Classified points of a file, a part at a time where that can be: what review and corrections read."""
+"""Points of a file, in parts where possible."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def reads_in_parts(path: str) -> bool:
 def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
     """The points of a file that are neither noise nor withheld, in its order.
 
-    Of each part ``xyz`` (n, 3), ``codes`` (n,), and those of the dimensions :data:`WANTED` that it has; meters.
+    Each part has ``xyz`` (n, 3) in meters, ``codes`` (n,), and those of the dimensions :data:`WANTED` that exist.
     """
     for arrays, flags in arrays_in_parts(path, WANTED):
         points = Points(arrays, wkt=wkt, legacy_flags=flags)
@@ -47,9 +47,9 @@ def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
 def arrays_in_parts(
     path: str, wanted: Sequence[str], only: Sequence[str] = ()
 ) -> Iterator[tuple[dict[str, NDArray], bool]]:
-    """Coordinates, classes, what is withheld, and what there is of the `wanted` dimensions; whether classes hold flags.
+    """Coordinates, classes, withheld flags and the `wanted` dimensions that exist; and whether classes hold flags.
 
-    A part of a LAS or LAZ file at a time, `only`: see :func:`las_chunks`; of others all, by PDAL.
+    LAS and LAZ files are read in parts (`only`: see :func:`las_chunks`), others at once by PDAL.
     """
     named = {"X": "x", "Y": "y", "Z": "z", "Classification": "classification", "Withheld": "withheld"}
     if not reads_in_parts(path):
@@ -71,7 +71,7 @@ def las_chunks(
     """The points of a LAS or LAZ file from one number to another, `most` at a time, as laspy reads them.
 
     `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
-    ``CLASSIFICATION``, ...): LAZ 1.4 holds them apart, so the others take no time. They hold nothing then.
+    ``CLASSIFICATION``, ...): LAZ 1.4 compresses them separately, so skipping the others saves time. Those are zero then.
     """
     import laspy
 
@@ -100,7 +100,7 @@ def las_chunks(
 
 
 def header_of(path: str) -> Any:
-    """The header of a file, with its records, but that of an octree: points in another order have none."""
+    """The header of a file with its records, except those of COPC, which do not fit points in another order."""
     import laspy
 
     try:

@@ -1,4 +1,4 @@
-"""The one place that touches PDAL: running pipelines, versions, drivers, and what differs between versions."""
+"""The only module that calls PDAL: running pipelines, versions, drivers, and differences between versions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _DRIVER_CURE = (
 
 @dataclass
 class Execution:
-    """What a run of a pipeline gave."""
+    """The result of running a pipeline."""
 
     count: int
     metadata: dict[str, Any] = field(default_factory=dict)
@@ -159,7 +159,7 @@ _kept: list[Any] = []
 
 
 def keep(stdout: Any) -> None:
-    """Hold what sys.stdout was when a script failed: PDAL remembers it without holding it, until a run succeeds."""
+    """Keep a reference to sys.stdout after a script failed: PDAL holds a borrowed one until a run succeeds."""
     if not any(kept is stdout for kept in _kept):
         _kept.append(stdout)
 
@@ -200,7 +200,7 @@ def validate(stages: list[dict[str, Any]]) -> None:
 
 
 def translate(message: str, before: Sequence[str] = ()) -> PipelineError | DependencyError:
-    """PDAL's error text, and what it said `before`, as an error of ours, with a cure where the cause is known."""
+    """PDAL's error text, and the log lines `before`, as one of our errors, with a cure where the cause is known."""
     text = message.strip()
     if re.search(r"(create|load|find).*filters\.python", text) or (
         "filters.python" in text and "driver" in text.lower()
@@ -226,7 +226,7 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
 
 
 def _log(pipeline) -> str:
-    """What PDAL and GDAL said; they quote files, whatever bytes those hold."""
+    """The log of PDAL and GDAL, which may quote names that are not UTF-8."""
     try:
         return str(getattr(pipeline, "log", "") or "")
     except UnicodeDecodeError as error:
@@ -272,7 +272,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def gentle() -> Iterator[None]:
-    """Handle Ctrl-C, and SIGTERM where Python handles it, so."""
+    """Handle Ctrl-C this way, and SIGTERM where Python handles it."""
     global _asked, _handling
     if _handling or threading.current_thread() is not threading.main_thread():
         yield
@@ -292,10 +292,10 @@ def gentle() -> Iterator[None]:
 
 
 def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Stages that this PDAL knows: before 2.4 a COPC file is read as the LAZ file that it is too.
+    """Stages that this PDAL knows: before 2.4 a COPC file is read as plain LAZ.
 
-    Where nothing says otherwise, writers are told what old PDAL takes from memory that it never set: `writers.las` the
-    file source identifier, 0, and `writers.ogr`, which crashes of it, the dimension of its measure, Z.
+    Options that old PDAL reads from uninitialized memory are set where the user does not: the file source id of
+    `writers.las` to 0, and the measure dimension of `writers.ogr`, which crashes otherwise, to Z.
     """
     if version() >= (2, 4, 0):
         return stages

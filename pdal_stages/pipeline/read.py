@@ -16,13 +16,13 @@ from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
 from ..base.files import LAS, Output
 
-#: Writers of LAS and what is made of it.
+#: Writers of LAS and COPC.
 LAS_WRITERS = ("writers.las", "writers.copc")
 #: Readers of LAS files.
 LAS_READERS = ("readers.las", "readers.copc")
-#: What stages of PDAL have that never names a file.
+#: Options of PDAL's stages that never name a file.
 _NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
-#: Bytes that no pipeline has.
+#: More bytes than any pipeline file has.
 _LARGEST = 1 << 26
 
 
@@ -45,7 +45,7 @@ class PipelineSource:
 
 
 def _with_plain_name(stage: Any) -> Any:
-    """A file name that says no more than a path, as text, which every PDAL takes (from 2.9 on it may be an object)."""
+    """A file name given as an object with only a path (PDAL 2.9), as text, which every PDAL takes."""
     name = stage.get("filename") if isinstance(stage, dict) else None
     if isinstance(name, dict) and set(name) == {"path"} and isinstance(name["path"], str):
         return {**stage, "filename": name["path"]}
@@ -138,7 +138,7 @@ def _places(text: str, at: int) -> list[int]:
 _decoder = json.JSONDecoder()
 
 
-#: What PDAL wants of the options that wire stages together.
+#: Types of the options that connect stages.
 _SHAPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
     ("type", (str,), "text"),
     ("tag", (str,), "text"),
@@ -165,7 +165,7 @@ def _checked(source: PipelineSource) -> PipelineSource:
 
 
 def _check_values(stage: Any, where: str) -> None:
-    """Refuse what PDAL cannot be given: it takes UTF-8 without NUL, and numbers that a double holds."""
+    """Refuse values that PDAL cannot take: it needs UTF-8 without NUL, and finite numbers."""
     try:
         text = json.dumps(stage, allow_nan=False, ensure_ascii=False)
         text.encode()
@@ -184,7 +184,7 @@ _STRING_OR_COMMENT = re.compile(r'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?|//[^\n]*|/\*(?s:
 
 
 def _without_comments(text: str, name: str) -> str:
-    """Comments as spaces, so that places stay."""
+    """Replace comments by spaces, so that line numbers stay."""
 
     def blank(match: re.Match[str]) -> str:
         if match[0][0] == '"':
@@ -285,7 +285,7 @@ def readers_files(stages: list[dict[str, Any]], *, las: bool = False) -> list[st
 
 
 def reader_files(stage: dict[str, Any], *, las: bool = False) -> list[str]:
-    """Those of one stage, which is a reader where it has no type."""
+    """The same for one stage, which is a reader where it has no type."""
     name, kind = stage.get("filename"), stage.get("type", "")
     if not isinstance(name, str) or "://" in name:
         return []
@@ -298,7 +298,7 @@ def reader_files(stage: dict[str, Any], *, las: bool = False) -> list[str]:
 
 
 def named_files(stages: list[dict[str, Any]]) -> list[str]:
-    """Files there are that options of PDAL's stages name, whichever the options: polygons, rasters, scripts."""
+    """Existing files named in any option of PDAL's stages: polygons, rasters, scripts."""
     found: list[str] = []
     for stage in stages:
         own = (*_NO_FILES, *(("filename",) if is_writer(stage, stages) else ()))

@@ -1,4 +1,4 @@
-"""What is behind ``review``: classified files in, patches that a person should look at out."""
+"""The command ``review``: from classified files to patches that a person should check."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from .workers import each_file
 LAYERS = ("patches", "tiles")
 #: Rows in the page's tables, and in text.
 _ROWS, _WORST = 200, 10
-#: Fill of patches, from those with least to expect to those with most; of those looked at.
+#: Fill colors of patches, from fewest to most expected errors; and of checked patches.
 _INKS = ("255,237,160,110", "254,178,76,150", "240,59,32,170", "165,0,38,190")
 _LOOKED_AT = "120,170,120,90"
 
 
 @dataclass
 class Review:
-    """What was found; of the patches those `listed`, which come first, are written. Coordinates are told in units of
-    `across` meters, as the files have them."""
+    """The result; the first `listed` patches are written. Coordinates are reported in units of `across` meters, as in the
+    files."""
 
     cells: ReviewCells
     patches: Patches
@@ -51,7 +51,7 @@ class Review:
 
     @cached_property
     def tiles(self) -> list[dict[str, Any]]:
-        """A row for each file: points, points expected wrong, patches listed, minutes to look at these; worst first."""
+        """A row for each file: points, expected errors, patches listed, minutes to check them; worst first."""
         n, listed, of = len(self.files), self.patches.file[: self.listed], self.cells.place[:, 0]
         points = np.bincount(of, self.cells.points.sum(axis=1), n)
         errors = np.bincount(of, self.cells.errors.sum(axis=1), n)
@@ -140,7 +140,7 @@ def review_files(
 
 
 def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
-    """The cells of a file, whose number it is; reliabilities are as they are there, or made now, which is said."""
+    """The cells of a file with its number; missing reliabilities are computed, with a message."""
     found: list[ReviewCells] = []
     whole: list[dict[str, NDArray]] = []
     for part in parts_of(path, wkt):
@@ -170,7 +170,7 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
 
 
 def reliability_of(points: Mapping[str, NDArray], model: str) -> NDArray[np.float32]:
-    """The probability that a model gives to the class each point of a part has; 1 for classes that it does not know."""
+    """The probability that a model gives to the class of each point; 1 for classes that it does not know."""
     loaded = loaded_model(model)
     made = {}
     if list(loaded.info.get("preparation") or []) == list(PREPARATION):  # else it says what it needs
@@ -230,11 +230,11 @@ def _fields(rows: Sequence[dict[str, Any]]) -> dict[str, NDArray]:
     return {name: np.array([row[name] for row in rows], kinds_of[name]) for name in names}
 
 
-# ---- what people see: a page, lines of text, styles of the layers for QGIS -----------------------------
+# ---- presentation: a page, lines of text, styles of the layers for QGIS -----------------------------
 
 
 def review_page(review: Review) -> str:
-    """The page: figures, the minutes of looking that find shares of the expected errors, tiles, patches."""
+    """The page: figures, minutes of checking that find given shares of the expected errors, tiles, patches."""
     found = review.to_dict()
     points, expected = found["points"], found["expected"]
     figures = [
@@ -284,11 +284,11 @@ def lines(found: Mapping[str, Any]) -> list[str]:
 
 
 def styles(errors: NDArray[np.float64]) -> dict[str, str]:
-    """Of layer ``patches`` in four steps of the points expected wrong, green where ``done`` is 1; of ``tiles`` outlines."""
+    """Styles: ``patches`` in four steps of expected errors, green where ``done`` is 1; ``tiles`` as outlines."""
     positive = errors[errors > 0]
     steps = np.quantile(positive, [0.5, 0.8, 0.95]) if len(positive) else np.array([1.0, 2.0, 3.0])
     low, middle, high = (f"{value:.0f}" for value in steps)
-    rules = [  # some are of nothing where the steps are as good as one
+    rules = [  # some match nothing where steps coincide
         (f"below {low} points expected wrong", f"done = 0 and expected < {low}"),
         (f"{low} to {middle}", f"done = 0 and expected >= {low} and expected < {middle}"),
         (f"{middle} to {high}", f"done = 0 and expected >= {middle} and expected < {high}"),

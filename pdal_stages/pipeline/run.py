@@ -34,7 +34,7 @@ from .read import (
     writers_outputs,
 )
 
-#: Points that did not get a class from the classifier, or another one, by their names in the reports of stages.
+#: Points that got no class from the classifier, or were changed after it, by their keys in the reports of stages.
 LEFT_ALONE = {
     "rejected": "rejected as unreliable",
     "ignored": "left out: noise, withheld (ignore)",
@@ -62,7 +62,7 @@ class Pipeline:
     Raises
     ------
     PipelineError, OptionError
-        Everything about our stages that can be known before reading points.
+        Everything about our stages that can be checked before reading points.
 
     Examples
     --------
@@ -90,7 +90,7 @@ class Pipeline:
 
     @property
     def left_alone(self) -> dict[str, int]:
-        """Numbers of points by :data:`LEFT_ALONE`, as the last stage says that counts them."""
+        """Numbers of points by :data:`LEFT_ALONE`, from the last stage that counts them."""
         last = [each[-1].figures for _, each in self.reports if each]
         return {k: one[k] for one in last for k in LEFT_ALONE if isinstance(one.get(k), int) and one[k]}
 
@@ -169,7 +169,7 @@ class Pipeline:
         Raises
         ------
         StageError
-            What went wrong, where, and the cure.
+            What went wrong, where, and how to fix it.
         """
         self._check_inputs()
         self.check_outputs()
@@ -218,7 +218,7 @@ class Pipeline:
         return result.count
 
     def _check_inputs(self) -> None:
-        """Open what is read, and look at the headers of LAS files: PDAL takes damaged ones for whole, or crashes."""
+        """Open all inputs and check the headers of LAS files: PDAL reads damaged ones as if whole, or crashes."""
         for path in readers_files(self.expanded.stages):
             try:
                 refuse_pipe(path)
@@ -241,7 +241,7 @@ class Pipeline:
             self.warnings += check_readers(self.expanded.stages, next(filter(None, units), ""))
 
     def _located(self, error: StageError) -> StageError:
-        """PDAL's words, with the line of the stage that they name and the nearest stage there is."""
+        """PDAL's error, with the line of the stage that it names and the most similar stage name."""
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
         found = str(error.found or "")
@@ -289,7 +289,7 @@ def _several(node: Any) -> list[Any]:
 
 
 def _renamed(node: Any, names: Mapping[str, str]) -> Any:
-    """Metadata with the names that files have in the end."""
+    """Metadata with the final names of files."""
     if isinstance(node, dict):
         return {key: _renamed(value, names) for key, value in node.items()}
     if isinstance(node, list):

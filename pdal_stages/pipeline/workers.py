@@ -1,4 +1,4 @@
-"""Worker processes on this machine: one-process pools of the standard library, so that one may die without the others."""
+"""Worker processes on this machine: pools of one process each, so that one can die without the others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..base.messages import LoggedStream, PlainStream
 from ..base.resources import CORES, available_threads
 from .pdal import check_interrupt, gentle
 
-#: Of a worker that died.
+#: The reason where a worker died.
 KILLED = "its worker process died: too little memory, or a crash in a library"
 #: One task at a time in a process: PDAL's threads are ours, and memory is stated for one.
 _one = threading.Lock()
@@ -33,7 +33,7 @@ _one = threading.Lock()
 
 @dataclass
 class TaskResult:
-    """What became of a task."""
+    """The result of a task."""
 
     result: Any = None
     reason: str = ""  #: why it failed; empty where it did not
@@ -42,7 +42,7 @@ class TaskResult:
 
 
 def perform(task: Callable[[], Any]) -> TaskResult:
-    """Call a task; what goes wrong is in the answer, except Ctrl-C."""
+    """Call a task; errors are part of the answer, except Ctrl-C."""
     with _one:
         started, cpu = time.perf_counter(), time.process_time()
         answer = TaskResult()
@@ -111,7 +111,7 @@ class WorkerProcesses(AbstractContextManager):
         self.slots, self.threads = slots, threads
         self._idle: list[ProcessPoolExecutor] = []
         self._busy: dict[Future, ProcessPoolExecutor] = {}
-        self._hearers: list[threading.Thread] = []
+        self._readers: list[threading.Thread] = []
 
     def __exit__(self, *exc: object) -> None:
         for pool in [*self._idle, *self._busy.values()]:
@@ -120,8 +120,8 @@ class WorkerProcesses(AbstractContextManager):
             for process in processes:
                 process.kill()
                 process.join(10.0)
-        for hearer in self._hearers:
-            hearer.join(1.0)
+        for reader in self._readers:
+            reader.join(1.0)
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Send a task to a free worker."""
@@ -129,15 +129,15 @@ class WorkerProcesses(AbstractContextManager):
             pool = self._idle.pop()
             future = pool.submit(perform, task)
         else:
-            with _environment(self.threads), self._heard():
+            with _environment(self.threads), self._logged():
                 pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
                 future = pool.submit(perform, task)
         self._busy[future] = pool
         return future
 
     @contextmanager
-    def _heard(self) -> Iterator[None]:
-        """What a process that starts meanwhile prints goes through this one where a log is kept."""
+    def _logged(self) -> Iterator[None]:
+        """With a log, pass what a process started meanwhile prints through this process."""
         if not isinstance(sys.stderr, LoggedStream):
             yield
             return
@@ -150,8 +150,8 @@ class WorkerProcesses(AbstractContextManager):
             os.dup2(before, 2)
             os.close(theirs)
             os.close(before)
-        self._hearers.append(threading.Thread(target=_repeat, args=(ours, sys.stderr), daemon=True))
-        self._hearers[-1].start()
+        self._readers.append(threading.Thread(target=_repeat, args=(ours, sys.stderr), daemon=True))
+        self._readers[-1].start()
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Those that are done, at least one."""
@@ -184,7 +184,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """What a process that starts meanwhile inherits: its share of the cores, no modules of the current folder, no Ctrl-C.
+    """The environment of a process started meanwhile: its share of the cores, no modules of the current folder, no Ctrl-C.
 
     The program is not imported in it, so a script needs no ``if __name__ == "__main__"``.
     """
@@ -211,9 +211,9 @@ def _environment(threads: int) -> Iterator[None]:
 def run_tasks(
     workers: Any, waiting: deque, task_of: Callable[[Any], Callable[[], Any]]
 ) -> Iterator[tuple[Any, TaskResult]]:
-    """Yield (item, answer) for every waiting item, as they finish; more may be put in after every answer.
+    """Yield (item, answer) for every waiting item, as they finish; items may be added after every answer.
 
-    `workers` have slots, submit and wait; `task_of` is asked for an item's task just before that is sent.
+    `workers` have slots, submit and wait; `task_of` is called for an item's task just before it is sent.
     """
     out: dict[Any, Any] = {}
     while waiting or out:
@@ -236,9 +236,9 @@ def _answer(future: Any) -> TaskResult:
 def each_file(
     function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
 ) -> Iterator[tuple[tuple, TaskResult]]:
-    """Each item of work, the function's arguments, with what became of it, as they finish; failures do not stop the rest.
+    """Each item of work, the function's arguments, with its result, as they finish; failures do not stop the rest.
 
-    The function is a module's own, so that other processes find it. They share the cores. A single worker is this process.
+    The function must be importable by other processes. They share the cores. A single worker is this process.
     """
     count = min(checks.whole("--workers", workers, 1, 1024), len(work))
     if count == 1:
