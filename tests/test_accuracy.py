@@ -258,7 +258,7 @@ def test_table_is_ascii_and_aligned():
             {"reference": [2], "predicted": [2], "merge": {5: [3], 6: [3]}},
             "to two others.*class 3 to 5 and 6",
         ),
-        ({"reference": [2], "predicted": [2], "merge": {3: 5}}, "lists of classes.*5"),
+        ({"reference": [2], "predicted": [2], "merge": {3: 5}}, "list of classes.*5"),
         ({"reference": [2], "predicted": [2], "reliability": [87.0]}, "not between 0 and 1.*87"),
         ({"reference": np.arange(300), "predicted": np.zeros(300, int)}, "too many different values.*300"),
     ],

@@ -106,7 +106,7 @@ def test_inputs_of_one_name_lie_in_their_folders(folder, classify, tmp_path):
         source = laspy.read(folder / f"in/{of}.laz")
         assert np.array_equal(laspy.read(out / name).xyz, source.xyz)
     code, _, err = classify(given, f"{tmp_path}/c_#.laz")
-    assert code == 1 and "two inputs have one name" in err and "folder" in err
+    assert code == 1 and "two inputs have the same name" in err and "folder" in err
     code, _, err = classify(given, f"{tmp_path}/in")
     assert code == 1 and "one of the inputs" in err
     code, said, err = classify(folder / "in", folder / "in" / "t0.laz", tmp_path / "other")
@@ -244,7 +244,7 @@ def test_octrees_are_called_alike_in_one_piece_and_in_tiles():
     assert outputs_of(["in/a.copc.laz"], "o/#", copc=True) == [f"o/{kept}"]
     assert outputs_of(["in/a.copc.laz"], "o/#") == ["o/a.laz"]
     assert outputs_of(["in/a.copc.laz"], "c_#.las", copc=True) == ["c_a.las"]
-    with pytest.raises(PipelineError, match="one name"):
+    with pytest.raises(PipelineError, match="the same name"):
         outputs_of(["in/a.copc.laz", "in/a.laz"], "o/c_#.laz")
 
 

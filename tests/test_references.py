@@ -68,7 +68,7 @@ def test_units_of_two_kinds(tmp_path, inputs, one, two):
             way()
         said = str(caught.value)
         assert "0.304801 m" in said and "1 m" in said and "in0.las" in said and "in1.las" in said
-        assert ("as no reference says otherwise" in said) == (two is None)
+        assert ("as there is no spatial reference" in said) == (two is None)
     assert not list(tmp_path.glob("o_*")) and not (tmp_path / "whole.las").exists()
 
 
@@ -110,7 +110,7 @@ def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, ca
     inputs(METERS, None)
     files = [str(tmp_path / f"in{number}.las") for number in range(2)]
     assert main(["objects", *files, str(tmp_path / "town.geojson")]) == 1  # which have no classes
-    assert f"{files[1]} has no spatial reference; it is taken to have" in capsys.readouterr().err
+    assert f"{files[1]} has no spatial reference; it is assumed to have" in capsys.readouterr().err
 
 
 def test_geotiff_keys_of_las_14_in_old_point_formats(tmp_path, write_las):

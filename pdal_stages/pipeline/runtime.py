@@ -1,4 +1,4 @@
-"""Where an expanded stage arrives inside PDAL: from ``filters.python``'s globals to a stage's run().
+"""Running an expanded stage inside PDAL: from ``filters.python``'s globals to a stage's run().
 
 The script that PDAL executes is a few lines that call :func:`run_stage`; everything else
 lives here, in the installed package, where compiled code can be cached.
@@ -47,7 +47,7 @@ _reports: dict[str, list[Report]] = {}
 _failures: dict[str, StageError] = {}
 _usual_stdout: Any = sys.__stdout__
 #: Stages made in this process, and its functions, by label, as long as someone holds them; in another process options
-#: are parsed anew.
+#: are parsed again.
 made: WeakValueDictionary[str, Any] = WeakValueDictionary()
 
 
@@ -145,7 +145,7 @@ def points_of_views(
 
 
 def _made_again(arguments: Mapping[str, Any]) -> Stage:
-    """The stage of an expanded pipeline that runs in another process than the one that expanded it."""
+    """The stage of an expanded pipeline, in another process than the one that expanded it."""
     kind = stage_type(arguments["stage"])
     stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
     stage.makes_again = arguments.get("makes_again", False)
@@ -186,7 +186,7 @@ def run_on_nothing(stage: Stage, where: str | None = None) -> Report:
 
 
 def as_stage_error(error: BaseException, where: str) -> StageError:
-    """Whatever a stage raised, as an error of ours."""
+    """Any exception of a stage as one of our errors."""
     if isinstance(error, StageError):
         return error.at(where)
     if isinstance(error, MemoryError):
@@ -201,7 +201,7 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
 
 
 def _encodable(text: str) -> str:
-    """Text that PDAL can take: file names may hold bytes that are not UTF-8, and C ends at a zero."""
+    """Text that PDAL can take: valid UTF-8 without NUL."""
     return text.encode("utf-8", "replace").decode().replace("\0", "?")
 
 
@@ -288,7 +288,7 @@ class Callbacks(AbstractContextManager):
         return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **own}
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """The stages, with a check before each that ends the process of old PDAL where no point is ground."""
+        """The stages, with a check before each one that crashes old PDAL where no point is ground."""
         if pdal_env.version() >= (2, 9, 0):
             return list(stages)
         out: list[dict[str, Any]] = []

@@ -288,7 +288,7 @@ def test_degrees(command, tmp_path, write_las):
 BOXES = {
     "infinite bounding box": (float("inf"), 20, "the header has no bounding box"),
     "bounding box of 1e300": (1e300, 20, None),
-    "tiles of 1e-300": (None, 1e-300, "too far away to be counted in tiles"),
+    "tiles of 1e-300": (None, 1e-300, "too large for tiles of this size"),
     "tiles of a millimeter": (None, 0.001, None),
 }  # fmt: skip
 

@@ -22,7 +22,7 @@ REFUSED = {
     "a text": (b'"in.las"', ["must be a list or an object"]),
     "empty list": (b"[]", ["the pipeline has no stages"]),
     "object without 'pipeline'": (b'{"stages": []}', ["no list named 'pipeline'", "'stages'", 'Write {"pipeline"']),
-    "trailing comma": (b"[\n" + STAGE + b",\n]", ["job.json, line", "none before a bracket"]),
+    "trailing comma": (b"[\n" + STAGE + b",\n]", ["job.json, line", "none before a closing bracket"]),
     "missing comma": (b'[\n"a.las"\n"b.las"]', ["job.json, line 3", "Expecting ',' delimiter"]),
     "several roots": (b'["a.las"]\n["b.las"]', ["line 2", "Extra data", "one list or object"]),
     "Windows path without doubled backslashes": (b'["C:\\data\\in.las"]', ["line 1", "escape"]),

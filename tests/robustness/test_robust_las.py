@@ -209,7 +209,7 @@ DAMAGED = {
     "records after the points at byte 0": (".las 6", after(place=0), "not where it says"),
     "records after the points at 2^64 - 1": (".las 6", after(place=2**64 - 1), "not where it says"),
     "a record of 2^62 bytes after the points": (".las 6", after(length=2**62), "do not end within"),
-    "no points in the header": (".las 6", zero, "counts no points, but holds some"),
+    "no points in the header": (".las 6", zero, "counts no points, but the file holds some"),
     "LAZ: cut in the points": (".laz 3", lambda d: d[: len(d) // 2], "it is cut short"),
     "LAZ: cut in the chunk table": (".laz 3", lambda d: d[:-4], "LAS file"),
     "LAZ: chunk table beyond the end": (".laz 3", lambda d: struct.pack_into("<q", d, struct.unpack_from("<I", d, 96)[0], 10**12), "cut short"),
@@ -220,7 +220,7 @@ DAMAGED = {
     "LAZ: another size in the chunk table": (".laz 3", lambda d: d.__setitem__(table(d) + 9, d[table(d) + 9] ^ 0x40), "LAS file"),
     "LAZ: no record of the compression": (".laz 3", lambda d: d.__setitem__(d.index(b"laszip encoded"), ord("k")), "no record of how"),
     "LAZ: records after the points at 2^62": (".laz 6", after(place=2**62), "not where it says"),
-    "LAZ: no points in the header": (".laz 6", zero, "counts no points, but holds some"),
+    "LAZ: no points in the header": (".laz 6", zero, "counts no points, but the file holds some"),
     "LAZ: another count in the header": (".laz 6", lambda d: struct.pack_into("<Q", d, 247, 599), "599 counted, 600 held"),
 }  # fmt: skip
 

@@ -46,9 +46,9 @@ LISTS = {
     "tile index that is no database": ("index.gpkg", b"no database", ["cannot be read"]),
     "EPT that is no JSON": ("ept.json", b"no", ["cannot be read"]),
     "EPT without bounds": ("ept.json", _ept(boundsConforming=[]), ["cannot be read"]),
-    "EPT beyond its octree": ("ept.json", _ept(boundsConforming=[-1e12, -1e12, 0, 1e12, 1e12, 9]), ["points beyond its octree"]),
+    "EPT beyond its octree": ("ept.json", _ept(boundsConforming=[-1e12, -1e12, 0, 1e12, 1e12, 9]), ["its points lie outside its octree"]),
     "EPT of 1e300 m": ("ept.json", _ept(boundsConforming=[-1e300, -1e300, 0, 1e300, 1e300, 9]), ["can be read"]),
-    "EPT of -5 points": ("ept.json", _ept(points=-5), ["a description of nothing"]),
+    "EPT of -5 points": ("ept.json", _ept(points=-5), ["not a valid description"]),
     "EPT without its data": ("ept.json", _ept(), ["the EPT source is damaged"]),
 }  # fmt: skip
 
