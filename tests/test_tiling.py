@@ -364,9 +364,9 @@ def test_outputs_need_names(tmp_path, town_file):
         run_tiled([str(tmp_path / "a.las"), str(tmp_path / "b.las"), str(tmp_path / "#.las")], 30)
     (tmp_path / "deep").mkdir()
     las[:100].write(tmp_path / "deep" / "a.las")
-    with pytest.raises(PipelineError, match="one name"):
+    with pytest.raises(PipelineError, match="the same name"):
         run_tiled([str(tmp_path / "a.las"), str(tmp_path / "deep" / "a.las"), str(tmp_path / "o_#.las")], 30)
-    with pytest.raises(PipelineError, match="no file fits"):
+    with pytest.raises(PipelineError, match="no file matches"):
         find_sources([{"type": "readers.las", "filename": str(tmp_path / "none*.las")}])
 
 
