@@ -100,6 +100,13 @@ def test_what_hides_the_ground_is_no_wire(kind, density):
     assert found(xyz).sum() <= 0.001 * len(xyz)
 
 
+def test_a_thin_canopy_above_ground_is_no_wire():
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(0, 80, (4000, 3))
+    xyz[:, 2] = np.where(np.arange(4000) < 2000, 12 + rng.normal(0, 0.3, 4000), 0.0)
+    assert not found(xyz).any()
+
+
 @settings(max_examples=3, deadline=None)
 @given(st.integers(0, 100), st.tuples(st.integers(-3000, 3000), st.integers(-3000, 3000)))
 def test_order_and_shifts_by_whole_cells_change_nothing(seed, cells):
@@ -176,7 +183,9 @@ def test_a_corridor(data_dir):
     assert (wire & ~np.isin(codes, (14, 15))).sum() < 0.001 * len(codes)
 
 
-@pytest.mark.parametrize("name", ["isprs_filter/samp31.laz", "seville/plazanueva.laz"])
+@pytest.mark.parametrize(
+    "name", ["isprs_filter/samp41.laz", "seville/plazanueva.laz", "rural/ign_0p3ppm2.laz"]
+)
 def test_clouds_without_wires(name, data_dir):
     las = laspy.read(data_dir / name)
     height = filtered_ground(las.xyz)["HeightAboveGround"]

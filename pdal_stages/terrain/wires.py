@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import njit
+from ..base.jit import device, njit
 from .cells import CellWindow, cell_numbers, levels, longest_sides, number_sets, patches
 
 #: Side of the cells, meters.
@@ -34,6 +34,9 @@ STEEPEST = 0.6
 FILLED, ONE_SIDED = 8, 5
 #: Around the line, from `CLEAR` meters farther on to `AROUND`, there is at most such a share of what is on it.
 CLEAR, AROUND, MUCH = 0.45, 2.0, 0.34
+#: Unless it is on other lines beside, all of which hold no more than so many times what is on the line.
+MOST = 3.0
+_BIN, _BINS = 0.4, 14
 #: What lies `UNDER` meters below the line is counted up to `STRIP` meters from it, and to each side from `STRIP_FROM` to
 #: `STRIP_TO`: below are so many of all that is not higher on the fuller side, for the same area, and to either side so many
 #: of what is below on the other.
@@ -126,6 +129,34 @@ def _thin(place, thick, cells, start, h, w, held):
     return out, crowded
 
 
+@device
+def _clutter(near, count, slim, ux, uy, rise, pieces):
+    """How many levels around a line are on no other line beside it, filled like it."""
+    half, middle = pieces.shape[2] // 2, _BINS // 2 + 1
+    pieces[:] = False
+    for m in range(count):
+        along = near[m, 0] * ux + near[m, 1] * uy
+        a = int(np.floor((near[m, 1] * ux - near[m, 0] * uy) / _BIN)) + middle
+        b = int(np.floor((near[m, 2] - rise * along) / _BIN)) + middle
+        if slim[m] and 0 <= a < _BINS + 2 and 0 <= b < _BINS + 2:
+            pieces[a, b, min(int((along + HALF) / PIECE), 2 * half - 1)] = True
+    beside = 0
+    for m in range(count):
+        along = near[m, 0] * ux + near[m, 1] * uy
+        aside, above = near[m, 1] * ux - near[m, 0] * uy, near[m, 2] - rise * along
+        if not NEAR + CLEAR < max(abs(aside) - BESIDE + NEAR, abs(above)) <= AROUND:
+            continue
+        a = min(max(int(np.floor(aside / _BIN)) + middle, 1), _BINS)
+        b = min(max(int(np.floor(above / _BIN)) + middle, 1), _BINS)
+        lower = upper = 0
+        for s in range(2 * half):
+            there = pieces[a - 1 : a + 2, b - 1 : b + 2, s].any()
+            lower += there and s < half
+            upper += there and s >= half
+        beside += not slim[m] or (lower + upper < FILLED and max(lower, upper) < ONE_SIDED)
+    return beside
+
+
 @njit
 def _lines(place, cells, start, h, w, thin, crowded, line):
     """Fill `line` (n, 3) with the direction (x, y; rise over run) of the line through each level; returns which have one."""
@@ -135,6 +166,7 @@ def _lines(place, cells, start, h, w, thin, crowded, line):
     near = np.empty((4096, 3))
     slim = np.empty(4096, np.bool_)
     filled = np.zeros(2 * half, np.bool_)
+    pieces = np.zeros((_BINS + 2, _BINS + 2, 2 * half), np.bool_)
     for n in range(len(thin)):
         if not thin[n]:
             continue
@@ -175,7 +207,7 @@ def _lines(place, cells, start, h, w, thin, crowded, line):
                 if away <= NEAR:
                     on += slim[m]
                     filled[min(int((along + HALF) / PIECE), 2 * half - 1)] |= slim[m]
-                elif NEAR + CLEAR < away <= AROUND and (abs(above) > NEAR + CLEAR or not slim[m]):
+                elif NEAR + CLEAR < away <= AROUND:
                     beside += 1
             lower = upper = 0
             for s in range(half):
@@ -184,10 +216,13 @@ def _lines(place, cells, start, h, w, thin, crowded, line):
             if lower + upper < FILLED and max(lower, upper) < ONE_SIDED:
                 continue
             score = lower + upper
-            if beside <= MUCH * on and (score > best or (score == best and on > many)):
-                best, many = score, on
-                line[n, 0], line[n, 1], line[n, 2] = ux, uy, rise
-                good[n] = True
+            if score < best or (score == best and on <= many) or beside > MOST * on:
+                continue
+            if beside > MUCH * on and _clutter(near, count, slim, ux, uy, rise, pieces) > MUCH * on:
+                continue
+            best, many = score, on
+            line[n, 0], line[n, 1], line[n, 2] = ux, uy, rise
+            good[n] = True
     return good
 
 
