@@ -109,17 +109,12 @@ def surfaces(z, start, h, w):
                 kind[n] = ROUGH
                 if not _closed(z, start, h, w, j, i, n):
                     continue
-                slope, scatter = _fit(z, start, h, w, j, i, n, LEVEL, _WIDE[0], _WIDE[1])
-                if 0.0 <= slope <= LEVEL and scatter <= _WIDE[2] ** 2:
-                    kind[n] = SOLID
-                    continue
-                slope, scatter = _fit(z, start, h, w, j, i, n, LEVEL, _NARROW[0], _NARROW[1])
-                if 0.0 <= slope <= LEVEL and scatter <= _NARROW[2] ** 2:
-                    kind[n] = SOLID
-                    continue
-                slope, scatter = _fit(z, start, h, w, j, i, n, STEEP, _WIDE[0], _WIDE[1])
-                if 0.0 <= slope <= STEEP and scatter <= _WIDE[2] ** 2 * (1.0 + slope * slope):
-                    kind[n] = SMOOTH
+                for steep, (around, least, rough) in ((LEVEL, _WIDE), (LEVEL, _NARROW), (STEEP, _WIDE)):
+                    slope, scatter = _fit(z, start, h, w, j, i, n, steep, around, least)
+                    aslant = 1.0 + slope * slope if steep > LEVEL else 1.0
+                    if 0.0 <= slope <= steep and scatter <= rough * rough * aslant:
+                        kind[n] = SMOOTH if steep > LEVEL else SOLID
+                        break
     return kind
 
 
