@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 
+import laspy
 import numpy as np
 import pytest
 from alsnet_scenes import TINY, model_of, random_net, scene
@@ -13,6 +14,12 @@ from pdal_stages.base.errors import DimensionError, OptionError
 from pdal_stages.stages.base import stage_type
 
 WRITER = "writers.classifiermodel"
+
+
+def las_writer(path):
+    """The writer of a LAS file with all dimensions."""
+    words = {"forward": "all", "extra_dims": "all", "minor_version": 4}
+    return {"type": "writers.las", "filename": str(path), **words}
 
 
 @pytest.fixture
@@ -36,20 +43,13 @@ def model(tmp_path):
 
 @pytest.mark.pdal
 def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
-    laspy = pytest.importorskip("laspy")
     path = cloud[0]
     out = tmp_path / "out.las"
     ps.run_pipeline(
         [
             str(path),
             {"type": "filters.modelclassifier", "model": str(model), "margin": True},
-            {
-                "type": "writers.las",
-                "filename": str(out),
-                "forward": "all",
-                "extra_dims": "all",
-                "minor_version": 4,
-            },
+            las_writer(out),
         ]
     )
     las = laspy.read(out)
@@ -63,7 +63,6 @@ def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
 @pytest.mark.pdal
 def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
     """Heights above ground included, which neighbors need too."""
-    laspy = pytest.importorskip("laspy")
     from pdal_stages import run_tiled
 
     path, model = cloud[0], tmp_path / "heights.model"
@@ -77,13 +76,7 @@ def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
             str(path),
             {"type": "filters.hag_minima"},
             {"type": "filters.modelclassifier", "model": str(model)},
-            {
-                "type": "writers.las",
-                "filename": str(out),
-                "forward": "all",
-                "extra_dims": "all",
-                "minor_version": 4,
-            },
+            las_writer(out),
         ]
 
     ps.run_pipeline(stages(tmp_path / "whole.las"))
@@ -106,7 +99,6 @@ def test_tiles_give_the_labels_of_the_whole(cloud, tmp_path, pdal_module):
 )
 def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_module):
     """Color is LAS's own; echo width is an extra dimension, which the reader of LAS 1.4 gives by its name."""
-    laspy = pytest.importorskip("laspy")
     xyz, labels, _ = scene(4000, 36.0, origin=(500_000.0, 5_400_000.0, 100.0))
     arrays = {
         **dict(zip("XYZ", xyz.T, strict=True)),

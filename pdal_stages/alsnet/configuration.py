@@ -199,7 +199,7 @@ class NetworkOptions(Settings):
     points: int | None = None  #: of a batch, instead of the configuration's
     spacing: float | None = setting(None, "number", "Spacing of batches, m; default: four a point", 0.01, 1e5)
     coordinates: str = setting("Z", "string", "Coordinates used as inputs", choices=("", "Z", "XYZ"))
-    epochs: int = setting(60, "integer", "Most epochs; each sees every chosen batch once", 1, 100_000)
+    epochs: int = setting(60, "integer", "Maximum number of epochs; each sees every chosen batch", 1, 100_000)
     batches_per_step: int = setting(2, "integer", "Batches per optimizer step", 1, 1024)
     learning_rate: float = setting(0.002, "number", "Initial learning rate; falls to 1 % of it", 1e-8, 10.0)
     #: 1 (none) [WM19], 1 / sqrt(share) or 1 / share (balanced)
@@ -207,11 +207,11 @@ class NetworkOptions(Settings):
         "sqrt", "string", "Class weights in the loss", choices=("none", "sqrt", "balanced")
     )
     #: batches above it are nearly all of one class and not trained on [WM19: 20 %]; 100: all are
-    histogram_threshold: float = setting(20.0, "number", "Largest spread of class shares, %", 0.0, 100.0)
+    histogram_threshold: float = setting(20.0, "number", "Maximum spread of class shares, %", 0.0, 100.0)
     augment: bool = setting(True, "boolean", "Rotate, shift, jitter and thin each batch, anew in each epoch")
     validation: float = setting(0.2, "number", "Share of ground held out to choose the epoch", 0.0, 0.5)
     block_size: float = setting(25.0, "number", "Side of the blocks held out, meters", 0.1, 1e6)
-    patience: int = setting(20, "integer", "Most epochs without a better mean F1; 0: no limit", 0, 100_000)
+    patience: int = setting(20, "integer", "Maximum epochs without a better mean F1; 0: no limit", 0, 100_000)
     checkpoint: str | None = setting(None, "filename", "Written each epoch; resumed from", check=_file)
     #: classes it shares keep their weights, others start afresh
     start_from: str | None = setting(None, "filename", "Model file to start from", check=_file)

@@ -138,7 +138,7 @@ class TrainingOptions(Settings):
     base: Any = setting(
         None,
         "model",
-        "A model to build on, so that few labels do; it still decides on classes that the labels lack",
+        "A model to build on, so that a few labels suffice; it still decides on classes without labels",
     )
     algorithm: str = setting(
         "random_forest",

@@ -183,11 +183,7 @@ class Cells:
 
     @staticmethod
     def join(parts: Sequence[Cells]) -> Cells:
-        """Records of all parts' points together."""
-        if not parts:
-            raise ValueError("there is nothing to join")
-        if len({part.size for part in parts}) > 1:
-            raise ValueError("cells of different sizes cannot be joined")
+        """Records of all parts' points together; cells of all parts have one size."""
         if len(parts) == 1:
             return parts[0]
         columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in _COLUMNS}

@@ -31,9 +31,9 @@ class ObjectSettings(Settings):
         0.05,
         100,
     )
-    building_height: float = _setting(1.5, "Least height of a building's cells above the ground", 0, 100)
+    building_height: float = _setting(1.5, "Minimum height of a building's cells above the ground", 0, 100)
     building_area: float = _setting(
-        4.0, "Least area of a building; smaller ones are left out", 0, 10_000, "m2"
+        4.0, "Minimum area of a building; smaller ones are left out", 0, 10_000, "m2"
     )
     step: float = _setting(
         2.5,
@@ -42,10 +42,10 @@ class ObjectSettings(Settings):
         100,
     )
     roof_part: float = _setting(
-        10.0, "Least area of a roof part; smaller ones (dormers) join their neighbor", 0, 10_000, "m2"
+        10.0, "Minimum area of a roof part; smaller ones (dormers) join their neighbor", 0, 10_000, "m2"
     )
-    tree_height: float = _setting(3.0, "Least height of a tree", 0, 100)
-    tree_area: float = _setting(1.0, "Least area of a tree's crown", 0, 1000, "m2")
+    tree_height: float = _setting(3.0, "Minimum height of a tree", 0, 100)
+    tree_area: float = _setting(1.0, "Minimum area of a tree's crown", 0, 1000, "m2")
     saddle: float = _setting(0.3, "Depth of the saddle in the canopy that separates two trees", 0, 10)
     smoothing: float = _setting(0.3, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
     dbh_factor: float = _setting(

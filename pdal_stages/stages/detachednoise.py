@@ -20,14 +20,14 @@ class DetachedNoise(ClassStage):
     cluster: int = option(
         "integer",
         60,
-        "Most points of a noise cluster; clusters with points above them may have more",
+        "Maximum number of points of a noise cluster; clusters with points above them may have more",
         minimum=1,
         maximum=1_000_000,
     )
     gap: float = option(
         "number",
         2.5,
-        "Least height of high noise above everything nearby; more in clouds of less than 3 points/m2",
+        "Minimum height of high noise above everything nearby; more in clouds of less than 3 points/m2",
         minimum=0,
         exclusive=True,
         maximum=1000,
@@ -36,7 +36,7 @@ class DetachedNoise(ClassStage):
     depth: float = option(
         "number",
         1.0,
-        "Least depth of low noise below the ground; more where the ground is rough",
+        "Minimum depth of low noise below the ground; more where the ground is rough",
         minimum=0,
         exclusive=True,
         maximum=1000,

@@ -77,7 +77,7 @@ class HagMorphological(Stage):
     threshold: float = option(
         "number",
         0.5,
-        "Largest distance of a ground point from the ground surface",
+        "Maximum distance of a ground point from the ground surface",
         minimum=0,
         maximum=1000,
         unit="m",
