@@ -3,7 +3,6 @@ sure it was, on ground that it had not seen: from which reliability on points of
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..base.checks import strict_json
 from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
 from .algorithms import REFINED, Column
@@ -251,14 +251,14 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
     beside = Path(path).with_suffix(SUFFIX)
     if beside.is_file():
         try:
-            return Sureness.from_dict(json.loads(beside.read_bytes()))
+            return Sureness.from_dict(strict_json(beside.read_bytes()))
         except (OSError, ValueError, RecursionError) as error:
             raise ModelError("the file beside the model is damaged", where=str(beside), found=error) from None
     cure = "Train it with folds (the default), on labels that lie in more than one place"
     if info.get("teacher"):
         cure = "Its labels are another model's answers; take a model that was scored on a person's labels"
     raise OptionError(
-        "it is not known how sure this model must be to be right: it was never scored on ground it had not seen",
+        "how often this model is right at which Reliability is not known: it was never scored on ground held out",
         found=path,
         cure=f"{cure}; or set a limit by hand: --filters.modelclassifier.reject_below=0.8",
     )
@@ -291,7 +291,7 @@ def said(known: Sureness, names: Mapping[int, str], accuracy: float) -> list[str
             best = np.floor(100 * one.right) / 100
             share = 100 * known.limits(best)[code].kept
             lines.append(
-                f"  {name}: none keeps it, as never more than {100 * one.right:.1f} % of the surest were right; "
+                f"  {name}: no point keeps it, as at most {100 * one.right:.1f} % of the most reliable were right; "
                 f"with {best:g}, {share:.1f} % would"
             )
         else:
