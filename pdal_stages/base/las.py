@@ -64,7 +64,7 @@ UNLABELED = (0, 1)
 #: Overlap of strips, before LAS 1.4 had a flag for it.
 OVERLAP = 12
 #: Codes that say nothing about the object. They are neither trained on nor scored unless they are named.
-UNINFORMATIVE = (*UNLABELED, *NOISE, OVERLAP)
+UNINFORMATIVE = tuple(sorted((*UNLABELED, *NOISE, OVERLAP)))
 #: Largest code LAS 1.0-1.3 point formats (0-5) hold: five bits.
 LEGACY_LIMIT = 31
 
