@@ -1,1 +1,1 @@
-"""Pipelines over inputs of any number and size: tiles with a halo, on one host or many, written seamlessly."""
+"""Pipelines over any number and size of inputs: tiles with a halo, on one host or several, without seams."""

@@ -1,8 +1,7 @@
-"""A model for a survey without labels: trained on what another model is sure of there, and so on that survey's own ways.
+"""A model for a survey without labels, trained on the points that another model is sure of.
 
-Self-training: what a model that has never seen a survey says of it is right, nearly always, where it is sure; these points
-show how roofs, crowns and ground look in this sensor's points, at this density, in this land. A model of them alone knows
-nothing else, and is better there.
+Self-training: on a new survey, a model is nearly always right where it is sure. These points show what roofs, crowns and
+ground look like with this sensor and point density and in this region, and a model trained on them alone is better there.
 """
 
 from __future__ import annotations
@@ -26,29 +25,29 @@ from .classify import ClassifyTask
 from .settings import TilingOptions
 from .training import TrainTask
 
-#: Reliability from which on a model is believed. With 0.55 less is gained: its errors are learned with the rest.
+#: Least reliability of points to train on. With 0.55 the gain is smaller, as errors are learned, too.
 SURE = 0.7
-#: Samples of a class: enough for one survey, and quickly trained.
+#: Samples of each class: enough for one survey, and quick to train.
 COUNT = 6_000
-#: A class of which the teacher is sure of fewer points is left out: these may well be its errors.
+#: A class with fewer sure points is left out: they may well be errors of the teacher.
 FEWEST = 200
-#: Points to look at: of a larger survey some of its files, spread over it.
+#: Most points to classify: of a larger survey, only some files spread over it.
 MOST = 20_000_000
 
 
 @dataclass(frozen=True)
 class AdaptTask:
-    """What a model is made for."""
+    """A model to be adapted to a survey."""
 
-    #: files, folders, patterns, tile indexes of one survey; of the classes they have noise and overlap alone count
+    #: files, folders, patterns, tile indexes of one survey; of their classes only noise and overlap matter
     inputs: Sequence[str]
     model: str  #: the file to write
-    teacher: str = "standard"  #: the model that says what it sees
-    sure: float = SURE  #: its least ``Reliability`` that counts
+    teacher: str = "standard"  #: the model that classifies the survey
+    sure: float = SURE  #: the least ``Reliability`` of points to train on
     options: TilingOptions = field(default_factory=TilingOptions)
 
     def run(self) -> list[str]:
-        """Write the model; what is to be told. StageError where the teacher is sure of fewer than two classes."""
+        """Write the model; returns messages. StageError where the teacher is sure of fewer than two classes."""
         sure = checks.number("'--sure'", self.sure, 0.0, 1.0)
         teacher, files = load_model(self.teacher), input_files(self.inputs)
         check_outputs([Output(self.model, "model", MODEL)], files)
@@ -69,7 +68,7 @@ class AdaptTask:
                 "where": f"Reliability >= {sure:g}",
                 "voxel": teacher.voxel,
                 "count": COUNT,
-                "folds": 0,  # a score by the teacher's own answers would be none
+                "folds": 0,  # scoring against the teacher's own answers means nothing
             }
             made = str(folder / "adapted.model")
             TrainTask(classified, made, (), given, self.options).run()
@@ -100,7 +99,7 @@ class AdaptTask:
 
 
 def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:
-    """Every so many-th file, so that they have about `most` points; and what is to be told."""
+    """Files at regular steps, so that they have about `most` points; and messages."""
     headers = [las.header_there(name) for name in files] if all(map(is_las, files)) else []
     points = sum(header.count for header in headers if header)
     step = min(max(1, round(points / most)), len(files))

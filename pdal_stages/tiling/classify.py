@@ -1,4 +1,4 @@
-"""A survey, or a file, classified: in one piece where it fits, otherwise in seamless tiles."""
+"""Classify a file or a survey: in one piece where it fits into memory, otherwise in seamless tiles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .settings import TilingOptions, fits_whole
 
 @dataclass
 class Written:
-    """An output that was written in one piece."""
+    """The output of a run in one piece."""
 
     path: str
     points: int
@@ -31,7 +31,7 @@ class Written:
 
 @dataclass(frozen=True)
 class ClassifyTask:
-    """What is to be classified, how, and where to."""
+    """Inputs, output and settings of a classification."""
 
     inputs: tuple[str, ...]  #: files, folders, patterns, tile indexes, EPT sources
     output: str  #: a file; of several inputs a folder, or a name with ``#`` for the input's
@@ -47,7 +47,7 @@ class ClassifyTask:
 
     @cached_property
     def in_one_piece(self) -> bool:
-        """Whether the only input is a file that fits into memory, and nothing asks for tiles."""
+        """Whether there is one input that fits into memory, and no option asks for tiles."""
         options = self.options
         asked = options.tile is not None or options.per != "auto" or options.scheduler or options.resume
         if len(self.files) > 1 or asked or any(one.what == "report" for one in self.beside):
@@ -63,14 +63,14 @@ class ClassifyTask:
 
     @cached_property
     def outputs(self) -> list[str]:
-        """A file for each input; none where each tile is one."""
+        """An output file for each input; empty where each tile is an output."""
         if self._per_tile:
             return []
         target = str(Path(self.output) / "#") if is_folder(self.output) else self.output
         return outputs_of(self.files, target, copc=self.in_one_piece)
 
     def make_folders(self) -> None:
-        """Make the output folder, and those in it that outputs lie in."""
+        """Create the output folder, and the folders in it."""
         if not is_folder(self.output):
             return
         for folder in sorted({Path(self.output), *(Path(name).parent for name in self.outputs)}):
@@ -96,7 +96,7 @@ class ClassifyTask:
         return Written(target, count, codes[-1] if codes else {}, pipeline.left_alone, messages)
 
     def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
-        """Classify all inputs in tiles; `finished` hears of every output that was written."""
+        """Classify all inputs in tiles; `finished` is called with every output that was written."""
         from .inputs import one_format
         from .plan import plan_of_files
         from .run import run_plan

@@ -1,4 +1,4 @@
-"""Tasks on a Dask scheduler that runs already, with workers on this or other hosts."""
+"""Tasks on a running Dask scheduler, with workers on this or other hosts."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ..base.version import build
 from ..pipeline import pdal as pdal_env
 from ..pipeline.workers import TaskResult, perform
 
-#: Seconds to wait for the scheduler, and for a worker: at the beginning, and when all are gone.
+#: Seconds to wait for the scheduler, and for a worker at the start or after all have gone.
 _CONNECT, _WAIT = 10.0, 120.0
-#: Seconds after which it is asked whether scheduler and workers are still there.
+#: Seconds between checks that scheduler and workers are still there.
 _ASK = 10.0
 _RESUME = "Once it is back, continue with --resume"
 
@@ -58,7 +58,7 @@ class Cluster(contextlib.AbstractContextManager):
         self._client.close()
 
     def submit(self, task: Callable[[], Any]) -> Future:
-        """Send a task; as bytes, because Dask would look for its own keys in all that it holds."""
+        """Send a task, as bytes so that Dask does not search it for its own keys."""
         host, work = socket.gethostname(), pickle.dumps(task)
         try:
             return self._executor.submit(perform_for, _versions(), self.folder, host, work)
@@ -66,7 +66,7 @@ class Cluster(contextlib.AbstractContextManager):
             raise _lost() from None
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """Those that are done, at least one; StageError where a worker is unfit, or scheduler or workers are lost."""
+        """The futures that are done, at least one; StageError where a worker is unsuitable, or the cluster is lost."""
         gone: float | None = None
         while True:
             done = wait(list(futures), timeout=_ASK, return_when=FIRST_COMPLETED).done
@@ -94,7 +94,7 @@ def _versions() -> tuple[str, str]:
 
 
 def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> TaskResult | str:
-    """Do a task on a worker for the program on `host`, or say why results would not be those of that or not get there."""
+    """Do a task on a worker for the program on `host`, or return why the worker is unsuitable."""
     here, theirs = socket.gethostname(), _versions()
     if theirs != wanted:
         return (

@@ -1,11 +1,10 @@
-"""Rounds before the tiles: what a far-reaching stage needs of points is made once, and tiles put it together.
+"""Rounds before the tiles: the raster of a far-reaching stage is computed once, in blocks that tiles share.
 
-Filtered ground looks half a kilometer around a tile, but what decides on it is a raster: of the lowest points, and of where
-the ground's points lie in each cell. So each tile's own points are read first, with the surroundings that the stages before
-need (noise is marked before heights are made). The lowest are written into a file, all that may be ground, and what the
-stages before changed. Then blocks of the raster are made, each out of the lowest points of its surroundings and the points
-inside. At last a tile reads the points that the stages after need, gives them what the stages before changed, and takes the
-raster from the blocks.
+Filtered ground depends on points half a kilometer around a tile, but only through a raster of the lowest points and of the
+positions of ground points in each cell. So each tile's own points are read first, with the halo of the earlier stages (noise
+is marked before heights are computed). The lowest points, possible ground points, and changes by earlier stages are saved.
+Then blocks of the raster are computed from the lowest points around them and the points inside. Finally a tile reads the
+points that the later stages need, applies the saved changes, and takes the raster from the blocks.
 """
 
 from __future__ import annotations
@@ -32,12 +31,12 @@ from .tile import Changed, FromBefore, HeadRun, RunContext, run_head
 
 
 def left_name(tile: str) -> str:
-    """What is called what the first round left of a tile."""
+    """The name of the first round's result for a tile."""
     return f"{tile}.first"
 
 
 def block_name(block: tuple[int, int]) -> str:
-    """What is called a block that is made of what is left."""
+    """The name of a block of the raster."""
     return f"{block[0]}_{block[1]}.block"
 
 
@@ -56,11 +55,13 @@ class FirstRoundTask:
     context: RunContext
     first: FirstRound
     tile: tuple[int, int]
-    sources: list[tuple[InputSource, CloudIndex | None]]  #: inputs that may hold points of it or its halo
-    target: str  #: file for what is left of its points
+    sources: list[
+        tuple[InputSource, CloudIndex | None]
+    ]  #: inputs that may have points in the tile or its halo
+    target: str  #: file for the result
 
     def run(self) -> dict[str, Any]:
-        """Write what is left of the tile's own points, and what the stages before the one that wants it made of them."""
+        """Save what the raster needs of the tile's own points, and the changes by earlier stages."""
         context, plan, first = self.context, self.context.plan, self.first
         stage, left = stage_of(plan), [{"around": np.empty((0, 4))}]
 
@@ -87,15 +88,15 @@ class FirstRoundTask:
 
 @dataclass(frozen=True)
 class BlockTask:
-    """A block of the raster that is made once of what is left around it."""
+    """A block of the raster, computed from the first round's results around it."""
 
     plan: TilePlan
     block: tuple[int, int]
-    tiles: list[str]  #: files of what is left of the tiles around, as far as these were done
+    tiles: list[str]  #: files of the first round, of the tiles around that are done
     target: str
 
     def run(self) -> dict[str, Any]:
-        """Write what tiles need of the block."""
+        """Save the block."""
         assert self.plan.first is not None
         blocks = self.plan.first.blocks
         low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(self.block, blocks.reach)
@@ -111,7 +112,7 @@ class BlockTask:
 
 
 def blocks_around(context: RunContext, tile: tuple[int, int], around_m: float) -> list[tuple[int, int]]:
-    """The blocks that a tile with so many meters around it touches."""
+    """The blocks that a tile touches with so many meters around it."""
     assert context.plan.first is not None
     box = _box_m(context, tile, around_m)
     return TileGrid(context.plan.first.blocks.side).covering(box)
@@ -125,7 +126,7 @@ def _box_m(context: RunContext, tile: tuple[int, int], around_m: float) -> Box:
 def from_before(
     folder: str, context: RunContext, tile: tuple[int, int], read_m: float, cuts: list[Piece]
 ) -> FromBefore:
-    """What the rounds before, which are kept in `folder`, left for a tile that is read with so many meters around it."""
+    """The results of the earlier rounds in `folder` for a tile that is read with so many meters around it."""
     first = context.plan.first
     assert first is not None
     around = read_m + first.blocks.around + first.blocks.spill
@@ -146,7 +147,7 @@ def _there(folder: str, names: Iterable[str]) -> list[str]:
 
 
 def _changed(names: Sequence[str], left: list[str], piece: Piece) -> Changed:
-    """New values of a piece's points that the stages before the far-reaching one gave: rows and values by dimension."""
+    """New values that earlier stages gave to points of a piece: rows and values by dimension."""
     parts = []
     for path in left if names else ():
         kept = load_arrays(path, under=f"{piece.source.key}/")

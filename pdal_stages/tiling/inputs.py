@@ -1,4 +1,4 @@
-"""The inputs of a tiled run, and what is known of them before any tile: which can be read, where they lie, in what unit."""
+"""The inputs of a tiled run, checked before any tile: whether they can be read, their extent and unit."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from .settings import (
 )
 from .store import fingerprint
 
-#: Options of readers.tindex that choose files or points, or change them.
+#: Options of readers.tindex that select files or points, or change them.
 _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
-#: Bytes looked at, at the beginning and the end.
+#: Bytes of the digest, at the beginning and the end.
 _ENDS = 1 << 16
 
 
@@ -60,17 +60,17 @@ class InputSource:
 
     @property
     def key(self) -> str:
-        """A short name, the same in every run."""
+        """A short identifier, the same in every run."""
         return hashlib.sha1(os.fsencode(self.path)).hexdigest()[:12]
 
     def within(self, box: Box) -> dict[str, Any]:
-        """The reader of an EPT source for a box alone."""
+        """The reader of an EPT source, restricted to a box."""
         x0, y0, x1, y1 = box
         return {**self.reader, "filename": self.path, "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])"}
 
 
 def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
-    """The inputs behind readers: names, patterns, EPT addresses, tile indexes; PipelineError where none can be cut."""
+    """The inputs of readers: names, patterns, EPT addresses, tile indexes; PipelineError where one cannot be cut."""
     found: dict[str, InputSource] = {}
     for reader in readers:
         given, kind = reader.get("filename", ""), reader["type"]
@@ -149,7 +149,7 @@ def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
 def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
     """Read the points of an EPT source in a box into a LAS file; whether there are any.
 
-    Scales and offsets are the source's, so coordinates stay what they are; other dimensions become extra dimensions.
+    Scales and offsets are the source's, so coordinates do not change; other dimensions become extra dimensions.
     """
     form = {**ept_form(read_ept(source.path)), "extra_dims": "all"}
     run = pdal_env.execute(
@@ -163,12 +163,12 @@ def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
 
 @dataclass(frozen=True)
 class CloudIndex:
-    """Where the points of a file lie."""
+    """The location of a file's points."""
 
     count: int
     box: Box  #: of all points
     tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
-    cells: NDArray[np.int64]  #: (n, 4): column, row, place of the first point in the copy, number of points
+    cells: NDArray[np.int64]  #: (n, 4): column, row, index of the first point in the copy, number of points
     copy: str  #: the file with the points
 
     @classmethod
@@ -180,24 +180,24 @@ class CloudIndex:
 
 
 class Survey:
-    """The inputs of a run, and its options with the tiles' side and the workers settled."""
+    """The inputs of a run, and its options with tile size and number of workers decided."""
 
     def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
-        self.unreadable: dict[str, str] = {}  #: inputs by path that cannot be read, and why
+        self.unreadable: dict[str, str] = {}  #: unreadable inputs by path, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
         self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
         self.sources = find_sources(plan.readers)
         self.paths = [source.path for source in self.sources]
         others = named_files([*plan.head, *plan.tail])
-        #: What inputs, and other files that stages read, were like when the run began.
+        #: Fingerprints of inputs, and of other files that stages read, at the start of the run.
         self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
         self._read_headers()
         files = all(source.kind == "las" for source in self.sources)
         if options.per == "file" and not files:
             raise OptionError("--per file needs LAS or LAZ inputs", cure="Use --per tile")
-        #: ``file`` or ``tile``: what one output is made of.
+        #: ``file`` or ``tile``: what an output corresponds to.
         self.per = options.per if options.per != "auto" else "file" if files else "tile"
         #: What each of the writers writes of each input; empty where each tile is an output.
         self.outputs = outputs_for(plan, self.paths) if self.per == "file" else []
@@ -205,7 +205,7 @@ class Survey:
         self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
         self.place()
         self.density = Density.of(self.extents.values())
-        #: Memory of a worker for what is made before the tiles.
+        #: Memory of a worker for the rounds before the tiles.
         self.block_bytes = (
             block_bytes(plan.first.blocks, self.density.area * self.unit**2) if plan.first else 0.0
         )
@@ -236,9 +236,9 @@ class Survey:
             )
 
     def _unit(self, plan: TilePlan) -> float:
-        """Meters per unit of the coordinates, whose reference must be one for all inputs that stages see together."""
+        """Meters per unit of the coordinates; inputs that stages see together must have the same reference."""
         needed = bool(plan.head and plan.sees_m)
-        of_kind: dict[str, Reference] = {}  # PDAL is asked once for inputs that say the same
+        of_kind: dict[str, Reference] = {}  # PDAL is asked once for equal references
         found: dict[str, Reference] = {}
         for source in self.sources:
             if source.path in self.unreadable:
@@ -265,14 +265,14 @@ class Survey:
         return next(iter(found.values())).units.horizontal
 
     def _reference_of(self, source: InputSource, horizontal: str) -> Reference:
-        """What PDAL's reader says of an input, with as few points read as it can."""
+        """The reference of an input, according to PDAL's reader, with as few points read as possible."""
         if source.kind == "las":
             return reference_of({**source.reader, "filename": source.path, "count": 1}, horizontal)
         x, y, _, _ = self.extents[source.path].box
         return reference_of(source.within((x, y, x + 1, y + 1)), horizontal)
 
     def place(self) -> None:
-        """Note where inputs lie, as headers or indexes say; thousands of them are compared at once."""
+        """Collect the boxes of inputs from headers or indexes, as an array for fast comparison."""
         self.placed = [s for s in self.sources if s.path in self.extents and self.extents[s.path].count]
         boxes = []
         for source in self.placed:
@@ -282,27 +282,27 @@ class Survey:
         self.bounds: Box = union(boxes)
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
-        """Names and stamps of the files that stages read."""
+        """Names and fingerprints of the files that stages read."""
         return [[path, self.stamps.get(path)] for path in named_files(stages)]
 
     def seen(self, sources: list[InputSource]) -> list[Any]:
-        """Names, stamps and readers of inputs."""
+        """Names, fingerprints and readers of inputs."""
         return [[source.path, self.stamps[source.path], source.reader] for source in sources]
 
     def changed(self) -> list[str]:
-        """Inputs and other files that are not what they were when the run began."""
+        """Inputs and other files that changed since the run began."""
         return [path for path, then in self.stamps.items() if stamp(path) != then]
 
     def near(self, tile: tuple[int, int], halo_units: float) -> list[InputSource]:
-        """Inputs that may hold points of a tile or its halo."""
+        """Inputs that may have points in a tile or its halo."""
         return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, halo_units))]
 
     def readable(self, sources: list[InputSource]) -> list[tuple[InputSource, CloudIndex | None]]:
-        """Those that can be read, with what tasks need to know of where their points lie."""
+        """The readable ones, with the index of their points."""
         return [(s, self.indexes.get(s.path)) for s in sources if s.path not in self.unreadable]
 
     def tiles(self) -> dict[tuple[int, int], int]:
-        """Every tile that may have points of its own, row by row, and how many where that is known (else 0)."""
+        """Every tile that may have own points, row by row, and their number where known (else 0)."""
         counts: dict[tuple[int, int], int] = {}
         for path, header in self.extents.items():
             if path in self.indexes:
@@ -315,7 +315,7 @@ class Survey:
         return dict(sorted(counts.items(), key=lambda item: (item[0][1], item[0][0])))
 
     def figures(self, plan: TilePlan) -> dict[str, Any]:
-        """What a report says of the pipeline, its models, the inputs and the tiles' size."""
+        """Figures of the pipeline, its models, the inputs and the tiles for the report."""
         return {
             "pipeline": plan.name,
             "models": [str(stage["model"]) for stage in plan.head if "model" in stage],
@@ -330,9 +330,9 @@ class Survey:
 
 
 def stamp(path: str | os.PathLike) -> list[Any]:
-    """Size, time of change, and a digest of both ends: a copy, link or change of mode leaves it as it is.
+    """A fingerprint: size, time of change, and a digest of both ends. Copies and changes of mode keep it.
 
-    A file that was replaced is told by it even if size and time are those of the older one.
+    It also detects a file that was replaced by one with the same size and time.
     """
     try:
         with open(path, "rb") as file:
@@ -346,11 +346,11 @@ def stamp(path: str | os.PathLike) -> list[Any]:
 
 
 def one_format(paths: Sequence[str]) -> dict[str, Any]:
-    """Options of ``writers.las`` that hold what each of some inputs holds; none where these are alike LAS files.
+    """Options of ``writers.las`` that can hold the points of all inputs; none where these are LAS files of one form.
 
-    The finest scale along each axis with its offset, and of the formats from LAS 1.4 the first that has all colors there
-    are: PDAL forwards only what all inputs of a tile share, and has scales of a centimeter and point format 3 for the rest.
-    What cannot be read is said when it is.
+    The finest scale of each axis with its offset, and the first format of LAS 1.4 with all colors of the inputs: PDAL only
+    forwards what all inputs of a tile share, and otherwise uses scales of a centimeter and point format 3. Unreadable
+    inputs are reported later.
     """
     formats: set[int] = set()
     places: set[tuple[float, ...]] = set()

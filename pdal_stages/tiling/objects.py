@@ -1,4 +1,4 @@
-"""The command ``pdal-stages objects``: classified files in, one vector file out, objects across their borders whole.
+"""The command ``pdal-stages objects``: from classified files to one vector file, with objects whole across file borders.
 
 Each file is read once into records of cells; then objects are found in all.
 """
@@ -31,11 +31,11 @@ from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 if TYPE_CHECKING:
     from .classify import ClassifyTask
 
-#: Whose options the commands take for objects.
+#: Stages whose options the commands accept for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
-#: What is read of LAZ 1.4 (see :func:`las_chunks`).
+#: Dimensions that are read of LAZ 1.4 (see :func:`las_chunks`).
 _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
-#: Larger cells are not taken by themselves: they tell no house from the next.
+#: Cells are not enlarged beyond this automatically: neighboring houses would merge.
 LARGEST = 4.0
 
 
@@ -53,7 +53,7 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
 def write_objects(
     names: Sequence[str], stage: ObjectsWriter, workers: int = 1, metadata: str | None = None
 ) -> dict[str, Any]:
-    """Find objects in classified files, write them, say what was found; the files, and counts by kind."""
+    """Find objects in classified files, write and summarize them; returns the files, and counts by kind."""
     check_target(stage.filename)
     inputs = input_files(names)
     more = [Output(metadata, "metadata", JSON)] if metadata else []
@@ -86,7 +86,7 @@ def write_objects(
 
 
 def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:
-    """The stage whose options the command follows: those of ``--writers.objects.NAME=``, or ``--filters.objects.NAME=``."""
+    """The stage with the options of the command: ``--writers.objects.NAME=``, or ``--filters.objects.NAME=``."""
     for one in overrides:
         if one.by_tag or one.selector not in OPTIONS_OF:
             raise OptionError(
@@ -101,7 +101,7 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
 def _objects_of_files(
     inputs: Sequence[str], stage: ObjectsWriter, workers: int
 ) -> tuple[Objects, Units, str]:
-    """The objects of all files together; units of the coordinates and their reference (WKT)."""
+    """The objects of all files together; the units of the coordinates and their reference (WKT)."""
     references = {path: reference_of_file(path, stage.horizontal_unit) for path in inputs}
     print_messages(*check_one_reference(references))
     units, wkt = references[inputs[0]].units, references[inputs[0]].wkt
@@ -120,7 +120,7 @@ def _objects_of_files(
 
 
 def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
-    """The records of all files."""
+    """The cells of all files."""
     failed = []
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
@@ -139,7 +139,7 @@ def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: i
 
 
 def _cells_of(path: str, stage: ObjectsWriter, wkt: str) -> tuple[Cells, NDArray[np.int64]]:
-    """A file's records, and the points of each class code."""
+    """The cells of a file, and its number of points by class code."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
     for arrays, flags in arrays_in_parts(path, ("Reliability",), _ONLY):

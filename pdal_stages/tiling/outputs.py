@@ -1,4 +1,4 @@
-"""Outputs: points read again, results of tiles put into them, the pipeline's tail with its writers run on them."""
+"""Outputs: points are read again, get the results of tiles, and go through the pipeline's tail with its writers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from .plan import TilePlan
 from .settings import MOST_AT_ONCE
 from .store import load_arrays, written
 
-#: PDAL's names of types that are not NumPy's with ``_t``.
+#: PDAL's type names that are not NumPy's plus ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}
 
 
@@ -43,21 +43,21 @@ class PieceResults:
     """Results of a tile's own points of one piece."""
 
     piece: Piece
-    rows: NDArray[np.int64]  #: (n,) rows of the piece that came out, ascending
+    rows: NDArray[np.int64]  #: (n,) rows of the piece that remain, ascending
     values: dict[str, NDArray]  #: (n,) new values of dimensions
 
 
 @dataclass(frozen=True)
 class NewValues:
-    """What points get that are read again, in the order they are read in."""
+    """New values for points that are read again, in their order."""
 
-    kept: NDArray[np.bool_]  #: (n,) which of the points stay
+    kept: NDArray[np.bool_]  #: (n,) which of the points remain
     #: New values of dimensions and the rows they belong to; None for all.
     values: Mapping[str, tuple[NDArray[np.int64] | None, NDArray]]
 
 
 def of_own_points(result: PieceResults) -> NewValues:
-    """The results for a file of the piece, of which the tile's own points alone stay."""
+    """The results as new values for the piece's file, of which only the tile's own points remain."""
     kept = np.zeros(len(result.piece.index), bool)
     kept[result.rows] = True
     return NewValues(kept, {name: (result.rows, values) for name, values in result.values.items()})
@@ -71,7 +71,7 @@ def flags_in_classes(path: str) -> bool:
 def changed_in(
     name: str, read: NDArray, rows: NDArray[np.int64] | None, values: NDArray, holds_flags: bool
 ) -> NDArray:
-    """A dimension as it was read with new values of some rows, or of all; flags that are bits of the class stay."""
+    """A dimension with new values in some or all rows; flags that are bits of the class are kept."""
     out = np.array(read)
     out[slice(None) if rows is None else rows] = values
     if holds_flags and name == "Classification":
@@ -80,7 +80,7 @@ def changed_in(
 
 
 def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
-    """Results of a tile as they are kept, by the key of each input."""
+    """The results of a tile as arrays to be saved, by the key of each input."""
     content: dict[str, NDArray] = {}
     for result in results:
         piece, key = result.piece, result.piece.source.key
@@ -92,9 +92,9 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
 
 
 def read_results(tiles: Iterable[str], source: InputSource, count: int, start: int, end: int) -> NewValues:
-    """Results of points `start` to `end` of a file with `count` points, out of the files of its tiles.
+    """The results of points `start` to `end` of a file with `count` points, from the files of its tiles.
 
-    StageError where these do not hold each of the file's points once.
+    StageError where these do not contain each of the file's points once.
     """
     kept = np.zeros(end - start, bool)
     seen = 0
@@ -142,15 +142,14 @@ def run_tail(
     outputs: Sequence[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Run readers, the new values of each, and the tail with its writers; the record of what they wrote.
+    """Run readers, their new values, and the tail with its writers; returns a record of what was written.
 
-    The files, `outputs`, appear under their names when all are whole, and the run goes on whose folder for temporary files
-    is `scratch`.
+    The `outputs` get their names once all are complete, and only while the run with the temporary folder `scratch` exists.
     """
     writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
     def finish(made: Path, final: Path, number: int) -> None:
-        if not Path(scratch).is_dir():  # of a run that was killed: another one may write here now
+        if not Path(scratch).is_dir():  # the run was killed, and another one may be writing here
             raise StageError("the run that this belonged to has ended", found=scratch)
         check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
         las.supersede_copc(made)
@@ -173,7 +172,7 @@ def run_tail(
 def read_with(
     callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: Sequence[bool]
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Stages that read points and give them their new values, and the tags of the last ones.
+    """Stages that read points and set their new values, and the tags of the last ones.
 
     `flags`: of each reader, whether flags must be split from the class (old PDAL); empty for none.
     """
@@ -189,7 +188,7 @@ def read_with(
 
 
 def _put(callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool) -> Iterator[dict[str, Any]]:
-    """Filters that give a reader's points their new values, and drop some; PDAL wants the two apart."""
+    """Filters that set new values of a reader's points, and drop some; PDAL needs two filters for this."""
 
     def put(module, ins, outs) -> None:
         if len(ins["X"]) != len(new.kept):
@@ -210,7 +209,7 @@ def _put(callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool) -
 def with_dimensions(
     tail: list[dict[str, Any]], beside: Mapping[str, str] | None, paths: list[str]
 ) -> list[dict[str, Any]]:
-    """A tail whose LAS writers are told which extra dimensions to write: the inputs' own, and those `beside` them."""
+    """A tail whose LAS writers list the extra dimensions to write: the inputs' own, and those in `beside`."""
     listed = "" if beside is None else las_output.extra_dims_option(paths, beside)
     return [
         {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
@@ -223,7 +222,7 @@ def with_dimensions(
 
 @dataclass(frozen=True)
 class FileTask:
-    """An input file's output, to be put together from tiles."""
+    """The output of an input file, to be assembled from tiles."""
 
     plan: TilePlan
     source: InputSource
@@ -233,7 +232,7 @@ class FileTask:
     scratch: str  #: folder for temporary files
 
     def run(self) -> dict[str, Any]:
-        """Write the outputs; the record says what was written, and counts classes."""
+        """Write the outputs; returns a record of what was written, with counts of classes."""
         tail = with_dimensions(self.plan.tail, self.plan.beside, [self.source.path])
         if self.count > MOST_AT_ONCE and self._can_be_joined:
             return self._in_parts(tail)
@@ -243,7 +242,7 @@ class FileTask:
 
     @property
     def _can_be_joined(self) -> bool:
-        """Whether what is written is one LAS or LAZ file whose parts have the same header."""
+        """Whether the output is one LAS or LAZ file whose parts have the same header."""
         names = [Path(path).suffix.lower() for path in self.outputs]
         writer = self.plan.writers[0]
         plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())
@@ -253,14 +252,14 @@ class FileTask:
         found = read_results(self.results, self.source, self.count, start, end)
         if self.count:
             return found
-        # No tile tells which dimensions its points would have got.
+        # No tile has results, so the dimensions come from the plan.
         types = self.plan.makes.items()
         return NewValues(
             found.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types}
         )
 
     def _in_parts(self, tail: list[dict[str, Any]]) -> dict[str, Any]:
-        """Each part goes through the tail into an uncompressed file; these are joined under the first one's header."""
+        """Run the tail on each part into an uncompressed file, and join these under the first one's header."""
         import laspy
 
         classes: Counter[str] = Counter()

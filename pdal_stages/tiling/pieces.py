@@ -1,7 +1,7 @@
-"""Points of inputs: read once and sorted by place into an uncompressed copy, of which each tile cuts out what is near it.
+"""Points of inputs: read once and sorted by location into an uncompressed copy, from which each tile cuts its points.
 
-A LAZ file can only be read in chunks of 50,000 points, which often lie in a long strip. Tiles read most points several
-times (for the first round, as surroundings of their neighbors), so they read the copy. It is removed when the run is done.
+A LAZ file can only be read in chunks of 50,000 points, often along a flight line. Tiles read most points several times (for
+the first round, as halo of their neighbors), so they read the copy. It is removed at the end of the run.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .settings import Box, TileGrid, check_number
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
     import laspy
 
-#: Points of a block: LAZ is compressed in pieces of so many.
+#: Points of a block, as many as in a LAZ chunk.
 BLOCK = 50_000
 #: What messages call the copy.
 TEMPORARY = "temporary"
-#: Points that are sorted together.
+#: Points that are sorted at a time.
 _PART = 1_000_000
-#: The points are sorted by cells; so many of these make up the side of a tile.
+#: The points are sorted by cells; this many make up the side of a tile.
 _CELLS = 4
 
 
@@ -40,7 +40,7 @@ _CELLS = 4
 
 
 def record_blocks(path: str, start: int = 0, end: int | None = None, most: int = BLOCK) -> Iterator[NDArray]:
-    """Records of the points from one number to another, in blocks, with laspy's names of their fields."""
+    """Point records from `start` to `end` in blocks, as arrays with laspy's field names."""
     return (points.array for points in las_chunks(path, start, end, most))
 
 
@@ -55,16 +55,16 @@ def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]
             writer.write_evlrs(header.evlrs)
 
 
-# ---- the copy, sorted by place -------------------------------------------------------------------------------
+# ---- the copy, sorted by location -------------------------------------------------------------------------------
 
 
 def _copy_type(header: laspy.LasHeader) -> np.dtype:
-    """How the copy of a file holds a point: its number in the file, and its record."""
+    """The type of a point in the copy: its number in the file, and its record."""
     return np.dtype([("number", "<i8"), ("record", header.point_format.dtype())])
 
 
 def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
-    """Read a file once, write its points into a copy, sorted by place, and say where they lie (:class:`CloudIndex`)."""
+    """Read a file once, write its points into a sorted copy, and return their index (:class:`CloudIndex`)."""
     header = header_of(path)
     dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -132,7 +132,7 @@ class Piece:
     source: InputSource
     path: str
     index: NDArray[np.int64]  #: (n,) number of each point in its input file
-    #: (n,) how far it lies outside the tile along the farther axis, in the unit of the coordinates; -1 inside
+    #: (n,) distance outside the tile along the farther axis, in the unit of the coordinates; -1 inside
     away: NDArray[np.float64]
 
     @cached_property
@@ -142,7 +142,7 @@ class Piece:
 
     @property
     def reader(self) -> dict[str, Any]:
-        """The reader of its input, without a file's name."""
+        """The reader of its input, without a file name."""
         return {**self.source.reader, "type": "readers.las"}
 
 
@@ -153,7 +153,7 @@ def cut_all(
     halo_units: float,
     folder: str,
 ) -> list[Piece]:
-    """A tile's points and their surroundings, out of every input that has any there.
+    """The points of a tile and its halo, from every input that has any there.
 
     `halo_units` is in the unit of the coordinates.
     """

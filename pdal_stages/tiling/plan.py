@@ -1,4 +1,4 @@
-"""From a pipeline to what each tile runs: readers, a head that sees neighbors, a tail that writes."""
+"""From a pipeline to the plan of each tile: readers, a head that sees neighbors, a tail that writes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..stages.hag_morphological import Blocks, HagMorphological
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
-#: PDAL's filters that look at one point at a time.
+#: PDAL's filters that process each point by itself.
 _PER_POINT = (
     "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay projpipeline range "
     "reprojection transformation"
@@ -34,39 +34,39 @@ _GLOBAL = (
 
 @dataclass(frozen=True)
 class FirstRound:
-    """What is made before the tiles for a stage that looks far: see :mod:`.ground`."""
+    """The first round, before the tiles, for a far-reaching stage: see :mod:`.ground`."""
 
-    at: int  #: number of the stage in the head
-    halo_m: float  #: halo that the stages before it need
+    at: int  #: index of the stage in the head
+    halo_m: float  #: halo of the stages before it
     blocks: Blocks
-    #: Dimensions that the stages before it change, kept for the tiles, which then leave these stages out; None where they
-    #: have to run in each tile again.
+    #: Dimensions changed by the stages before it, saved for the tiles, which then skip these stages; None where they must
+    #: run again in each tile.
     kept: list[str] | None
 
 
 @dataclass(frozen=True)
 class TilePlan:
-    """What a tiled run does to each tile."""
+    """The plan of a tiled run."""
 
     readers: list[dict[str, Any]]  #: as given
     head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its halo
-    later: list[float]  #: meters outside the tile within which the results of each of them are still used
-    #: Stages that look at single points, and the writers: run on the points of one output.
+    later: list[float]  #: meters outside the tile within which each one's results are still used
+    #: Stages that process single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
     halo_m: float  #: of each tile, meters
-    sees_m: float  #: meters around a tile within which any point may matter
-    #: Dimensions the head changes; None where PDAL's filters in it make that unknown.
+    sees_m: float  #: meters around a tile within which points may matter
+    #: Dimensions that the head changes; None where unknown because of PDAL's filters in it.
     creates: list[str] | None
-    unit: str  #: `horizontal_unit` of our stages, empty for the spatial reference's
-    messages: list[str]  #: what the user should know
-    name: str  #: the pipeline's file, or what else its source is called
-    #: Of the dimensions that stages make, those that LAS files get beside the input's own; None leaves it to the writer.
+    unit: str  #: `horizontal_unit` of our stages; empty: the unit of the spatial reference
+    messages: list[str]  #: messages for the user
+    name: str  #: the pipeline's file, or another name of its source
+    #: Created dimensions that LAS files get besides the input's own; None leaves it to the writer.
     beside: dict[str, str] | None = None
-    first: FirstRound | None = None  #: what is made of the points before any tile
-    #: What takes each tile's own points in place of the tail: called with their results, the outputs and the folder for
-    #: temporary files, it gives the record of what it wrote.
+    first: FirstRound | None = None  #: the first round, where there is one
+    #: Called with each tile's own results, the outputs and the temporary folder, in place of the tail; returns a record of
+    #: what was written.
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
-    #: Dimensions that our stages make and outputs hold, with PDAL's types: what a file without points gets, too.
+    #: Dimensions that our stages create and outputs hold, with PDAL's types; files without points get them, too.
     makes: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -79,7 +79,7 @@ class _Step:
     """One stage of the pipeline."""
 
     given: dict[str, Any]  #: an object with a type
-    where: str  #: its place, for messages
+    where: str  #: its line or number, for messages
     ours: Stage | None
 
     @property
@@ -96,16 +96,16 @@ class _Step:
         return self.ours is not None or self.type.removeprefix("filters.") not in _PER_POINT.split()
 
     def reach(self, buffer: float | None) -> float:
-        """Meters around a point in which others change its result."""
+        """Meters around a point within which others affect its result."""
         if self.ours is not None:
             return self.ours.halo_m()
         return float(buffer or 0.0) if self.sees_neighbors else 0.0
 
 
 def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
-    """Check that a pipeline can be run in tiles, and cut it; `buffer`: how far PDAL's filters look, meters.
+    """Check that a pipeline can be run in tiles, and plan it; `buffer`: how far PDAL's filters look, meters.
 
-    PipelineError or OptionError where tiles cannot give its result, with the reason and the cure.
+    PipelineError or OptionError, with the reason and the cure, where tiles cannot give its result.
     """
     source = pipeline.source
     ours = {expanded.number: expanded for expanded in pipeline.expanded.ours}
@@ -114,7 +114,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         made = ours.get(index)
         given = _object(stage, index, len(source.stages)) if made is None else dict(made.given)
         steps.append(_Step(given, source.where(index), None if made is None else made.stage))
-    _check_row(steps)
+    _check_linear(steps)
     readers, filters, writers = ([s for s in steps if s.rank == rank] for rank in (0, 1, 2))
     _check_ends(readers, filters, writers)
     end = max((n for n, step in enumerate(filters, 1) if step.sees_neighbors), default=0)
@@ -122,7 +122,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         _check_local(step, number < end, buffer)
     head, tail = filters[:end], filters[end:]
     reaches = [step.reach(buffer) for step in head]
-    sees_m = sum(reaches)  # _first_round makes some of them less
+    sees_m = sum(reaches)  # before _first_round reduces some
     first = _first_round(readers, head, reaches)
     later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
@@ -145,9 +145,9 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
 
 
 def readers_of(files: Sequence[str]) -> list[dict[str, Any]]:
-    """A reader for each kind of input, of all its files."""
+    """A reader for each kind of input, with all its files."""
     readers: list[dict[str, Any]] = []
-    # Of LAS 1.0-1.3 PDAL leaves extra dimensions out unless told.
+    # PDAL reads extra dimensions of LAS 1.0-1.3 only with this option.
     for kind, more in (("readers.las", {"use_eb_vlr": True}), ("readers.ept", {})):
         if names := [name for name in files if is_ept(name) == (kind == "readers.ept")]:
             readers.append({"type": kind, "filename": names, "tag": "input", **more})
@@ -160,7 +160,7 @@ def plan_of_files(
     overrides: Iterable[Override],
     buffer: float | None = None,
 ) -> tuple[TilePlan, PipelineSource]:
-    """The plan of stages after the readers of files; and the pipeline, of one input of each kind."""
+    """The plan of stages after readers of files; and the pipeline with one input of each kind."""
     readers = readers_of(files)
     heads = [{**reader, "filename": reader["filename"][0]} for reader in readers]
     pipeline = Pipeline([*heads, *stages], overrides, whole=False)
@@ -171,7 +171,7 @@ def plan_of_files(
 
 
 def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) -> FirstRound | None:
-    """Find the stage whose far-reaching raster is made before; it then needs no halo."""
+    """Find the far-reaching stage whose raster is computed first; it then needs no halo."""
     for at, step in enumerate(head):
         if isinstance(step.ours, HagMorphological):
             kept = _kept(readers, head[:at])
@@ -186,17 +186,17 @@ def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) 
 
 
 def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:
-    """The dimensions that stages change, where it is enough to keep these."""
+    """The dimensions that stages change, where saving these suffices."""
     if any(step.ours is None and step.type != "filters.merge" for step in before):
         return None  # which may drop points
     if before and any(step.type == "readers.ept" for step in readers):
-        return None  # whose points have no numbers
+        return None  # EPT points have no fixed numbers
     made = {name for step in before if step.ours is not None for name in step.ours.creates()}
     return sorted(made) if made <= {"Classification"} else None
 
 
 def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
-    """A stage as an object with a type; bare names become readers and the writer that PDAL would take."""
+    """A stage as an object with a type; bare names become the readers and writer that PDAL infers."""
     out = dict(stage) if isinstance(stage, dict) else {"filename": stage}
     if not out.get("type"):
         name, kind = str(out.get("filename", "")), "writer" if 0 < index == count - 1 else "reader"
@@ -209,8 +209,8 @@ def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
     return out
 
 
-def _check_row(steps: list[_Step]) -> None:
-    """Refuse pipelines that branch; in a row `inputs` say nothing new, so they are left out."""
+def _check_linear(steps: list[_Step]) -> None:
+    """Refuse pipelines that branch; in a linear one, `inputs` are redundant and removed."""
     readers = {str(step.given.get("tag")) for step in steps if step.rank == 0}
     for number, step in enumerate(steps):
         before = steps[number - 1] if number else None
@@ -259,7 +259,7 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
 
 
 def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
-    """Refuse stages that need all points at once, that look at neighbors no one knows how far away, or that move points."""
+    """Refuse stages that need all points at once, whose reach is unknown, or that move points."""
     instead = step.ours.instead_of_tiles if step.ours is not None else ""
     if instead or step.type.removeprefix("filters.") in _GLOBAL.split():
         raise PipelineError(
@@ -282,9 +282,9 @@ def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
 
 
 def _narrowed(step: _Step, later: float) -> dict[str, Any]:
-    """A stage of the head for a tile: absolute paths, and only points computed that someone will see.
+    """A stage of the head for a tile: with absolute paths, and limited to points whose results are used.
 
-    A shipped model keeps its name: on another host it lies elsewhere.
+    A shipped model keeps its name, as its path differs between hosts.
     """
     stage, ours = dict(step.given), step.ours
     if ours is not None:
@@ -299,13 +299,13 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
 
 
 def outputs_for(plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None) -> list[list[str]]:
-    """For every input, or every tile by its name, what each of the writers writes; StageError where it cannot be."""
+    """For every input, or every tile by name, the output of each writer; StageError where it cannot be written."""
     found = []
     for writer in plan.writers:
         name = os.path.abspath(writer["filename"])
         found.append(outputs_of(inputs, name) if tiles is None else named_outputs(name, tiles))
     kinds = [LAS if writes_las(writer) else "" for writer in plan.writers]
     every = [Output(path, "output", kind) for kind, paths in zip(kinds, found, strict=True) for path in paths]
-    # Other folders will be made: a dry run looks ahead.
+    # Missing folders will be created; a dry run checks the others.
     check_outputs([output for output in every if Path(output.path).parent.is_dir()], inputs)
     return [list(each) for each in zip(*found, strict=True)]

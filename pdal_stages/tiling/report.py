@@ -1,4 +1,4 @@
-"""Tiles and outputs of a run, and what became of them."""
+"""Tiles and outputs of a run, and their results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
 if TYPE_CHECKING:
     from .inputs import InputSource
 
-#: Most different warnings of tiles that a run repeats.
+#: Most distinct warnings of tiles that a run repeats.
 _MOST_MESSAGES = 20
 _CHANGED = (
     "it changed during the run, so outputs may hold results from before and after. Once it no longer changes, run "
@@ -25,40 +25,40 @@ _CHANGED = (
 
 @dataclass
 class Job:
-    """A tile to run, an output to put together from tiles, or what is made before them, and what became of it."""
+    """A task of a run and its state: a tile, an output to be assembled from tiles, or a task of the first round."""
 
-    name: str  #: under which it is kept in the work folder
-    points: int = 0  #: its own; 0 where not known before it is read
+    name: str  #: its key in the work folder
+    points: int = 0  #: its own; 0 where unknown before it is read
     tile: tuple[int, int] = (0, 0)  #: of a tile or block: column and row
     source: InputSource | None = None  #: the input that an output is of
-    #: what the writers write; None for a tile whose points go into outputs of files
+    #: files of the writers; None for a tile whose points go into outputs of input files
     outputs: list[str] | None = None
-    jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is put together from
-    mark: str = ""  #: fingerprint of all that decides its result
+    jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is assembled from
+    mark: str = ""  #: fingerprint of everything that affects its result
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
     state: str = "waiting"
-    #: What its task says of it, as it is kept in the work folder: counts, messages, outputs, cost, fingerprint.
+    #: The result of its task, as saved in the work folder: counts, messages, outputs, cost, fingerprint.
     record: dict[str, Any] = field(default_factory=dict)
     reason: str = ""  #: why it failed
-    blocked_by: str = ""  #: the unreadable input that it failed for, where that is the reason
+    blocked_by: str = ""  #: the unreadable input that is the reason, if any
 
     @property
     def is_output(self) -> bool:
-        """Whether it is an output that is put together from tiles."""
+        """Whether it is an output that is assembled from tiles."""
         return self.source is not None and self.outputs is not None
 
     def fail(self, reason: str, blocked_by: str = "") -> None:
-        """It cannot be done."""
+        """Mark it as failed."""
         self.state, self.reason, self.blocked_by = "failed", reason, blocked_by
 
     def fail_with(self, needed: Iterable[Job]) -> None:
-        """It cannot be done where any that it needs has failed."""
+        """Mark it as failed where any job that it needs has failed."""
         if reason := next((job.reason for job in needed if job.reason), ""):
             self.fail(reason)
 
 
 class InterruptedRun(KeyboardInterrupt):
-    """Ctrl-C in a tiled run; `run` says what it did until then."""
+    """Ctrl-C in a tiled run; `run` is what was done until then."""
 
     def __init__(self, run: TiledRun) -> None:
         super().__init__()
@@ -67,19 +67,19 @@ class InterruptedRun(KeyboardInterrupt):
 
 @dataclass
 class TiledRun:
-    """What a tiled run did."""
+    """The result of a tiled run."""
 
     tiles: list[Job]
     outputs: list[Job]  #: empty where each tile is an output
-    unreadable: dict[str, str]  #: inputs that could not be read, and why
-    changed: list[str]  #: files that changed while they were worked on
+    unreadable: dict[str, str]  #: unreadable inputs, and why
+    changed: list[str]  #: files that changed during the run
     messages: list[str]  #: what the user should know
     summary: dict[str, Any]  #: figures for people; see :meth:`to_dict`
-    objects: dict[str, Any] | None = None  #: those of the outputs: the files they are in, and counts by kind
+    objects: dict[str, Any] | None = None  #: objects of the outputs: their files, and counts by kind
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """What failed, and why: inputs with all that waits for them, then other tiles and outputs."""
+        """What failed, and why: inputs with the jobs that depend on them, then other tiles and outputs."""
         jobs = [(f"tile {job.name}", job) for job in self.tiles]
         jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
         return [
@@ -89,7 +89,7 @@ class TiledRun:
         ]
 
     def _blocked_by(self, path: str) -> str:
-        """What was not made because an input cannot be read, in words."""
+        """A remark on the jobs that depend on an unreadable input."""
         tiles, outputs = (sum(j.blocked_by == path for j in jobs) for jobs in (self.tiles, self.outputs))
         if not tiles and not outputs:
             return ""
@@ -148,16 +148,16 @@ def summarize(tiles: list[Job], cpu_seconds: float, seconds: float) -> dict[str,
 
 
 def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> list[str]:
-    """Warnings and notes of tiles, and of the rounds before them, once each, the most frequent first."""
+    """Warnings and notes of tiles and of the first round, once each, the most frequent first."""
     done = [job for job in tiles if job.state == "done"]
     found: Counter[str] = Counter()
     for lines in ([j.record.get("messages", []) for j in done if j.record.get("points")], before):
         for text, n in Counter(text for each in lines for text in set(each)).items():
             if not text.startswith((HOLDS_NOWHERE, TOUCH_NONE)):
                 found[text] += n
-            elif n == len(lines):  # that there is nothing to do in some tiles is as it should be
+            elif n == len(lines):  # that there is nothing to do in some tiles is normal
                 found[text] = max(found[text], n)
-    # What one stage says and several say, too.
+    # Messages of one stage that several stages report, too.
     for text in [text for text in found if text.partition(": ")[2] in found]:
         del found[text]
     told = [f"{text} ({counted(n, 'tile')})" for text, n in found.most_common(_MOST_MESSAGES)]

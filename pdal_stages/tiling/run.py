@@ -1,4 +1,4 @@
-"""A tiled run: inputs read once, what tiles need of the ground, tiles, outputs that are put together from them."""
+"""A tiled run: reading the inputs, the first round, tiles, and outputs that are assembled from them."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from .settings import TilingOptions, worker_bytes
 from .store import Store, fingerprint
 from .tile import RunContext, TileTask
 
-#: A run stops when so many tiles failed for one reason and none succeeded.
+#: A run stops when this many tiles failed for the same reason and none succeeded.
 _HOPELESS = 10
-#: Bytes that a run keeps of a point until its output is written; in the rounds before the tiles, and there of a cell.
+#: Bytes on disk for a point until its output is written; in the first round, for a point and for a raster cell.
 _KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 60, 33, 112
 
 
@@ -54,12 +54,12 @@ def run_tiled(
     Parameters
     ----------
     source : str, Path, list, dict or Pipeline
-        As for :class:`pdal_stages.Pipeline`, or one that was made already.
+        As for :class:`pdal_stages.Pipeline`, or such an object.
     tile : float or TilingOptions
         Side of the tiles, in the unit of the coordinates; or all options.
     overrides : iterable of Override
     dry_run : bool
-        Only find the tiles; nothing is read but headers, nothing written.
+        Only find the tiles: only headers are read, and nothing is written.
     progress : bool, optional
         Whether to show progress on stderr.
     **options
@@ -68,12 +68,12 @@ def run_tiled(
     Returns
     -------
     TiledRun
-        With the failures of tiles, which do not raise: look at :attr:`TiledRun.failures`.
+        Failures of tiles do not raise: see :attr:`TiledRun.failures`.
 
     Raises
     ------
     StageError
-        For what is wrong before any tile, or with every tile.
+        For errors before any tile, or in every tile.
     InterruptedRun
         A KeyboardInterrupt with what was done until then.
     """
@@ -92,9 +92,9 @@ def run_plan(
     finished: Callable[[Job], None] | None = None,
     source: PipelineSource | None = None,
 ) -> TiledRun:
-    """Run what was planned; see :func:`run_tiled`. `finished` hears of every output that was written.
+    """Run a plan; see :func:`run_tiled`. `finished` is called with every output that was written.
 
-    `source`: the pipeline as the user gave it, which is tried on an input first.
+    `source`: the user's pipeline, which is first validated on one input.
     """
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
@@ -132,7 +132,7 @@ def run_plan(
                     interrupted = False
         finally:
             for each in folders:
-                sweep(each)  # what workers left that were killed
+                sweep(each)  # left by workers that were killed
     summary = survey.figures(plan) | {"workers": workers.slots, "threads_per_worker": workers.threads}
     summary |= summarize(run.tiles, run.cpu_seconds, time.monotonic() - started)
     summary["peak_mb_of_a_worker"] = run.peak_mb
@@ -144,7 +144,7 @@ def run_plan(
 
 
 def _workers(options: TilingOptions, folder: str) -> Any:
-    """What does the tasks of a run, which keeps what it makes in `folder`."""
+    """The workers of a run whose working folder is `folder`."""
     if options.scheduler:
         from .cluster import Cluster
 
@@ -154,7 +154,7 @@ def _workers(options: TilingOptions, folder: str) -> Any:
 
 
 def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> None:
-    """Let PDAL prepare the pipeline on one input: stages that lack dimensions and unknown options fail before any tile."""
+    """Let PDAL prepare the pipeline on one input, so that missing dimensions and unknown options fail before any tile."""
     inputs = [s for s in survey.sources if s.path not in survey.unreadable and s.kind == "las"]
     if not inputs:
         return
@@ -166,24 +166,24 @@ def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> No
 
 
 class _Run:
-    """What a run has to do, and what it has done."""
+    """The state of a run: jobs that are to be done, and that are done."""
 
     def __init__(self, plan: TilePlan, survey: Survey, store: Store, workers: Any, show: bool | None) -> None:
         self.plan, self.survey, self.store, self.workers, self.show = plan, survey, store, workers, show
         self.tiles: list[Job] = []  #: with points of their own, row by row
         self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
-        self.cpu_seconds = 0.0  #: of tasks, tries that failed too
-        self.peak_mb = 0.0  #: the most memory that a process held
-        self.messages_before: list[list[str]] = []  #: warnings and notes of the rounds before the tiles
-        #: How far around a tile, in units of the coordinates, inputs are at hand: it may have to be read wider.
+        self.cpu_seconds = 0.0  #: of tasks, including failed ones
+        self.peak_mb = 0.0  #: peak memory of a process
+        self.messages_before: list[list[str]] = []  #: warnings and notes of the first round
+        #: How far around a tile, in units of the coordinates, inputs are available: its halo may have to grow.
         self.farthest = max(4 * survey.halo_units, survey.halo_units + survey.grid.size)
 
     def _do(
         self, what: str, waiting: deque[Job], task_of: Callable[[Job], Callable[[], Any]]
     ) -> Iterator[Job]:
-        """Do jobs as workers are free, note what is done, and yield each; outputs may be put in after every one.
+        """Run jobs as workers become free, save their records, and yield each; outputs may be added after every one.
 
-        StageError where the first ones all fail for one reason.
+        StageError where the first ones all fail for the same reason.
         """
         for job in waiting:
             self.store.forget(job.name)
@@ -206,7 +206,7 @@ class _Run:
                     progress.label = f"{what}, {done} of {len(counted)}{failed}"
                     progress.update(job.points)
                 if job.outputs:
-                    progress.clear()  # what is printed of it begins a line
+                    progress.clear()  # messages about it start on a new line
                 yield job
                 if not done and len(failures) >= _HOPELESS and len(set(failures)) == 1:
                     raise StageError(
@@ -217,9 +217,9 @@ class _Run:
     # ---- inputs ----------------------------------------------------------------------------------------------
 
     def read_inputs(self, needed: Collection[str] | None = None) -> None:
-        """Read LAS and LAZ files once, sort their points by place, and note where they lie.
+        """Read LAS and LAZ files once, sort their points by location, and save their index.
 
-        Those that an earlier run read are only read again where their points are `needed` (paths) and not there any more.
+        Files that an earlier run read are only read again where their points are `needed` (paths) and no longer there.
         """
         survey, store = self.survey, self.store
         waiting: deque[Job] = deque()
@@ -228,7 +228,7 @@ class _Run:
                 continue
             name = fingerprint(source.path, survey.stamps[source.path], survey.grid.size)
             copy = store.path(name, ".points")
-            # Where nothing was noted, or that is damaged, it is read again.
+            # Without a valid record it is read again.
             with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
                 index = CloudIndex.of(store.note(name), copy)
                 if os.path.exists(copy) or source.path not in (needed or ()):
@@ -243,7 +243,7 @@ class _Run:
         for job in self._do("reading the inputs", waiting, task_of):
             assert job.source is not None
             path = job.source.path
-            if f"the {TEMPORARY} file" in job.reason:  # for which the input is not to blame
+            if f"the {TEMPORARY} file" in job.reason:  # the input is not the cause
                 raise StageError(job.reason)
             if job.reason:
                 survey.unreadable[path] = job.reason
@@ -254,7 +254,7 @@ class _Run:
         survey.place()
 
     def inputs_of_waiting(self) -> set[str]:
-        """Inputs whose points tiles read that are to be run."""
+        """Inputs whose points are read by waiting tiles."""
         far = self.farthest
         if first := self.plan.first:
             far += (self.plan.sees_m + first.blocks.side + first.blocks.reach) / self.survey.unit
@@ -265,9 +265,9 @@ class _Run:
     # ---- tiles and outputs -----------------------------------------------------------------------------------
 
     def find_jobs(self) -> None:
-        """All tiles and outputs; those that unreadable inputs are part of fail.
+        """Find all tiles and outputs; those with unreadable inputs fail.
 
-        Their marks are of all that decides a result, every input that may be read for it too.
+        Their marks are fingerprints of everything that affects a result, including every input that may be read for it.
         """
         plan, survey, grid = self.plan, self.survey, self.survey.grid
         sees = plan.sees_m / survey.unit
@@ -300,7 +300,7 @@ class _Run:
             self.outputs.append(out)
 
     def take_over(self) -> None:
-        """Keep what an earlier run finished; tiles that no output waits for need not be done again."""
+        """Keep the results of an earlier run; tiles that no output needs are not run again."""
         needed = {job.name for out in self._unkept(self.outputs) for job in out.jobs}
         self._unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
         for job in self.tiles:
@@ -309,7 +309,7 @@ class _Run:
                 job.state, job.record = "kept", known if known.get("fingerprint") == job.mark else {}
 
     def _unkept(self, jobs: Iterable[Job]) -> deque[Job]:
-        """The waiting jobs but those that an earlier run did."""
+        """The waiting jobs that no earlier run has finished."""
         waiting = deque(job for job in jobs if job.state == "waiting")
         for job in waiting:
             if known := self.store.finished(job.name, job.mark):
@@ -317,16 +317,16 @@ class _Run:
         return deque(job for job in waiting if job.state == "waiting")
 
     def _context(self) -> RunContext:
-        """What all tiles have in common."""
+        """The context of all tiles."""
         survey, most = self.survey, self.survey.options.most_points
         if survey.density.points <= most:
-            most = 1 << 62  # a wider halo never holds more than all there is, however far they reach
+            most = 1 << 62  # all points fit, however wide the halo
         plan = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
         threads, scratch = self.workers.threads, str(self.store.scratch)
         return RunContext(plan, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
 
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
-        """Do all waiting tiles, and outputs as soon as the last of their tiles is there. `finished` hears of outputs."""
+        """Run all waiting tiles, and outputs as soon as their last tile is done. `finished` is called with outputs."""
         survey, store, context = self.survey, self.store, self._context()
         many = self.plan.first is not None and len(self.tiles) > 1
         before = partial(from_before, str(store.kept)) if many else None
@@ -355,24 +355,24 @@ class _Run:
                 _make_ready(out, waiting)
 
     def forget(self) -> None:
-        """Remove what nothing waits for any more."""
+        """Remove files that no job needs any more."""
         needed = {f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs}
         if any(job.state == "failed" for job in self.tiles):
             needed |= {path.name for path in self.store.kept.glob("*.[bf]*.npz")}  # blocks and first rounds
         self.store.remove(".npz", needed)
         self.store.remove(".points")
 
-    # ---- the rounds before the tiles ---------------------------------------------------------------------------
+    # ---- the first round, before the tiles ---------------------------------------------------------------------------
 
     def make_ground(self) -> None:
-        """Make what waiting tiles need, but what an earlier run left; what needs something that fails, fails too."""
+        """Make what waiting tiles need and an earlier run has not left; jobs that depend on failed ones fail, too."""
         first, survey, store = self.plan.first, self.survey, self.store
         if first is None or len(self.tiles) == 1:
             return
         unit, context = survey.unit, self._context()
         by_tile = {job.tile: job for job in self.tiles}
         places = {b for tile in by_tile for b in blocks_around(context, tile, first.blocks.spill)}
-        # Those of an earlier run with other inputs would be taken for blocks and tiles with points.
+        # Blocks and tiles left by an earlier run with other inputs must not be used.
         store.remove(".block.npz", [f"{block_name(block)}.npz" for block in places])
         store.remove(".first.npz", [f"{left_name(job.name)}.npz" for job in self.tiles])
         around = self.farthest * unit + first.blocks.around
@@ -421,7 +421,7 @@ class _Run:
 
 
 def _make_ready(out: Job, waiting: deque[Job]) -> None:
-    """Put an output to work when the last of its tiles is there."""
+    """Queue an output when its last tile is done."""
     if out.state != "waiting" or any(job.state == "waiting" for job in out.jobs):
         return
     failed = [job for job in out.jobs if job.state == "failed"]
@@ -435,7 +435,7 @@ def _make_ready(out: Job, waiting: deque[Job]) -> None:
 
 
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
-    """What a run would do: tiles, points, memory and disk, as the headers of the inputs tell (``--dry-run``)."""
+    """What a run would do: tiles, points, memory and disk, estimated from the headers of the inputs (``--dry-run``)."""
     grid, options, density = survey.grid, survey.options, survey.density
     tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
     if survey.per == "tile":

@@ -1,4 +1,4 @@
-"""Tiles: what the user asks for, what the memory allows, and the grid that they lie on."""
+"""Tiles: the user's options, the size that memory allows, and their grid."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from ..stages.hag_morphological import Blocks
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
-#: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is put
-#: together, and the `memory` option of our stages. See docs/large-areas.md.
+#: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is
+#: assembled, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, STAGES = 350 << 20, 285, 250, 512 << 20
-#: Of a cell of the raster of which a block is made before the tiles.
+#: Memory of a raster cell of a block in the first round.
 _CELL = 200
-#: Points of a larger file are put together in parts of so many, so that memory does not grow with the file.
+#: Larger output files are assembled in parts of this many points, so that memory does not grow with the file.
 MOST_AT_ONCE = 4_000_000
-#: Of the process that hands out the work.
+#: Memory of the main process.
 PARENT = 350 << 20
-#: Points of a tile at most where its size is chosen here: it is lost when it fails, and progress goes by tiles.
+#: Most points of a tile of automatic size: a failed tile is lost, and progress is counted in tiles.
 _MOST_OF_A_TILE = 3_000_000
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 800,000.
 _SIDES = [mantissa * 10**power for power in range(6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)]
 
 #: Most tiles of a run.
 MOST_TILES = 1_000_000
-#: Beyond it the number of a column or row is not exact.
+#: Larger column and row numbers are not exact.
 _FARTHEST = 2.0**52
 
 Box = tuple[float, float, float, float]
@@ -41,7 +41,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class TilingOptions:
-    """How a pipeline is run in tiles."""
+    """Options of a run in tiles."""
 
     #: side of a tile, in the unit of the coordinates; by default as large as the memory allows
     tile: float | None = None
@@ -52,10 +52,10 @@ class TilingOptions:
     per: str = "auto"
     #: meters of halo for PDAL filters that look at neighbors, beside what our stages ask for
     buffer: float | None = None
-    #: bytes that all processes here together may hold, of a run on a scheduler each worker; default: half of what is free
+    #: bytes for all local processes together, with a scheduler for each worker; default: half of the free memory
     memory: int | None = None
     resume: bool = False  #: keep what an earlier run finished
-    most_points: int = 5_000_000  #: a tile that has to look farther is read again with up to so many points
+    most_points: int = 5_000_000  #: most points of a tile that is read again with a wider halo
 
     def __post_init__(self) -> None:
         # 20 and 20.0 are one run
@@ -93,7 +93,7 @@ class TilingOptions:
 
 @dataclass(frozen=True)
 class Extent:
-    """What an input says of itself."""
+    """The extent of an input, according to its header."""
 
     count: int  #: points
     box: Box
@@ -101,16 +101,16 @@ class Extent:
 
 @dataclass(frozen=True)
 class Density:
-    """How many points the inputs have, and how close."""
+    """Number and density of the inputs' points."""
 
     points: int
     largest: int  #: points of the largest input
     area: float  #: square units of the coordinates, of the inputs' boxes
-    each: float  #: points a square unit, of the inputs that are dense among them
+    each: float  #: points per square unit, of the denser inputs
 
     @classmethod
     def of(cls, extents: Iterable[Extent]) -> Density:
-        """Of inputs, as their headers tell."""
+        """From the extents of inputs."""
         boxes = [(*one.box, one.count) for one in extents if one.count]
         x0, y0, x1, y1, count = np.array(boxes, np.float64).reshape(-1, 5).T
         with np.errstate(over="ignore"):  # of odd headers
@@ -132,25 +132,25 @@ class Density:
 
 
 def block_bytes(blocks: Blocks, area_m2: float) -> float:
-    """Memory that a block takes which is made before the tiles, of so many square meters of points at most."""
+    """Memory of a block of the first round, with at most `area_m2` of points."""
     return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / blocks.cell**2 * _CELL
 
 
 def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:
-    """Memory of a worker for tiles of so many points and outputs of so many; `block`: see :func:`block_bytes`."""
+    """Memory of a worker, from the points of a tile and of an output file; `block`: see :func:`block_bytes`."""
     of_file = min(largest_file, MOST_AT_ONCE) * FILE_POINT
     return BASE + max(points_read * TILE_POINT + STAGES, of_file, block)
 
 
 def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool:
-    """Whether a cloud can be worked on in one piece, which takes so many bytes a point."""
+    """Whether a cloud fits into memory in one piece, at `point` bytes for each point."""
     return BASE + STAGES + points * point <= (memory or free_memory() // 2)
 
 
 def settled(
     options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
 ) -> TilingOptions:
-    """The options with a side of tiles and a number of workers that the memory allows; OptionError where no tile fits."""
+    """The options with tile size and number of workers chosen to fit into memory; OptionError where no tile fits."""
     whole = options.memory or free_memory() // 2
     local = 0 if options.scheduler else options.local_workers
     fixed = options.workers is not None or local <= 1

@@ -1,4 +1,4 @@
-"""What a run keeps beside its outputs: a lock, arrays and notes of what is done, scratch space."""
+"""The working folder of a run beside its outputs: a lock, arrays and records of finished jobs, temporary files."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def fingerprint(*parts: Any) -> str:
 
 
 class Store:
-    """The folder of one run, locked while it is used; `outputs` is the folder beside whose files it is made."""
+    """The working folder of a run in the folder `outputs`, locked while in use."""
 
     def __init__(self, outputs: Path) -> None:
         self.folder = outputs / FOLDER
         self.kept = self.folder / "kept"
-        #: Of this very run: what workers still do for one that was killed finds its own gone.
+        #: Of this run only: workers left over from a killed run find theirs gone.
         self.scratch = self.folder / "scratch" / secrets.token_hex(4)
 
     def __enter__(self) -> Store:
@@ -44,7 +44,7 @@ class Store:
             for folder in (self.folder, self.kept, self.scratch.parent):
                 with contextlib.suppress(FileExistsError):
                     folder.mkdir()
-                # Nothing is written or removed where a link leads.
+                # Links are not followed.
                 if folder.is_symlink() or not folder.is_dir():
                     raise StageError(
                         "the run's own folder beside the outputs is a link or a file",
@@ -76,31 +76,31 @@ class Store:
 
     def __exit__(self, *exc: object) -> None:
         shutil.rmtree(self.scratch.parent, ignore_errors=True)
-        self._lock.close()  # the file stays, so that nobody locks a removed one
+        self._lock.close()  # the file stays, so that nobody locks a deleted one
 
     def clear(self) -> None:
-        """Forget all that earlier runs finished."""
+        """Remove the results of earlier runs."""
         old = self.scratch / "before"
-        self.kept.rename(old)  # whole, as a worker of a lost run may still write there
+        self.kept.rename(old)  # renamed first, as a leftover worker may still write there
         self.kept.mkdir()
         shutil.rmtree(old, ignore_errors=True)
 
     def path(self, name: str, ending: str = ".npz") -> str:
-        """A file of arrays, or of points, by its name."""
+        """The path of a file of arrays or points."""
         return str(self.kept / f"{name}{ending}")
 
     def finish(self, name: str, mark: str, record: Mapping[str, Any]) -> None:
-        """Note that something is done; `mark` is the fingerprint of all that decides it."""
+        """Save the record of a finished job; `mark` is the fingerprint of everything that affects it."""
         partial = self.kept / f"{name}.partial"
         partial.write_text(json.dumps({**record, "fingerprint": mark}))
         os.replace(partial, self._note(name))
 
     def forget(self, name: str) -> None:
-        """Something is to be done anew: what was noted of it must not be believed of a file made since."""
+        """Remove the record of a job that will be run again, so that it cannot match a newer file."""
         self._note(name).unlink(missing_ok=True)
 
     def note(self, name: str) -> dict[str, Any]:
-        """What was noted of something that is done, with its fingerprint; nothing where it is not."""
+        """The record of a finished job with its fingerprint; empty where there is none."""
         try:
             found = strict_json(self._note(name).read_bytes())
             return found if isinstance(found, dict) else {}
@@ -108,7 +108,7 @@ class Store:
             return {}
 
     def finished(self, name: str, mark: str) -> dict[str, Any] | None:
-        """What was noted, where `mark` is still the same and the files that were written are there unchanged."""
+        """The record of a job, where `mark` still matches and the files it wrote are unchanged."""
         found = self.note(name)
         with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
             files = found.get("outputs", [])
@@ -120,14 +120,14 @@ class Store:
         return self.kept / f"{name}.json"
 
     def remove(self, ending: str, but: Collection[str] = ()) -> None:
-        """Remove the files whose names end so, but some."""
+        """Remove the files with an ending, except those named in `but`."""
         for path in self.kept.glob(f"*{ending}"):
             if path.name not in but:
                 path.unlink(missing_ok=True)
 
 
 def written(outputs: Sequence[str | os.PathLike]) -> list[list[Any]]:
-    """What a record says of files just written: their names, sizes and times of change."""
+    """Names, sizes and times of files just written, for a record."""
     return [[str(path), s.st_size, s.st_mtime_ns] for path, s in ((p, os.stat(p)) for p in outputs)]
 
 
@@ -138,9 +138,9 @@ def save_arrays(path: str | Path, arrays: Mapping[str, NDArray]) -> None:
 
 
 def load_arrays(path: str | Path, only: Collection[str] | None = None, under: str = "") -> dict[str, NDArray]:
-    """The arrays of a file, or `only` some as far as they are there; those whose names begin with `under`, without that.
+    """The arrays of a file, or those named in `only`; with `under`, those with this prefix, without it.
 
-    A file that cannot be read is removed, so that a later run makes it anew.
+    A file that cannot be read is removed, so that a later run makes it again.
     """
     try:
         with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:

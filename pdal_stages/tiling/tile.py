@@ -1,4 +1,4 @@
-"""A tile: cut out with its halo, the head of the pipeline run on it, the tile's own results taken out and kept."""
+"""A tile: its points with a halo go through the head of the pipeline, and the results of its own points are saved."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from .plan import INPUT, OUTSIDE, ROW, TilePlan
 from .settings import Box, TileGrid, inside
 from .store import save_arrays, written
 
-#: How often a tile is read again with a wider halo.
+#: How many times a tile is read again with a wider halo.
 _WIDENINGS = 3
 _MARKS = (ROW, INPUT, OUTSIDE)
-#: The warning of `Points` in a tile: of the user's `where` with what was added for the tile, or of that alone.
+#: The warning of `Points` in a tile, about the user's `where` combined with the tile's own condition, or that alone.
 _NOWHERE = re.compile(rf"{HOLDS_NOWHERE} (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
 
 Changed = dict[str, tuple[NDArray[np.int64] | None, NDArray]]
@@ -52,19 +52,19 @@ class RunContext:
 
 
 class HeadRun(NamedTuple):
-    """What a run of the head gave."""
+    """The result of running the head."""
 
     results: list[PieceResults]
-    need: float = 0.0  #: the halo that it took, meters
+    need: float = 0.0  #: the halo that was needed, meters
     messages: Sequence[str] = ()  #: warnings and notes
     left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.report`
 
 
 class FromBefore(NamedTuple):
-    """What the rounds before the tiles made for a tile."""
+    """Results of the first round for a tile."""
 
     blocks: Any  #: for the far-reaching stage
-    changed: list[Changed]  #: of each piece: rows and new values of dimensions that the stages before it gave
+    changed: list[Changed]  #: for each piece: rows and new values of dimensions, from the stages before it
 
 
 def run_head(
@@ -75,7 +75,7 @@ def run_head(
     before: FromBefore | None = None,
     last: Function | None = None,
 ) -> HeadRun:
-    """Run the head once; `everything`: all inputs were read, so nothing can lie farther away; `last` sees its result."""
+    """Run the head once. `everything`: all points are read, so none lies farther away; `last` gets its result."""
     plan, first = context.plan, context.plan.first
     if not plan.head and last is None:
         return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts])
@@ -85,7 +85,7 @@ def run_head(
     new = [_marked(n, piece, context.unit, changed[n]) for n, piece in enumerate(cuts)]
     flags = [flags_in_classes(piece.path) for piece in cuts]
     needs = [0.0]
-    views: list[dict[str, NDArray]] = []  # of the tile's own points: far less than all arrays of all points
+    views: list[dict[str, NDArray]] = []  # of the tile's own points only, to save memory
 
     def reach(
         number: int, used_m: float, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
@@ -133,15 +133,15 @@ def run_head(
 
 
 def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
-    """What is said of a tile, in the same words of every tile, as a run says it once; nothing of files in `scratch`."""
+    """Messages of a tile, worded the same for every tile, as a run repeats them once; none about files in `scratch`."""
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
-        if text.startswith(scratch) or NO_REFERENCE in text:  # of a piece, as is said of the input
+        if text.startswith(scratch) or NO_REFERENCE in text:  # about a piece; the input has its own message
             continue
         if TOUCH_NONE in text:
             text = text[text.index(TOUCH_NONE) :]
         elif nowhere := _NOWHERE.search(text):
-            if nowhere[1] is None:  # the tile has no point of its own: nothing that the user asked for
+            if nowhere[1] is None:  # only the tile's own condition: not the user's
                 continue
             text = f"{HOLDS_NOWHERE} {nowhere[1]}"
         lines.append(text)
@@ -149,7 +149,7 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
 
 
 def _marked(number: int, piece: Piece, unit: float, changed: Changed) -> NewValues:
-    """What numbers a piece's points, and what the rounds before made of them."""
+    """New values that number a piece's points, and those of the first round."""
     count = len(piece.index)
     marks = {
         ROW: np.arange(count, dtype=np.uint32),
@@ -167,7 +167,7 @@ def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
 
 
 def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceResults]:
-    """Results of the tile's own points, sorted as their pieces are."""
+    """Results of the tile's own points, in the order of their pieces."""
     names = [name for view in views[:1] for name in view if name not in _MARKS]
     results = []
     for number, piece in enumerate(cuts):
@@ -192,20 +192,20 @@ def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceRe
 
 @dataclass(frozen=True)
 class TileTask:
-    """A tile to be worked on."""
+    """The task of a tile."""
 
     context: RunContext
     tile: tuple[int, int]
-    #: Inputs that may hold points of it or its halo; EPT sources have no index.
+    #: Inputs that may have points in it or its halo; EPT sources have no index.
     sources: list[tuple[InputSource, CloudIndex | None]]
-    complete: float  #: meters around the tile up to which these are all the inputs there are
-    result: str  #: file for the results, where outputs are put together from tiles
-    outputs: list[str] | None  #: otherwise: what each of the writers writes
-    #: What the rounds before made for a tile that is read with so many meters around it; None where there were none.
+    complete: float  #: meters around the tile within which these are all inputs
+    result: str  #: file for the results, where outputs are assembled from tiles
+    outputs: list[str] | None  #: otherwise: the files of the writers
+    #: Gives the first round's results for a tile read with so many meters around it; None where there was none.
     before: Callable[[RunContext, tuple[int, int], float, list[Piece]], FromBefore] | None
 
     def run(self) -> dict[str, Any]:
-        """Run the head; write its results, or the outputs. The record says which."""
+        """Run the head; save its results, or write the outputs; returns a record."""
         context = self.context
         with TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
             results, record = self._settled(folder)
@@ -216,7 +216,7 @@ class TileTask:
         return record | {"outputs": written([self.result])}
 
     def _settled(self, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
-        """Run the head with surroundings that suffice; results, and the record.
+        """Run the head with a sufficient halo; returns results and a record.
 
         It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that did not
         suffice (``short``).

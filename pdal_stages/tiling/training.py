@@ -1,4 +1,4 @@
-"""A survey trained on: in one piece where it fits into the memory, otherwise in tiles, and the model is the same."""
+"""Training on a survey: in one piece where it fits into memory, otherwise in tiles, with the same model."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from .run import run_plan
 from .settings import TilingOptions, fits_whole
 from .store import load_arrays, save_arrays, written
 
-#: Memory of a point that is trained on in one piece, voxels and samples' surroundings included.
+#: Memory of a point in training in one piece, with voxels and neighborhoods of samples.
 TRAIN_POINT = 400
-#: Of points that a person checked, and of others of which a base is sure: see :mod:`..stages.checked`.
+#: Arrays of points that a person checked, and of others that the base model is sure of: see :mod:`..stages.checked`.
 _WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
@@ -65,9 +65,9 @@ def _lowered(given: Mapping[str, Any]) -> ClassifierModel:
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
-    """Name -> files of each survey; `grouped` are ``NAME=PATTERN``, and each file that is like none is its own.
+    """Name -> files of each survey; `grouped` are ``NAME=PATTERN``, and any other file is a survey by itself.
 
-    OptionError where a group is not written so, or has no file, or a file is in two.
+    OptionError where a group is malformed or empty, or a file is in two.
     """
     out: dict[str, list[str]] = {}
     of: dict[str, str] = {}
@@ -99,20 +99,20 @@ def _like(file: str, pattern: str) -> bool:
 
 @dataclass(frozen=True)
 class TrainTask:
-    """What a model is trained on, and how."""
+    """Inputs and options of a training."""
 
     files: Sequence[str]  #: labeled inputs
     model: str  #: the file to write
     overrides: Sequence[Override] = ()
     given: Mapping[str, Any] = field(default_factory=dict)  #: options of ``writers.classifiermodel``
     options: TilingOptions = field(default_factory=TilingOptions)
-    #: the files of each survey, where these do not see each other
+    #: the files of each survey, whose points are not neighbors of each other's
     surveys: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    survey: str = ""  #: of which survey all files are
+    survey: str = ""  #: the survey of all files
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
-        """As it stands in a pipeline; of several files the score is by file, unless told otherwise."""
+        """The training stage as in a pipeline; several files are scored by file, unless specified otherwise."""
         files = list(self.files)
         writer = {"type": ClassifierModel.type, "filename": self.model, "files": files, **self.given}
         writer = overridden(writer, self.overrides)
@@ -128,17 +128,17 @@ class TrainTask:
         return writer
 
     def _each(self) -> list[TrainTask]:
-        """The same for each survey; this one where there are none."""
+        """A task for each survey; this one where there are none."""
         named = self.surveys.items()
         return [replace(self, files=files, surveys={}, survey=name) for name, files in named] or [self]
 
     def _points(self) -> int:
-        """How many points the files have, as their headers tell."""
+        """The number of points of the files, from their headers."""
         return sum(read_extent(source).count for source in find_sources(readers_of(self.files)))
 
     @cached_property
     def stage(self) -> ClassifierModel:
-        """What trains."""
+        """The stage that trains."""
         return _lowered(self._writer)
 
     def in_one_piece(self) -> bool:
@@ -157,7 +157,7 @@ class TrainTask:
             return True  # said when it is read
 
     def run(self) -> list[str]:
-        """Train and write the model; what is to be told."""
+        """Train and write the model; returns messages."""
         stage = self.stage
         base = stage.training.base
         made_by = preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
@@ -172,7 +172,7 @@ class TrainTask:
         return [*told, *report.messages]
 
     def _read(self, heights: Sequence[Mapping[str, Any]], stage: ClassifierModel) -> Points:
-        """The points with heights, and with the files' numbers where they are held out by these."""
+        """The points with heights, and with file numbers where these are the groups of the score."""
         readers = [reader_of(file, f"input{i}") for i, file in enumerate(self.files, 1)]
         told = check_readers(readers)
         number = python_filter("pdal_stages_file_number", _NUMBER, {}, {FILE_NUMBER: "uint32_t"})
@@ -188,7 +188,7 @@ class TrainTask:
         return points
 
     def _whole(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
-        """Trained on all points of a survey at once, one survey after the other."""
+        """Train on all points of a survey at once, one survey after the other."""
         each = self._each()
         training: Any = None
 
@@ -233,7 +233,7 @@ class TrainTask:
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
     ) -> tuple[Report, list[TiledCloud], list[str]]:
-        """What is to be known of the points; these, with heights, as clouds in parts; and the dimensions to train on."""
+        """A report; the points with heights, as tiled clouds; and the dimensions to train on."""
         tiles = folder / "tiles"
         tiles.mkdir()
         tail = {"type": "writers.null", "filename": str(tiles / "#.npz")}
@@ -296,7 +296,7 @@ def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCl
 
 @dataclass(frozen=True)
 class Taking:
-    """Writes a tile's own points as they are trained on, in place of a pipeline's writers."""
+    """Saves a tile's own points for training, in place of a pipeline's writers."""
 
     writer: Mapping[str, Any]  #: the stage that trains
     numbers: Mapping[str, int]  #: of inputs by path, where points are to have the number of theirs
