@@ -1,4 +1,4 @@
-"""How well classes agree with a reference: measures, confidence, text."""
+"""Agreement of classes with a reference: measures, confidence, text."""
 
 from .measures import Accuracy
 

@@ -1,4 +1,4 @@
-"""How well a per-point confidence tells right from wrong: reliability curve, error against margin.
+"""How well a per-point confidence separates right from wrong: reliability curve, error against margin.
 
 A :class:`Grading` is a histogram of a confidence in [0, 1] with the share of right points in each
 bin. Histograms add, so tiles graded one by one give the figures of the whole.
@@ -110,7 +110,7 @@ class Grading:
     def separation(self) -> float | None:
         """Area under the ROC curve: the chance that a right point is more confident than a wrong one.
 
-        0.5 tells nothing, 1 marks every error; None where all points are right or all are wrong.
+        0.5 means no information, 1 that every error is marked; None where all points are right or all are wrong.
         """
         wrong = (self.count - self.right).astype(np.float64)
         right = self.right.astype(np.float64)

@@ -1,6 +1,6 @@
-"""Where points are expected wrong, by the sum of 1 - Reliability: cells of an absolute grid, joined to patches to look at.
+"""Where errors are expected, by the sum of 1 - Reliability: cells of an absolute grid, joined to patches to check.
 
-Cells are joined by adding, so files are read one after the other, in parts, in any order. On surveys that a model had not
+Cells add up, so files can be read one after the other, in parts, in any order. On surveys that a model had not
 seen this finds 14 to 81 % of the wrong points in a tenth of the area.
 """
 
@@ -24,7 +24,7 @@ _PARTS = 1 << 16
 HOT = 0.1
 #: Patches end at the borders of blocks of this side, meters.
 BLOCK = 64.0
-#: Seconds until a person sees a patch, and that he looks at 100 square meters.
+#: Seconds to go to a patch, and to check 100 square meters.
 GETTING_THERE, LOOKING = 5.0, 2.5
 
 
@@ -110,9 +110,9 @@ class Patches:
 
 
 def find_patches(cells: ReviewCells) -> Patches:
-    """The patches of all cells, in the order in which a person finds most wrong points per minute.
+    """The patches of all cells, ordered by expected errors per minute of checking.
 
-    What is hot in a block is seen at a glance, so it is one patch, and the rest another.
+    The hot cells of a block are seen at a glance, so they are one patch, and the rest another.
     """
     total = cells.errors.sum(axis=1)
     hot = (total > 0) & (total >= np.quantile(total, 1.0 - HOT)) if len(total) else np.zeros(0, bool)

@@ -64,7 +64,7 @@ class Accuracy:
     names: Mapping[int, str] = field(default_factory=dict)
     #: reference points that were not compared, by their reference class before any merge
     left_out: Mapping[int, int] = field(default_factory=dict)
-    reliability: Grading | None = None  #: how well it tells right from wrong
+    reliability: Grading | None = None  #: how well it separates right from wrong
     margin: Grading | None = None
     #: classes that were taken as another one on both sides
     merged: Mapping[int, int] = field(default_factory=dict)

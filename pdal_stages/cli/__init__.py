@@ -1,4 +1,4 @@
-"""The command ``pdal-stages``, with PDAL's own flag habits; a module for each group of commands."""
+"""The command ``pdal-stages``, with flags like PDAL's; a module for each group of commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..base.messages import LoggedStream, PlainStream, RunLog, print_messages
 from ..base.version import __version__
 from .watcher import watched
 
-#: Modules and their commands, which are imported for these alone; for ``commands`` all are.
+#: Modules and their commands. Only the module of the command is imported, or all for ``commands``.
 _COMMANDS = {
     "tiles": ("classify",),
     "files": ("objects", "review", "corrections"),
@@ -40,14 +40,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = [word for word in arguments if word != "--debug"]
     ended = watched(arguments) if argv is None else lambda: None
     if argv is None:
-        # Those threads spin while they wait, for next to nothing.
+        # OpenBLAS's threads spin while waiting and gain almost nothing.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        gc.set_threshold(300_000)  # imports alone make more objects than Python looks through, over and over
-        atexit.register(gc.freeze)  # nor need it look for what to free when the process ends
+        gc.set_threshold(300_000)  # imports alone create so many objects that Python collects over and over
+        atexit.register(gc.freeze)  # nor is there anything to collect when the process ends
     streams = sys.stdout, sys.stderr
-    for stream in streams:  # a locale that lacks a character shows its code, rather than ending the run
+    for stream in streams:  # characters that the locale lacks are escaped, rather than ending the run
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
-            # Line by line, so that what is told and what is found stand in their order in a file as well.
+            # Line by line, so that messages and results keep their order in a file as well.
             stream.reconfigure(errors="backslashreplace", line_buffering=True)  # type: ignore[union-attr]
     sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
     log: RunLog | None = None
@@ -86,8 +86,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
-    """The command, its arguments, and the stages' options among them; leaves the program where usage is wrong."""
-    # Imported here, so that an environment that lacks something is told in a sentence.
+    """The command, its arguments, and options of stages among them; exits where usage is wrong."""
+    # Imported here, so that a missing package is reported in one sentence.
     from ..pipeline.read import parse_overrides
 
     overrides, rest = parse_overrides(arguments)
@@ -147,7 +147,7 @@ def _unforeseen(error: Exception) -> StageError:
 
 
 class _OneScreen(argparse.HelpFormatter):
-    """Usage shows only what must be given, and ``--[no-]flag`` stands for both ways of a switch."""
+    """Usage shows only required arguments, and ``--[no-]flag`` for both ways of a switch."""
 
     def _format_usage(self, usage, actions, groups, prefix):
         needed = [one for one in actions if one.required or not one.option_strings]
@@ -160,7 +160,7 @@ class _OneScreen(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """Says which of the choices may have been meant, adds commands, and keeps their help to one screen."""
+    """Suggests similar choices, adds commands, and keeps their help to one screen."""
 
     #: Arguments that only ``--help-all`` shows.
     rare: Sequence[str] = ()
@@ -185,7 +185,7 @@ class Parser(argparse.ArgumentParser):
 
     @property
     def commands(self) -> dict[str, Parser]:
-        """The commands that are there."""
+        """The commands by name."""
         if self._subparsers is None:
             self.add_subparsers(prog=self.prog, dest="command", required=True, metavar="COMMAND")
         return self._subparsers._group_actions[0].choices  # type: ignore
@@ -199,7 +199,7 @@ class Parser(argparse.ArgumentParser):
         logged: bool = False,
         rare: Sequence[str] = (),
     ) -> Callable:
-        """Add a command; returns what adds its arguments. `logged`: it works long enough for a log and progress."""
+        """Add a command; returns a function that adds its arguments. `logged`: it has a log and progress."""
         assert self.commands is not None
         made = self._subparsers._group_actions[0].add_parser(  # type: ignore
             name, help=help, description=f"{help}.", epilog=OVERRIDES if overrides else None
@@ -214,7 +214,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def takes_options(takes: Callable, stage: str, *names: str) -> None:
-    """Add flags for options of a stage, in the words that these are declared in."""
+    """Add flags for options of a stage, with their declared help."""
     from ..stages.base import stage_type
 
     kinds = {"integer": int, "number": float}

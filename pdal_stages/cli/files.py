@@ -1,4 +1,4 @@
-"""What follows classes: objects, what to review, and what was corrected."""
+"""Commands after classification: objects, review and corrections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What there is on this machine: stages, commands, PDAL's own stages of ours, a first example."""
+"""Commands about the installation: stages, options, the plugin for PDAL, a first example."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from ..base.errors import DependencyError, PipelineError, suggest
 from . import Parser
 
-#: Of what ``commands`` says as JSON: changes where a reader must.
+#: Version of the JSON of ``commands``, for its readers.
 _FORMAT = 1
 _TYPES = {int: "integer", float: "number"}
 
@@ -62,7 +62,7 @@ def _drivers(options: argparse.Namespace) -> None:
     ours = {name: stage.summary for name, stage in stage_types().items()}
     if options.showjson:
         listed = [{"name": n, "description": text, "link": "", "extensions": []} for n, text in ours.items()]
-        if not options.ours:  # where our plugin is built, PDAL names ours too
+        if not options.ours:  # with our plugin, PDAL lists ours as well
             theirs = json.loads(ask_program("--drivers", "--showjson"))
             listed += [entry for entry in theirs if entry["name"] not in ours]
         print(json.dumps(listed, indent=2))
@@ -76,7 +76,7 @@ def _drivers(options: argparse.Namespace) -> None:
 
 
 def _options(options: argparse.Namespace) -> None:
-    """The options of a stage, of ours or of PDAL's, in PDAL's form."""
+    """The options of one of our stages or of PDAL's, in PDAL's form."""
     from ..pipeline.pdal import ask_program
     from ..stages.base import stage_type, stage_types
 
@@ -123,7 +123,7 @@ def _commands(parser: Parser, options: argparse.Namespace) -> None:
 
 
 def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
-    """What commands and stages take, models and classes, as JSON, for programs that make dialogs of it (the QGIS plugin).
+    """Arguments of commands and stages, models and classes, as JSON, for programs that build dialogs (the QGIS plugin).
 
     An argument has ``name``, ``flag`` (empty for one without), ``kind`` (``number``, ``integer``, ``boolean``, ``string``),
     ``help``, ``default``, ``choices``, ``required``, ``many`` (takes several, or may be repeated) and ``value`` (what usage
@@ -219,7 +219,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    """What the demo, the default heights, training and classification use, on a few points of no meaning."""
+    """Run the kernels of the demo, the default heights, training and classification on a few meaningless points."""
     import numpy as np
 
     from ..classifier.clouds import TrainingCloud
@@ -229,7 +229,7 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..terrain import detached_noise, filtered_ground, hag_minima
 
     make_town(20.0, 1.0, threads=1, progress=False)
-    # A deck over a valley, with land at both of its ends: what is asked of decks is asked only where one may be.
+    # A deck over a valley, with land at both ends, so that the kernels for decks run as well.
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
     z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))
     filtered_ground(x, y, z, openings=(5,), decks=True, threads=1)

@@ -1,4 +1,4 @@
-"""Models: train them, judge and describe them."""
+"""Commands about models: train, adapt, score and describe them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run a pipeline, check it, or print it as PDAL runs it."""
+"""Commands about pipelines: run, check, or expand one for PDAL."""
 
 from __future__ import annotations
 

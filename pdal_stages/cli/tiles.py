@@ -1,4 +1,4 @@
-"""``classify``; the flags of runs in tiles, of other commands too, and what these print."""
+"""The command ``classify``; flags and output of runs in tiles, also for other commands."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 #: Failures printed, and tiles of a dry run.
 _MOST_FAILURES, _MOST_TILES = 20, 50
-#: Flags of tiles and what they are where nothing is said.
+#: Flags of tiles and their defaults.
 _DEFAULTS: dict[str, Any] = {
     "memory": None, "workers": None, "scheduler": "", "per": "auto", "buffer": None, "resume": False, "dry_run": False,
     "report": [],
@@ -187,7 +187,7 @@ def add_sizes(
     command: argparse.ArgumentParser,
     what: str = "Points that do not fit in memory are read in tiles, which give the same model.",
 ) -> Callable:
-    """Add the flags of ``train``, whose only output is a model; returns what adds more."""
+    """Add the flags of ``train``, whose only output is a model; returns a function that adds more."""
     takes = command.add_argument_group("large areas", what).add_argument
     takes("--tile", type=_side, metavar="SIZE", help="Side of the tiles in the cloud's unit, or auto")
     takes("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
@@ -203,7 +203,7 @@ def _side(text: str) -> float | str:
 
 
 def options_of(options: argparse.Namespace) -> TilingOptions:
-    """What the flags say."""
+    """The options from the flags."""
     names = {field.name for field in fields(TilingOptions)}
     chosen = {name: value for name, value in vars(options).items() if name in names}
     chosen["tile"] = None if options.tile == "auto" else options.tile
@@ -212,7 +212,7 @@ def options_of(options: argparse.Namespace) -> TilingOptions:
 
 
 def wants_tiles(options: argparse.Namespace) -> bool:
-    """Whether ``pipeline`` is asked for a run in tiles; other flags of tiles mean nothing without it."""
+    """Whether ``pipeline`` is to run in tiles; other flags of tiles are refused without it."""
     if options.tile is None:
         for name, default in _DEFAULTS.items():
             if getattr(options, name) != default:
@@ -224,7 +224,7 @@ def wants_tiles(options: argparse.Namespace) -> bool:
 
 
 def ran(go: Callable[[], TiledRun]) -> tuple[TiledRun, bool]:
-    """What a run did, and whether it was interrupted."""
+    """The result of a run, and whether it was interrupted."""
     with interruptible():
         try:
             return go(), False
@@ -234,7 +234,7 @@ def ran(go: Callable[[], TiledRun]) -> tuple[TiledRun, bool]:
 
 @contextmanager
 def interruptible():
-    """A run stopped by a service manager or batch system cleans up like one stopped by Ctrl-C."""
+    """Make SIGTERM, as sent by service managers and batch systems, clean up like Ctrl-C."""
     before = None
     with suppress(ValueError):  # not in the main thread
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -246,7 +246,7 @@ def interruptible():
 
 
 def end_at_once(options: argparse.Namespace) -> None:
-    """Ctrl-C ends the program although PDAL works: Python cannot handle signals meanwhile. The next run sweeps up."""
+    """Let Ctrl-C end the program while PDAL works, when Python cannot handle signals. The next run cleans up."""
     if options.is_program and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
@@ -263,7 +263,7 @@ def beside(options: argparse.Namespace) -> list[Output]:
 
 
 def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
-    """Write reports; the exit code. `again`: of an interrupted run, how to go on."""
+    """Write reports; returns the exit code. `again`: how to continue an interrupted run."""
     told = run.to_dict()
     for name in filter(None, [options.metadata, *options.report]):
         if name in options.report and Path(name).suffix.lower() != ".json":
@@ -291,7 +291,7 @@ def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
 def print_classes(
     classes: Mapping[str, int], left_alone: Mapping[str, int], names: Mapping[int, str]
 ) -> None:
-    """The points of each class in all files together, and of those that got none."""
+    """Print the points of each class in all files together, and those without a class."""
     for code, points in sorted((int(code), points) for code, points in classes.items()):
         print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
     for key, what in LEFT_ALONE.items():
@@ -300,7 +300,7 @@ def print_classes(
 
 
 def print_run(run: TiledRun) -> None:
-    """What a run did."""
+    """Print the result of a run."""
     s = run.summary
     lines = []
     if run.outputs:
@@ -330,7 +330,7 @@ def _print_failures(run: TiledRun) -> None:
 
 
 def print_dry(run: TiledRun) -> None:
-    """What a run would do."""
+    """Print what a run would do."""
     s = run.summary
     workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
     print(f"{counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it")

@@ -1,1 +1,1 @@
-"""Our stages as PDAL's own, for all that runs PDAL: what ``stage.cpp`` is compiled with, and what it calls."""
+"""Our stages as native PDAL plugins: the build of ``stage.cpp``, and the Python code that it calls."""

@@ -1,8 +1,8 @@
-"""The answers to the two questions that ``stage.cpp`` asks through ``filters.python``.
+"""The Python side of ``stage.cpp``, which calls it through ``filters.python`` in two steps.
 
-`prepare` is asked before any point is read: what is wrong with the options comes up here, and which dimensions they ask
-for. `run` does the work on one point view. An answer is metadata of the script, a list of named texts; a failure is the
-one named ``pdal_stages_error``, which the plugin throws as PDAL's own error. No exception leaves this module.
+`prepare` is called before any point is read: it checks the options and returns the dimensions they create. `run` processes
+one point view. Answers are metadata of the script, a list of named texts; a failure is named ``pdal_stages_error``, which
+the plugin throws as a PDAL error. No exception leaves this module.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from . import declarations
 
 
 def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Answer one question; True, whatever happened.
+    """Answer one call; always True.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
 
 
 def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
-    """The stage of a question, and what its user should know of the stages before it."""
+    """The stage of a call, and a warning about the stages before it."""
     kind = stage_type(question["stage"])
     if (question["version"], question["digest"]) != (__version__, declarations.digest(kind)):
         raise StageError(
@@ -62,7 +62,7 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
             cure="Build it again: pdal-stages plugin --install",
         )
     given: dict[str, str] = {}
-    for name, value in question["options"]:  # of a list as often as it has items
+    for name, value in question["options"]:  # lists come as several values
         given[name] = f"{given[name]},{value}" if name in given else value
     before = _stages(question["pipeline"])[:-1]
     options = {**kind.from_pipeline(given, before), **given}
@@ -85,12 +85,12 @@ def _own(stage: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
-    """What a stage before makes, as far as it matters: of ours, what it says; of PDAL's, heights."""
+    """The dimensions that an earlier stage creates; of PDAL's stages, only heights."""
     if stage.get("type") not in stage_types():
         return expansion.heights_of(stage)
     try:
         return stage_type(stage["type"])(_own(stage)).creates()
-    except StageError:  # its own preparation has said so
+    except StageError:  # reported by its own preparation
         return {}
 
 

@@ -1,4 +1,4 @@
-"""The plugin compiled for the PDAL at hand, put where PDAL looks, checked, and taken away again."""
+"""Compile the plugin for the installed PDAL, install it where PDAL looks, check and uninstall it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SOURCE = Path(__file__).with_name("stage.cpp")
 #: Suffix of a shared library, by which PDAL knows its plugins.
 SUFFIX = ".dylib" if sys.platform == "darwin" else ".so"
 _PYTHON_FILTER = f"libpdal_plugin_filter_python{SUFFIX}"
-#: A function of PDAL's library, in every version: its address tells which file the library is.
+#: A function of PDAL's library in every version, whose address gives the library's file.
 _OF_PDAL = "_ZN4pdal12StageFactoryC1Eb"
 _STILL_WORK = "pdal-stages pipeline and pdal-stages expand still work"
 
@@ -37,21 +37,21 @@ def libraries() -> list[str]:
 
 
 def usual_folder() -> Path:
-    """Where PDAL looks and the plugin is already; otherwise the folder of ``filters.python``."""
+    """The folder in PDAL's path that has the plugin; otherwise the folder of ``filters.python``."""
     named = [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
     there = (path for path in named if any((path / name).is_file() for name in libraries()))
     return next(there, None) or plugin_folder()
 
 
 def install(folder: Path | None = None) -> list[Path]:
-    """Compile the plugin and put it into a folder, by default beside ``filters.python``; the files.
+    """Compile the plugin and install it into a folder, by default beside ``filters.python``; returns the files.
 
-    A `folder` that is not there yet is made.
+    A missing `folder` is created.
     """
     target = folder or usual_folder()
     found, cxx = pdal(), compiler()
     if folder is not None:
-        with contextlib.suppress(OSError):  # told below
+        with contextlib.suppress(OSError):  # reported below
             folder.mkdir(parents=True, exist_ok=True)
     if not target.is_dir() or not os.access(target, os.W_OK):
         raise StageError(
@@ -74,7 +74,7 @@ def install(folder: Path | None = None) -> list[Path]:
 
 
 def uninstall(folder: Path | None = None) -> list[Path]:
-    """Take the plugin away; the files that were there."""
+    """Remove the plugin; returns the removed files."""
     target = folder or usual_folder()
     gone = [target / name for name in libraries() if (target / name).is_file()]
     for path in gone:
@@ -86,7 +86,7 @@ def uninstall(folder: Path | None = None) -> list[Path]:
 
 
 def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
-    """What is there, and what is missing, each with its cure. A plugin of other options says so when it is run."""
+    """What is installed, and what is missing with its cure. An outdated plugin is reported when it runs."""
     good: list[str] = []
     bad: list[str] = []
     looks = (
@@ -198,7 +198,7 @@ def _library_folder() -> Path:
 
 
 def _headers_version(headers: Path) -> str:
-    """The version that PDAL's headers say, empty where they do not."""
+    """The version in PDAL's headers; empty where there is none."""
     for name in ("pdal_features.hpp", "pdal_config.hpp"):
         path = headers / "pdal" / name
         text = path.read_text(errors="replace") if path.is_file() else ""

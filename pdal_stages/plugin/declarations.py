@@ -1,4 +1,4 @@
-"""The stages' declarations as the C++ header that the plugin is compiled with."""
+"""The declarations of our stages as a C++ header for the plugin."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..base.version import __version__
 from ..stages.base import Stage, stage_types
 from ..stages.options import Option
 
-#: Kind of option -> how PDAL's parser takes it; all else as text, which Python parses.
+#: Kind of option -> its type for PDAL's parser; others are text, which Python parses.
 _KINDS = {
     "number": "Number",
     "integer": "Integer",

@@ -1,4 +1,4 @@
-"""``pdal-stages doctor``: what is there on this machine, and the cure for what is not."""
+"""``pdal-stages doctor``: what is installed, and how to get what is missing."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ..pipeline import pdal as pdal_env
 from ..pipeline import runtime
 from . import building
 
-#: Extra -> the package that it brings, and what for.
+#: Extra -> the package that it installs, and its purpose.
 _EXTRAS = {
     "dask": ("distributed", "tiles on several hosts"),
     "deep": ("torch", "the neural network"),
     "table": ("pandas", "tables as data frames"),
     "vector": ("pyogrio", "objects as vector files, and polygons of a map"),
 }
-#: What a job needs beside the cloud itself; less is told.
+#: Memory that a job needs besides the cloud; less is reported.
 _LITTLE_MEMORY = 2 * 2**30
 _SCRIPT = """
 def stage(ins, outs):
@@ -46,7 +46,7 @@ def stage(ins, outs):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the answer."""
+    """One line of the result."""
 
     what: str
     found: str
@@ -59,7 +59,7 @@ class Finding:
 
 
 def examine() -> Iterator[Finding]:
-    """Everything, one after the other; each looks by itself, so that one fault does not hide the next."""
+    """All findings. Each check is independent, so that one fault does not hide the next."""
     for look in (_package, _bindings, _program, _plugin, _machine, _extras):
         try:
             yield from look()
@@ -99,7 +99,7 @@ def _run_program(stages: list) -> None:
 
 
 def _python_of(what: str, run: Callable[[list], object]) -> Finding:
-    """Which Python PDAL runs, and whether our package is there."""
+    """Which Python PDAL runs, and whether it has our package."""
     point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": "([1, 2], [1, 2], [1, 2])"}
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer")

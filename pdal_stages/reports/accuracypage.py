@@ -20,15 +20,15 @@ from ..base.las import class_color
 from .page import render
 from .views import IGNORED, RIGHT, WRONG, embedded, nice_step, paint, shading, surface, verdict
 
-#: Files within so many meters share a map, and places that are drawn at most.
+#: Files within so many meters share a map; most places that are drawn.
 TOGETHER, DRAWN = 1000.0, 12
-#: Most pixels across a map and in all of it.
+#: Most pixels across a map, and in total.
 MAP_WIDTH, MAP_PIXELS = 820, 800_000
 
 
 @dataclass(frozen=True)
 class Place:
-    """Points of a file, or of several that lie together, with both classifications as they were before any merge."""
+    """Points of a file, or of several close together, with both classifications before any merge."""
 
     name: str
     xyz: npt.NDArray[np.float64]
@@ -37,7 +37,7 @@ class Place:
 
 
 def places(files: Sequence[Place], systems: Sequence[str] = ()) -> list[Place]:
-    """Files that lie within :data:`TOGETHER` of one another, in one reference system, joined: a map of each."""
+    """Join files within :data:`TOGETHER` of one another in the same reference system, for one map each."""
     from scipy.sparse.csgraph import connected_components
 
     there = [k for k, one in enumerate(files) if len(one.xyz)]
@@ -122,7 +122,7 @@ def write_accuracy_report(
 
 
 def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, Any]:
-    """Maps of reference, prediction and errors for the template; none where the points lie on one spot or in a line."""
+    """Maps of reference, prediction and errors for the template; none where the points lie at one place or in a line."""
     points = np.asarray(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise StageError("'xyz' must be n x 3", where="accuracy report", found=f"shape {points.shape}")

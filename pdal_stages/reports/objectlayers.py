@@ -161,7 +161,7 @@ def object_frames(
 
 
 def check_target(path: str | Path, layers: Sequence[str] = LAYERS) -> None:
-    """Refuse a name with another ending, and what cannot be written; `layers`: their names."""
+    """Refuse a name with another ending, and files that cannot be written; `layers`: their names."""
     if Path(path).suffix.lower() not in DRIVERS:
         raise StageError(
             "objects are written to a vector file",
@@ -188,10 +188,10 @@ def target_files(path: str | Path, layers: Sequence[str] = LAYERS) -> list[Path]
 def write_layers(
     path: str | Path, layers: dict[str, Layer], wkt: str = "", styles: Mapping[str, str] | None = None
 ) -> list[Path]:
-    """Write layers; the files that were written, all or none.
+    """Write layers, all or none; returns the files.
 
     A GeoPackage holds all of them, with styles for QGIS; other formats get a file for each layer, named after it, with a
-    style beside it. A layer without objects is written too: what an earlier run found is not left there. `styles` are by
+    style beside it. Layers without objects are written as well, so that no older ones remain. `styles` are by
     layer; by default those of objects.
     """
     check_target(path, list(layers))
@@ -213,14 +213,14 @@ def write_layers(
 def write_objects(
     path: str, objects: Objects, straight: bool, units: Units | None, wkt: str
 ) -> dict[str, Any]:
-    """Write all layers; how many objects each has, and the ``files``."""
+    """Write all layers; returns the number of objects of each, and the ``files``."""
     layers = object_layers(objects, straight=straight, units=units)
     files = write_layers(path, layers, wkt)
     return {**{name: len(layer.shapes) for name, layer in layers.items()}, "files": [str(f) for f in files]}
 
 
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
-    """Write a layer, and count what was written: GDAL goes on after some writes that fail."""
+    """Write a layer and count its features, since GDAL ignores some failed writes."""
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     named = name if driver == "GPKG" else None
     try:
@@ -246,7 +246,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
         raise StageError("objects could not be written completely", found=lost, cure="Make room on the disk")
 
 
-#: Class whose color a layer's sure objects have, with its opacity; those to be checked are yellow on every layer.
+#: Class whose color the sure objects of a layer have, and their opacity; objects to be checked are yellow.
 _CLASSES = {
     "buildings": (6, 140),
     "trees": (5, 255),
@@ -264,14 +264,14 @@ _SYMBOLS = {
 
 
 def verdict_style(kind: str, name: str) -> str:
-    """A style for QGIS that tells what is sure from what is to be checked."""
+    """A style for QGIS that distinguishes sure objects from those to be checked."""
     code, opacity = _CLASSES[name]
     sure = ",".join(map(str, (*class_color(code), opacity)))
     return qml(kind, [("sure", "verdict = 'sure'", sure), ("check", f"verdict = '{CHECK}'", _TO_CHECK)])
 
 
 def qml(kind: str, rules: Sequence[tuple[str, str, str]], **options: Any) -> str:
-    """A style for QGIS of rules (label, condition, color) for a type of geometry; `options` of all symbols."""
+    """A style for QGIS from rules (label, condition, color) for a type of geometry; `options` apply to all symbols."""
     symbol, layer, color = _SYMBOLS[kind]
     listed = symbols = ""
     for n, (label, condition, ink) in enumerate(rules):

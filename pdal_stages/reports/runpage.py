@@ -1,4 +1,4 @@
-"""The report of a tiled run as one self-contained HTML page, made from what the run's JSON report holds."""
+"""The report of a tiled run as one self-contained HTML page, made from its JSON report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SETTINGS = {
 
 
 def run_page(run: Mapping[str, Any]) -> str:
-    """The page about a tiled run, of which `run` is what ``TiledRun.to_dict`` gives."""
+    """The page about a tiled run; `run` is the result of ``TiledRun.to_dict``."""
     done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
     pipeline = f"{Path(run['pipeline']).name}, " if run.get("pipeline") else ""
@@ -51,7 +51,7 @@ def run_page(run: Mapping[str, Any]) -> str:
 
 
 def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """The headline: what this run did, and what it kept."""
+    """The headline figures: what this run did, and what it kept of an earlier one."""
     states = run["states"]
     named = {"kept": "kept from an earlier run", "failed": "failed", "waiting": "to do"}
     rest = ", ".join(f"{states[k]:,} {text}" for k, text in named.items() if states.get(k))

@@ -1,6 +1,6 @@
 """Pictures of a cloud from above, and PNG files of them.
 
-Of each pixel the highest point is shown; gaps are closed from the nearest, and relief is shaded.
+Each pixel shows its highest point; gaps are filled from the nearest one, and relief is shaded.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Surface:
     spacing: float
 
     def spread(self, values: np.ndarray, missing) -> np.ndarray:
-        """Per-point values on the pixels."""
+        """Values of points as values of pixels."""
         return np.where(self.which >= 0, values[self.which], np.array(missing, values.dtype))
 
     def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
