@@ -13,7 +13,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import DimensionError, OptionError
-from pdal_stages.pipeline.expansion import together
+from pdal_stages.pipeline.expansion import merge_filters
 from pdal_stages.terrain.minima import hag_minima
 
 pytestmark = pytest.mark.pdal
@@ -122,9 +122,9 @@ def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     stages = [str(cloud), *ours, {"type": "filters.consistency"}]
     alone = [stages[0], *({**stage, "tag": f"t{n}"} for n, stage in enumerate(stages[1:]))]
     pipelines = [ps.Pipeline(each) for each in (stages, alone)]
-    plain, tagged = (together(pipeline.expanded.stages) for pipeline in pipelines)
+    plain, tagged = (merge_filters(pipeline.expanded.stages) for pipeline in pipelines)
     assert tagged == pipelines[1].expanded.stages
-    several = [[one["stage"] for one in stage["pdalargs"]["together"]] for stage in plain[1:]]
+    several = [[one["stage"] for one in stage["pdalargs"]["stages"]] for stage in plain[1:]]
     types = [
         None,
         *(stage["type"] for stage in stages[1:]),

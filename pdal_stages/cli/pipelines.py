@@ -101,7 +101,7 @@ def _in_tiles(options: argparse.Namespace) -> int:
     from ..tiling.plan import make_plan
     from ..tiling.run import run_tiled
 
-    chosen, beside = tiles.options_of(options), tiles.beside(options)
+    chosen, extra = tiles.options_of(options), tiles.extra_files(options)
     pipeline = Pipeline(_source(options), options.overrides, whole=False)
     if options.validate:
         make_plan(pipeline, chosen.buffer)
@@ -109,7 +109,7 @@ def _in_tiles(options: argparse.Namespace) -> int:
         return 0
     outputs = writers_outputs(pipeline.expanded.stages)  # '#' stands for names here, not for numbers
     named = [one for one in outputs if "#" not in one.path and Path(one.path).parent.is_dir()]
-    check_outputs([*named, *beside], pipeline.inputs())
+    check_outputs([*named, *extra], pipeline.inputs())
     run, interrupted = tiles.ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
     tiles.print_dry(run) if options.dry_run else tiles.print_run(run)
     return tiles.end_run(options, run, "run it again with --resume" if interrupted else "")

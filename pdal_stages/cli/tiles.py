@@ -105,7 +105,7 @@ def _classify(options: argparse.Namespace) -> int:
         request,
         options_of(options),
         metadata=options.metadata or "",
-        beside=tuple(beside(options)),
+        extra_files=tuple(extra_files(options)),
     )
     then = None
     if options.objects and not options.dry_run:
@@ -251,7 +251,7 @@ def end_at_once(options: argparse.Namespace) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def beside(options: argparse.Namespace) -> list[Output]:
+def extra_files(options: argparse.Namespace) -> list[Output]:
     """The log, the metadata and the reports, which are written beside the outputs."""
     kinds = {".html": HTML, ".htm": HTML, ".json": JSON}
     for name in options.report:

@@ -30,9 +30,7 @@ class ClassifyRequest:
     """How points are to be classified, independent of the inputs."""
 
     model: str = STANDARD  #: a model file, or the name of a shipped one
-    overrides: tuple[
-        Override, ...
-    ] = ()  #: options of stages from the command line; they may name another model
+    overrides: tuple[Override, ...] = ()  #: options of stages, which may name another model
     where: str | None = None  #: classify only the points for which this holds
     #: Created dimensions to write besides the input's own; ``all`` and ``none`` are allowed.
     dimensions: tuple[str, ...] = WRITTEN
@@ -143,7 +141,7 @@ class ClassifyRequest:
         return stages
 
     @cached_property
-    def beside(self) -> dict[str, str]:
+    def extra_dims(self) -> dict[str, str]:
         """The dimensions that are written besides the input's own: name -> PDAL type."""
         made: dict[str, str] = {}
         for stage in self.stages:
@@ -167,7 +165,7 @@ class ClassifyRequest:
         """Read a file, compute heights where the model needs them, classify, and write with everything else kept."""
         writer = writer_of(target)
         if writer.get("type") in LAS_WRITERS:
-            listed = extra_dims_option([source], self.beside)
+            listed = extra_dims_option([source], self.extra_dims)
             writer |= {"extra_dims": listed} if listed else {}
         elif self.dimensions != WRITTEN and "all" not in self.dimensions:
             raise OptionError(

@@ -277,7 +277,7 @@ def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Expa
     return ExpandedStage(stage, named, label, number, index, given, plain)
 
 
-def together(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """An expanded pipeline with one filter for stages of ours, and functions, that follow one another.
 
     For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. What tags and inputs wire stays
@@ -288,10 +288,10 @@ def together(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         before = out[-1] if out else {}
         wired = (before.keys() - {"inputs"} | stage.keys()).intersection(PDAL_OWN)
         if not wired and all(str(one.get("module")) in made for one in (before, stage)):
-            several = before["pdalargs"].get("together", [before["pdalargs"]])
+            several = before["pdalargs"].get("stages", [before["pdalargs"]])
             if not getattr(made.get(several[-1]["label"]), "forgets", False):
                 adds = [*dict.fromkeys(before["add_dimension"] + stage["add_dimension"])]
-                joined = {"pdalargs": {"together": [*several, stage["pdalargs"]]}, "add_dimension": adds}
+                joined = {"pdalargs": {"stages": [*several, stage["pdalargs"]]}, "add_dimension": adds}
                 out[-1] = {**before, **joined}
                 continue
         out.append(stage)

@@ -19,7 +19,7 @@ from ..base.messages import Report
 from ..stages.base import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
-from .expansion import Expanded, check_dimensions, expand, together
+from .expansion import Expanded, check_dimensions, expand, merge_filters
 from .inputs_outputs import check_octrees, check_readers, stage_files
 from .read import (
     Override,
@@ -193,7 +193,7 @@ class Pipeline:
                         run[number] = las_output.uncompressed_writer(stage, run[:number])
                 try:
                     with pdal_env.gentle():
-                        run = together(callbacks.check_ground(run))
+                        run = merge_filters(callbacks.check_ground(run))
                         result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
                         pdal_env.check_interrupt()
                     compressed = las_output.compress(partials)

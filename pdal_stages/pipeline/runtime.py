@@ -82,7 +82,7 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         PDAL's dimensions, and the ones to write back.
     """
     asked = module["pdalargs"]
-    several = asked.get("together", [asked])
+    several = asked.get("stages", [asked])
     for arguments in several:
         label = str(arguments.get("label", ""))
         # PDAL's module object stays alive; the register need not grow.

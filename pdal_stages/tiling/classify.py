@@ -38,7 +38,7 @@ class ClassifyTask:
     request: ClassifyRequest = field(default_factory=ClassifyRequest)
     options: TilingOptions = field(default_factory=TilingOptions)
     metadata: str = ""  #: a file that a run in one piece writes
-    beside: tuple[Output, ...] = ()  #: files that the caller writes, metadata among them
+    extra_files: tuple[Output, ...] = ()  #: files that the caller writes, metadata among them
 
     @cached_property
     def files(self) -> list[str]:
@@ -50,7 +50,7 @@ class ClassifyTask:
         """Whether there is one input that fits into memory, and no option asks for tiles."""
         options = self.options
         asked = options.tile is not None or options.per != "auto" or options.scheduler or options.resume
-        if len(self.files) > 1 or asked or any(one.what == "report" for one in self.beside):
+        if len(self.files) > 1 or asked or any(one.what == "report" for one in self.extra_files):
             return False
         if not is_las(self.files[0]):
             return not is_ept(self.files[0])
@@ -85,7 +85,7 @@ class ClassifyTask:
         (source,), (target,) = self.files, self.outputs
         self.make_folders()
         pipeline = self.request.pipeline(source, target)
-        pipeline.check_outputs(*self.beside)
+        pipeline.check_outputs(*self.extra_files)
         count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
         if self.metadata:
             text = json.dumps(pipeline.metadata, indent=2, default=str) + "\n"
@@ -122,16 +122,16 @@ class ClassifyTask:
         writer = {**writer_of(named), "filename": target, **alike}
         stages = [*self.request.stages, writer]
         plan, source = plan_of_files(self.files, stages, self.request.overrides, self.options.buffer)
-        beside = self.request.beside
+        extra_dims = self.request.extra_dims
         plan = replace(
             plan,
-            creates=["Classification", *beside] if len(plan.tail) == 1 and plan.creates else plan.creates,
-            makes=beside,
-            beside=beside,
+            creates=["Classification", *extra_dims] if len(plan.tail) == 1 and plan.creates else plan.creates,
+            makes=extra_dims,
+            extra_dims=extra_dims,
             name=self.request.model,
         )
         if not dry_run:
             self.make_folders()
         outputs = [Output(name) for name in self.outputs if Path(name).parent.is_dir()]
-        check_outputs([*outputs, *self.beside], self.files)
+        check_outputs([*outputs, *self.extra_files], self.files)
         return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)

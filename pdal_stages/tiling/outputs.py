@@ -207,10 +207,10 @@ def _put(callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool) -
 
 
 def with_dimensions(
-    tail: list[dict[str, Any]], beside: Mapping[str, str] | None, paths: list[str]
+    tail: list[dict[str, Any]], extra_dims: Mapping[str, str] | None, paths: list[str]
 ) -> list[dict[str, Any]]:
-    """A tail whose LAS writers list the extra dimensions to write: the inputs' own, and those in `beside`."""
-    listed = "" if beside is None else las_output.extra_dims_option(paths, beside)
+    """A tail whose LAS writers list the extra dimensions to write: the inputs' own, and `extra_dims`."""
+    listed = "" if extra_dims is None else las_output.extra_dims_option(paths, extra_dims)
     return [
         {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
         for stage in tail
@@ -233,7 +233,7 @@ class FileTask:
 
     def run(self) -> dict[str, Any]:
         """Write the outputs; returns a record of what was written, with counts of classes."""
-        tail = with_dimensions(self.plan.tail, self.plan.beside, [self.source.path])
+        tail = with_dimensions(self.plan.tail, self.plan.extra_dims, [self.source.path])
         if self.count > MOST_AT_ONCE and self._can_be_joined:
             return self._in_parts(tail)
         new = self._new_values(0, self.count)
@@ -312,6 +312,6 @@ def write_tile(
         return {"outputs": []}
     if plan.takes is not None:
         return plan.takes(mine, outputs, scratch)
-    tail = with_dimensions(plan.tail, plan.beside, [result.piece.source.path for result in mine])
+    tail = with_dimensions(plan.tail, plan.extra_dims, [result.piece.source.path for result in mine])
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in mine]
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, scratch)

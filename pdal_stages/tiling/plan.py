@@ -61,7 +61,7 @@ class TilePlan:
     messages: list[str]  #: messages for the user
     name: str  #: the pipeline's file, or another name of its source
     #: Created dimensions that LAS files get besides the input's own; None leaves it to the writer.
-    beside: dict[str, str] | None = None
+    extra_dims: dict[str, str] | None = None
     first: FirstRound | None = None  #: the first round, where there is one
     #: Called with each tile's own results, the outputs and the temporary folder, in place of the tail; returns a record of
     #: what was written.

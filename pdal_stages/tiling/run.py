@@ -271,7 +271,7 @@ class _Run:
         """
         plan, survey, grid = self.plan, self.survey, self.survey.grid
         sees = plan.sees_m / survey.unit
-        tail = [plan.tail, plan.beside, survey.stamps_of(plan.tail)]
+        tail = [plan.tail, plan.extra_dims, survey.stamps_of(plan.tail)]
         common = fingerprint(
             build(),
             [plan.head, survey.stamps_of(plan.head), plan.creates, plan.halo_m, sees],
