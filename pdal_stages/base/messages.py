@@ -238,8 +238,7 @@ class LoggedStream(PlainStream):
         self._begun = threading.local()  # a line may come in parts; those of threads are not mixed
 
     def write(self, text: str) -> int:
-        super().write(text)
         *lines, self._begun.line = (getattr(self._begun, "line", "") + text).split("\n")
-        for line in lines:
+        for line in lines:  # first, so that the log has all that was shown, even after Ctrl-C
             self.log.add(line)
-        return len(text)
+        return super().write(text)
