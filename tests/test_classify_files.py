@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -261,3 +262,14 @@ def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
     (tmp_path / "job.json").write_text(plain)
     assert main(["pipeline", str(tmp_path / "job.json")]) == 1
     assert "writers.copc" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("tile", [(), ("--tile", 500)])
+def test_points_beyond_the_box_of_the_header(folder, classify, tmp_path, tile):
+    """LAZ has no checksums: PDAL may decode a damaged file to points anywhere, without an error."""
+    content = bytearray((folder / "in/t0.laz").read_bytes())
+    high = struct.unpack_from("<d", content, 179)[0]
+    struct.pack_into("<d", content, 179, high - 5.0)
+    (tmp_path / "odd.laz").write_bytes(content)
+    code, _, err = classify(tmp_path / "odd.laz", tmp_path / "out.laz", *tile)
+    assert code == 0 and "odd.laz: points lie outside the bounding box in the header" in err, err

@@ -12,6 +12,7 @@ from pathlib import Path
 from ..base import las
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, write_whole
+from ..base.lascheck import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
 from .report import Job, TiledRun
@@ -93,6 +94,10 @@ class ClassifyTask:
         reports = [each[-1] for _, each in pipeline.reports if each]
         codes = [report.codes for report in reports if report.codes is not None]
         messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+        if all(is_las(name) and Path(name).is_file() for name in (source, target)):
+            written = las.read_header(target)
+            odd = beyond_box(source, written.box) if written else None
+            messages += [odd] if odd else []
         return Written(target, count, codes[-1] if codes else {}, pipeline.left_alone, messages)
 
     def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
