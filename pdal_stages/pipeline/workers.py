@@ -115,11 +115,11 @@ class WorkerProcesses(AbstractContextManager):
 
     def __exit__(self, *exc: object) -> None:
         for pool in [*self._idle, *self._busy.values()]:
-            processes = list((pool._processes or {}).values())
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in processes:
+            for process in list((pool._processes or {}).values()):
                 process.kill()
                 process.join(10.0)
+            _stop_sending(pool)
+            pool.shutdown(cancel_futures=True)
         for reader in self._readers:
             reader.join(1.0)
 
@@ -158,9 +158,18 @@ class WorkerProcesses(AbstractContextManager):
         done = wait(list(futures), return_when=FIRST_COMPLETED).done
         for future in done:
             pool = self._busy.pop(future)
-            if not isinstance(future.exception(), BrokenExecutor):
+            if isinstance(future.exception(), BrokenExecutor):
+                _stop_sending(pool)
+            else:
                 self._idle.append(pool)
         return done
+
+
+def _stop_sending(pool: Any) -> None:
+    """Let go of a large task that a dead worker did not read; Python before 3.11.5 would wait for it (gh-94777)."""
+    if sys.version_info < (3, 11, 5):
+        with suppress(OSError):
+            pool._call_queue._reader.close()
 
 
 def _repeat(pipe: int, stream: LoggedStream) -> None:
