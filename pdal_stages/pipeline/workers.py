@@ -160,6 +160,7 @@ class WorkerProcesses(AbstractContextManager):
             pool = self._busy.pop(future)
             if isinstance(future.exception(), BrokenExecutor):
                 _stop_sending(pool)
+                pool.shutdown()
             else:
                 self._idle.append(pool)
         return done
