@@ -45,11 +45,13 @@ def test_cut_files_are_refused(tmp_path, pdal_program, name):
             check_complete(path, name, writer, COUNT)
 
 
-def test_other_formats_are_held_against_the_disk(tmp_path, monkeypatch):
+def test_other_formats_are_held_against_disk_and_limits(tmp_path, monkeypatch):
     path = tmp_path / "x.tif"
     path.write_bytes(b"x" * 100)
     writer = {"type": "writers.gdal", "filename": "x.tif"}
     assert not check_complete(path, path, writer)
-    monkeypatch.setattr("pdal_stages.base.lascheck.disk_is_full", lambda path: True)
-    with pytest.raises(StageError, match="Make room"):
-        check_complete(path, path, writer)
+    for name, value in (("_largest_file", lambda: 100), ("disk_is_full", lambda path: True)):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"pdal_stages.base.lascheck.{name}", value)
+            with pytest.raises(StageError, match="Make room"):
+                check_complete(path, path, writer)

@@ -103,8 +103,8 @@ def check_complete(
 ) -> bool:
     """Refuse a file that was not written completely; return whether its content could be checked.
 
-    LAS and LAZ files are checked against their headers and the number of points; for other formats, only whether the
-    disk is full.
+    LAS and LAZ files are checked against their headers and the number of points; for other formats, only whether
+    disk and limits left room.
 
     Parameters
     ----------
@@ -128,14 +128,14 @@ def check_complete(
         size = path.stat().st_size
         with open(path, "rb+") as file:
             os.fsync(file.fileno())  # some file systems report a full disk only here
-        whole = _is_whole(path, count) if las else not disk_is_full(path)
+        whole = _is_whole(path, count) if las else not disk_is_full(path) and size < _largest_file()
     except OSError as error:
         raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
     if not whole:
         raise StageError(
             "the output file could not be written completely",
             found=f"{name}: {size:,} bytes were written",
-            cure="Make room on the disk",
+            cure="Make room on the disk (or raise the limit on file sizes)",
         )
     return las
 
@@ -147,6 +147,16 @@ def _is_whole(path: Path, count: int | None) -> bool:
         return False
     header = read_header(path)
     return header is not None and count in (None, header.count)
+
+
+def _largest_file() -> float:
+    """The limit on the size of this process's files, in bytes."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else limit
 
 
 def _end_of_points(header: LasHeader, size: int) -> int:

@@ -54,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     shown = os.environ.get("PDAL_STAGES_PROGRESS")
     code = 1
     try:
+        _refuse_little_room()
         options = parsed(arguments, is_program=argv is None)
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = str(int(options.progress))
@@ -121,6 +122,15 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     options.command = command
     options.overrides, options.arguments, options.is_program = overrides, list(arguments), is_program
     return options
+
+
+def _refuse_little_room() -> None:
+    """Refuse a limit on addresses under which libraries crash, or wait forever for threads."""
+    with contextlib.suppress(ImportError):  # Windows
+        import resource
+
+        if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < 2**30:
+            raise StageError("too little memory", found=f"ulimit -v {limit // 1024}", cure="Allow 1 GB")
 
 
 def _unforeseen(error: Exception) -> StageError:

@@ -52,7 +52,13 @@ class Store:
                         cure="Remove it, or write to another folder",
                     )
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-            self._lock = os.fdopen(os.open(self.folder / "lock", flags, 0o666), "r+", encoding="utf-8")
+            lock = os.open(self.folder / "lock", flags, 0o622)
+            # Anyone who can read a lock can hold it, so only those may who can write.
+            if hasattr(os, "fchmod"):
+                writers = os.fstat(lock).st_mode & 0o022
+                with contextlib.suppress(OSError):  # of another user, whose folder this is
+                    os.fchmod(lock, 0o600 | writers | writers << 1)
+            self._lock = os.fdopen(lock, "r+", encoding="utf-8")
             if not try_lock(self._lock):
                 with self._lock:
                     who = self._lock.read().strip()

@@ -12,7 +12,7 @@ import laspy
 import pytest
 from robustness_kit import HAG, job
 
-from pdal_stages import load_model
+from pdal_stages import load_model, run_tiled
 
 pytestmark = [pytest.mark.pdal, pytest.mark.skipif(os.name == "nt", reason="devices and links of Unix")]
 
@@ -128,3 +128,16 @@ def test_files_of_the_same_kind_are_replaced(command, files):
     assert load_model("n.model").plan.names != load_model("m.model").plan.names
     command.runs([*CLASSIFY, "o.las", "--metadata", "m.json"])
     assert json.loads((files / "m.json").read_text())["metadata"]
+
+
+def test_a_lock_that_only_writers_can_hold(tmp_path, cloud):
+    path, lock = job(tmp_path, cloud, HAG, tmp_path / "o.las"), tmp_path / ".pdal-stages" / "lock"
+    before = os.umask(0o022)
+    try:
+        for mask, older, mode in ((0o022, None, 0o600), (0o002, None, 0o660), (0o002, 0o644, 0o600)):
+            os.umask(mask)
+            lock.chmod(older) if older else lock.unlink(missing_ok=True)  # of an older release, or a new one
+            run_tiled(path, 20, workers=0, progress=False)
+            assert stat.S_IMODE(lock.stat().st_mode) == mode
+    finally:
+        os.umask(before)
