@@ -150,16 +150,13 @@ def test_no_command_shows_the_help(capsys):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing watches where processes cannot be forked")
 @pytest.mark.parametrize(
-    ("number", "kill", "said"),
-    [(9, "os.kill(os.getpid(), 9)", "died in the midst"), (2, "os.killpg(0, 2)", "interrupted; ")],
+    ("kill", "number", "said"), [("kill(os.getpid()", 9, "died in"), ("killpg(0", 2, "interrupted; ")]
 )
-def test_a_process_that_dies_is_told_of(job, tmp_path, number, kill, said):
+def test_a_process_that_dies_is_told_of(cloud, tmp_path, kill, number, said):
     """By a process beside it: a crash in PDAL and a lack of memory leave Python no time for a message."""
-    script = f"import os, signal\ndef f(ins, outs):\n    signal.signal(2, signal.SIG_DFL)\n    {kill}\n"
-    (tmp_path / "kill.py").write_text(script)
-    stages = json.loads(job.read_text("utf-8-sig").split("\n", 1)[1])["pipeline"]
-    how = {"type": "filters.python", "script": str(tmp_path / "kill.py"), "function": "f", "module": "kill"}
-    (tmp_path / "dies.json").write_text(json.dumps([*stages[:-1], how, stages[-1]]))
+    ends = f"import os, signal\ndef f(ins, outs):\n    signal.signal(2, signal.SIG_DFL)\n    os.{kill}, {number})\n"
+    how = {"type": "filters.python", "source": ends, "function": "f", "module": "ends"}
+    (tmp_path / "dies.json").write_text(json.dumps([str(cloud), how, str(tmp_path / "out.las")]))
     command = [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(tmp_path / "dies.json")]
     ended = subprocess.run(command, capture_output=True, text=True, start_new_session=True)
     assert ended.returncode == -number

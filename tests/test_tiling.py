@@ -508,9 +508,8 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
 def test_a_reference_that_stands_after_the_points(tmp_path, random_cloud, write_las, monkeypatch, at_once):
     """In feet: a piece without it would be taken for one in meters. Other records are kept too."""
     monkeypatch.setattr("pdal_stages.tiling.outputs.MOST_AT_ONCE", at_once)
-    las = laspy.read(
-        write_las(tmp_path / "in.las", dict(zip("XYZ", random_cloud(200, seed=1).T, strict=True)), 6)
-    )
+    points = dict(zip("XYZ", random_cloud(200, seed=1).T, strict=True))
+    las = laspy.read(write_las(tmp_path / "in.las", points, 6))
     wkt = b'LOCAL_CS["feet",UNIT["foot",0.3048]]'
     records = [laspy.VLR("LASF_Projection", 2112, "", wkt), laspy.VLR("mine", 7, "", b"hello")]
     las.header.global_encoding.wkt, las.evlrs = True, laspy.vlrs.vlrlist.VLRList(records)

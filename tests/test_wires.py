@@ -183,10 +183,8 @@ def test_a_corridor(data_dir):
     assert (wire & ~np.isin(codes, (14, 15))).sum() < 0.001 * len(codes)
 
 
-@pytest.mark.parametrize(
-    "name", ["isprs_filter/samp41.laz", "seville/plazanueva.laz", "rural/ign_0p3ppm2.laz"]
-)
+@pytest.mark.parametrize("name", ["isprs_filter/samp41", "seville/plazanueva", "rural/ign_0p3ppm2"])
 def test_clouds_without_wires(name, data_dir):
-    las = laspy.read(data_dir / name)
+    las = laspy.read(data_dir / f"{name}.laz")
     height = filtered_ground(las.xyz)["HeightAboveGround"]
     assert find_wires(las.xyz, height, np.ones(len(las), bool)).sum() <= 0.0005 * len(las)

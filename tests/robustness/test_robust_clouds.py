@@ -126,11 +126,8 @@ def test_training_on_odd_clouds(command, tmp_path, write_las):
 
 def test_thresholds_and_surveys_of_no_points(command, tmp_path, write_las):
     flight, bins = np.where(np.arange(300) < 9, np.nan, 1.0), tmp_path / "b.json"
-    source = {
-        "type": "readers.las",
-        "filename": str(written(tmp_path / "in.las", random(300), write_las, Flight=flight)),
-        "use_eb_vlr": True,
-    }
+    path = written(tmp_path / "in.las", random(300), write_las, Flight=flight)
+    source = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
     shapes = {"type": FEATURES["type"], "neighborhoods": "k5", "feature_set": "D1", "bins": str(bins)}
     for none in ({"where": "Z > 99"}, {"ignore": [2, 6]}):
         command.runs(["pipeline", job(tmp_path, source, {**shapes, **none}), "--metadata", tmp_path / "m"])
