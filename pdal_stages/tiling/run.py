@@ -131,7 +131,7 @@ def run_plan(
                     run.forget()
                     interrupted = False
         finally:
-            for each in folders:
+            for each in (*folders, store.kept):
                 sweep(each)  # left by workers that were killed
     summary = survey.figures(plan) | {"workers": workers.slots, "threads_per_worker": workers.threads}
     summary |= summarize(run.tiles, run.cpu_seconds, time.monotonic() - started)
