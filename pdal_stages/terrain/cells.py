@@ -5,7 +5,7 @@ Points are cut into pieces whose rasters are small wherever points lie: groups f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.arrays import begins_run, places_among
 from ..base.errors import StageError
 from ..base.jit import device, njit
+from ..base.lascheck import DAMAGED
 
 #: What a raster has where nothing was measured.
 HOLE = np.float32(np.inf)
@@ -291,7 +292,7 @@ def patches(
         yield slice(None), slice(None)
         return
     groups = _groups(column, row, link)
-    refuse_scattered(len(column), len(groups))
+    refuse_scattered([len(group) for group in groups])
     for group in groups:
         c, r = column[group], row[group]
         window = CellWindow.round(c, r)
@@ -307,13 +308,17 @@ def patches(
                     yield group[near[part]], mine[near[part]]
 
 
-def refuse_scattered(points: int, places: int) -> None:
-    """Refuse points most of which are alone in their places: each would take milliseconds, and none tells anything."""
-    if places > 4000 and points < 2 * places:
+def refuse_scattered(counts: Collection[int]) -> None:
+    """Refuse points that are alone in most of their places: each would take milliseconds, and none tells anything.
+
+    `counts` are the points of each place.
+    """
+    alone = sum(n == 1 for n in counts)
+    if alone > 4000 and 2 * alone > len(counts):
         raise StageError(
-            "most points lie alone, far from any other",
-            found=f"{points:,} points in {places:,} places",
-            cure="Look whether the file's scale and unit are right: pdal info --summary FILE",
+            "thousands of points lie alone, far from any other",
+            found=f"{alone:,} of {sum(counts):,} points",
+            cure=f"Look whether the file's scale and unit are right: pdal info --summary FILE. {DAMAGED}",
         )
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..base.arrays import begins_run
 from ..base.files import whole_files
 from ..pipeline.parts import header_of, las_chunks
+from ..terrain.cells import refuse_scattered
 from .inputs import CloudIndex, InputSource, fetch_ept
 from .settings import Box, TileGrid, check_number
 
@@ -91,6 +92,7 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
             found += made
             total += len(records)
+    refuse_scattered(tiles.values())
     box = [*low.tolist(), *high.tolist()]
     return {"count": total, "box": box, "tiles": [(*t, n) for t, n in sorted(tiles.items())], "cells": found}
 

@@ -23,7 +23,6 @@ from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
-from ..terrain.cells import refuse_scattered
 from .ground import BlockTask, FirstRoundTask, block_name, blocks_around, from_before, left_name
 from .inputs import CloudIndex, InputSource, Survey
 from .outputs import FileTask
@@ -384,7 +383,6 @@ class _Run:
         near: dict[tuple[int, int], list[tuple[int, int]]] = {
             b: [] for b in sorted(set().union(*wanted.values()))
         }
-        refuse_scattered(sum(job.points for job in self.tiles), len(near))
         for tile in by_tile:
             for block in near.keys() & blocks_around(context, tile, first.blocks.reach):
                 near[block].append(tile)
