@@ -19,7 +19,6 @@ _WHERE = {
     "ObjectSettings": "objects.found",
     "FeatureTable": "features",
     "Pipeline": "pipeline.run",
-    "PointClassifier": "classifier.estimator",
     "StageError": "base.errors",
     "TrainingCloud": "classifier.clouds",
     "TrainingOptions": "classifier.trainoptions",
@@ -48,7 +47,6 @@ if TYPE_CHECKING:
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
     from .classifier.clouds import TrainingCloud
-    from .classifier.estimator import PointClassifier
     from .classifier.model import Model, load_model
     from .classifier.training import train
     from .classifier.trainoptions import TrainingOptions

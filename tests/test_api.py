@@ -1,8 +1,7 @@
-"""The Python interface: defaults that work, arrays in and out, scikit-learn's manners."""
+"""The Python interface: defaults that work, arrays in and out."""
 
 from __future__ import annotations
 
-import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -96,36 +95,6 @@ def test_a_model_of_arrays_classifies_files_alike(scene, small, tmp_path, write_
     made = laspy.read(tmp_path / "o.las")
     xyz = np.column_stack([made.x, made.y, made.z])
     assert np.array_equal(np.asarray(made.classification), model.predict(xyz).classification)
-
-
-def test_the_estimator_keeps_the_conventions(scene, tmp_path):
-    from sklearn.base import clone, is_classifier
-    from sklearn.exceptions import NotFittedError
-
-    xyz, y = scene
-    made = ps.PointClassifier("k10", "Linearity,HeightRange", count=100, trees=5, passes=1, threads=1)
-    with pytest.raises(NotFittedError):
-        made.predict(xyz)
-    assert is_classifier(made) and clone(made).get_params() == made.get_params()
-    assert "trees=5" in repr(made) and made.set_params(trees=6).trees == 6
-    assert made.fit(xyz, y) is made and made.classes_.tolist() == [2, 6] and made.n_features_in_ == 3
-    p = made.predict_proba(xyz)
-    assert p.shape == (len(xyz), 2) and np.allclose(p.sum(axis=1), 1, atol=1e-5)
-    assert np.array_equal(made.classes_[p.argmax(axis=1)], made.predict(xyz))
-    assert made.score(xyz, y) > 0.98
-    order = np.random.default_rng(1).permutation(len(xyz))
-    assert np.array_equal(clone(made).fit(xyz[order], y[order]).predict(xyz), made.predict(xyz))
-    made.save(tmp_path / "m.model")
-    assert np.array_equal(ps.load_model(tmp_path / "m.model").predict(xyz).classification, made.predict(xyz))
-    with pytest.raises(StageError, match=r"\(n, 3\)"):
-        made.fit(xyz[:, :2], y)
-
-
-def test_one_set_of_defaults():
-    options = ps.TrainingOptions()
-    for name, parameter in inspect.signature(ps.PointClassifier).parameters.items():
-        if name != "options":
-            assert parameter.default == getattr(options, name), name
 
 
 def test_every_public_name_is_on_the_api_page():

@@ -8,7 +8,6 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.classifier.algorithms import PredictionOptions
-from pdal_stages.classifier.estimator import PointClassifier
 
 
 def test_figures_that_mean_nothing():
@@ -24,12 +23,10 @@ def test_figures_that_mean_nothing():
             PredictionOptions(memory_mb=memory)
 
 
-def test_the_estimator_says_what_is_wrong():
+def test_labels_of_another_number_of_points():
     xyz = np.random.default_rng(0).uniform(0, 9, (50, 3))
     with pytest.raises(OptionError, match="one label for each of the 50 points"):
-        PointClassifier().fit(xyz, np.zeros(49, int))
-    with pytest.raises(OptionError, match="'options' must be TrainingOptions"):
-        PointClassifier(options=5).fit(xyz, np.zeros(50, int))
+        ps.train(xyz, np.zeros(49, int), progress=False)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300])
