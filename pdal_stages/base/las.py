@@ -13,7 +13,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -88,6 +87,16 @@ class LasHeader:
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
     box: tuple[float, float, float, float]  #: (min x, min y, max x, max y)
+
+
+def named_las(path: str | os.PathLike) -> bool:
+    """Whether the name of a file ends as those of LAS, LAZ and COPC files do."""
+    return os.fspath(path).lower().endswith((".las", ".laz"))
+
+
+def named_copc(path: str | os.PathLike) -> bool:
+    """Whether the name of a file ends as those of COPC files do."""
+    return os.fspath(path).lower().endswith(".copc.laz")
 
 
 def refuse_pipe(path: str | os.PathLike) -> None:
@@ -190,7 +199,7 @@ def supersede_copc(path: str | os.PathLike) -> None:
     Readers of COPC would look for an octree where there is none. The records get the id with which LAS 1.4 (R15,
     section 2.5, "Superseded") negates a record in place.
     """
-    if Path(path).suffix.lower() not in (".las", ".laz"):
+    if not named_las(path):
         return
     copc = list(records_of(path, b"copc"))
     roots = [struct.unpack_from("<Q", data, 40)[0] for r, data in copc if r.number == 1 and len(data) >= 48]

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 from .errors import StageError
 from .files import disk_is_full
-from .las import LARGEST_RECORD, POINT_BYTES, WAVES, LasHeader, read_header, records
+from .las import LARGEST_RECORD, POINT_BYTES, WAVES, LasHeader, named_las, read_header, records
 
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
@@ -123,7 +123,7 @@ def check_complete(
         If it is incomplete.
     """
     path = Path(path)
-    las = writer.get("type") in ("writers.las", "writers.copc") or path.suffix.lower() in (".las", ".laz")
+    las = writer.get("type") in ("writers.las", "writers.copc") or named_las(path)
     try:
         size = path.stat().st_size
         with open(path, "rb+") as file:

@@ -13,7 +13,7 @@ from ..base import checks
 from ..base.arrays import places_among
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
-from ..base.las import LEGACY_LIMIT
+from ..base.las import LEGACY_LIMIT, named_copc
 from ..classifier.algorithms import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
@@ -47,7 +47,7 @@ def write_corrections(
     for name in filter(None, (before, after)):
         if not reads_in_parts(name):
             raise StageError("corrections are read from LAS and LAZ files", found=name)
-    if output.lower().endswith(".copc.laz"):
+    if named_copc(output):
         raise OptionError("corrections are written as LAS or LAZ", found=output, cure="Name it .laz")
     check_outputs([Output(output, "output")], [*filter(None, (before, after)), *areas])
     reference = reference_of_file(before)

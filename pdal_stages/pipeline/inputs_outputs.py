@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
-from ..base.las import header_there, projection, read_header
+from ..base.las import header_there, named_copc, named_las, projection, read_header
 from ..base.octree import check_copc, check_ept
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from ..classifier.modelfile import find
@@ -107,7 +107,7 @@ def ept_address(name: str) -> str:
 
 def is_las(name: str) -> bool:
     """Whether an input is a LAS, LAZ or COPC file, as its name says."""
-    return Path(name).suffix.lower() in (".las", ".laz") and "://" not in name
+    return named_las(name) and "://" not in name
 
 
 def is_folder(target: str) -> bool:
@@ -120,11 +120,7 @@ def is_folder(target: str) -> bool:
 def _output_name(source: str, copc: bool) -> str:
     """The input's name; COPC becomes plain LAZ unless it is written as COPC."""
     name = Path(source).name
-    return name[: -len(".copc.laz")] + ".laz" if _is_copc(name) and not copc else name
-
-
-def _is_copc(name: str) -> bool:
-    return name.lower().endswith(".copc.laz")
+    return name[: -len(".copc.laz")] + ".laz" if named_copc(name) and not copc else name
 
 
 def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -177,7 +173,7 @@ def reader_of(source: str, tag: str) -> dict[str, Any]:
     stage: dict[str, Any] = {"filename": str(source), "tag": tag}
     if is_ept(source):
         stage["type"] = "readers.ept"
-    elif Path(source).suffix.lower() in (".las", ".laz") and not _is_copc(source):
+    elif named_las(source) and not named_copc(source):
         stage |= {"type": "readers.las", "use_eb_vlr": True}
     return stage
 
@@ -185,8 +181,8 @@ def reader_of(source: str, tag: str) -> dict[str, Any]:
 def writer_of(target: str) -> dict[str, Any]:
     """A writer that keeps the input's header, where it is a LAS file."""
     stage: dict[str, Any] = {"filename": target, "tag": "output"}
-    if Path(target).suffix.lower() in (".las", ".laz"):
-        kind = "writers.copc" if _is_copc(target) and pdal_env.knows_copc() else "writers.las"
+    if named_las(target):
+        kind = "writers.copc" if named_copc(target) and pdal_env.knows_copc() else "writers.las"
         stage |= {"type": kind, "forward": "all"}
     return stage
 
@@ -246,7 +242,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
 
 def reference_of_file(path: str, horizontal: str = "") -> Reference:
     """The same of a file."""
-    las = read_header(path) is not None if path.lower().endswith((".las", ".laz")) else False
+    las = named_las(path) and read_header(path) is not None
     return reference_of({"filename": path} | ({"type": "readers.las", "count": 1} if las else {}), horizontal)
 
 
@@ -306,7 +302,7 @@ def check_octrees(stages: list[dict[str, Any]]) -> None:
         name, kind = str(stage.get("filename", "")), stage.get("type", "")
         if kind == "readers.ept" or (not kind and is_ept(name)):
             check_ept(ept_address(name))
-        elif pdal_env.knows_copc() and (kind == "readers.copc" or (not kind and _is_copc(name))):
+        elif pdal_env.knows_copc() and (kind == "readers.copc" or (not kind and named_copc(name))):
             for path in reader_files(stage, las=True):
                 check_copc(path)
 

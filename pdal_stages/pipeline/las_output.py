@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
-from ..base.las import LEGACY_LIMIT, LasHeader, extra_dimensions, header_there, supersede_copc
+from ..base.las import (
+    LEGACY_LIMIT,
+    LasHeader,
+    extra_dimensions,
+    header_there,
+    named_copc,
+    named_las,
+    supersede_copc,
+)
 from ..stages.base import Stage, stage_types
 from . import pdal as pdal_env
 from .read import is_reader, is_writer, reader_files, writes_las
@@ -53,7 +61,7 @@ def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
     """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the inputs' own are not known."""
     own: dict[str, str] = {}
     for source in sources:
-        if Path(source).suffix.lower() not in (".las", ".laz"):
+        if not named_las(source):
             return "all"
         own |= extra_dimensions(source)
     if not all(re.fullmatch(r"[A-Za-z_]\w*", name) for name in own):
@@ -107,7 +115,7 @@ def check_copc_outputs(stages: list[dict[str, Any]]) -> None:
     for stage in stages:
         name, kind = str(stage.get("filename", "")), stage.get("type", "")
         last = stage is stages[-1] and len(stages) > 1
-        if not name.lower().endswith(".copc.laz") or not (kind == "writers.las" or (last and not kind)):
+        if not named_copc(name) or not (kind == "writers.las" or (last and not kind)):
             continue
         if not pdal_env.knows_copc():
             what = f"PDAL {pdal_env.dotted_version()} cannot write COPC"

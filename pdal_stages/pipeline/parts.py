@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.las import NOISE, read_header
+from ..base.las import NOISE, named_las, read_header
 from ..stages.points import Points
 from . import pdal as pdal_env
 from .inputs_outputs import reader_of
@@ -28,7 +27,7 @@ _LASPY = {
 
 def reads_in_parts(path: str) -> bool:
     """Whether parts of a file can be read: LAS, LAZ and COPC files."""
-    return Path(path).suffix.lower() in (".las", ".laz") and read_header(path) is not None
+    return named_las(path) and read_header(path) is not None
 
 
 def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:

@@ -15,6 +15,7 @@ from typing import Any
 from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
 from ..base.files import LAS, Output
+from ..base.las import named_las
 
 #: Writers of LAS and COPC.
 LAS_WRITERS = ("writers.las", "writers.copc")
@@ -271,7 +272,7 @@ def _by_file_name(stages: list[Any], selector: str) -> list[dict[str, Any]]:
     for index, stage in enumerate(stages):
         name = stage if isinstance(stage, str) else "" if "type" in stage else str(stage.get("filename", ""))
         kind = "writers" if 0 < index == len(stages) - 1 else "readers"
-        if name.lower().endswith((".las", ".laz")) and selector == f"{kind}.las":
+        if named_las(name) and selector == f"{kind}.las":
             if isinstance(stage, str):
                 stages[index] = stage = {"type": selector, "filename": name}
             hits.append(stage)
@@ -289,7 +290,7 @@ def reader_files(stage: dict[str, Any], *, las: bool = False) -> list[str]:
     name, kind = stage.get("filename"), stage.get("type", "")
     if not isinstance(name, str) or "://" in name:
         return []
-    is_las = kind in LAS_READERS or (not kind and name.lower().endswith((".las", ".laz")))
+    is_las = kind in LAS_READERS or (not kind and named_las(name))
     if not is_las and (las or (kind and not kind.startswith("readers."))):
         return []
     names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
@@ -334,7 +335,7 @@ def is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
 def writes_las(writer: dict[str, Any]) -> bool:
     """Whether a writer, or a stage without a type, writes LAS."""
     kind, name = writer.get("type", ""), str(writer.get("filename", ""))
-    return kind in LAS_WRITERS or (not kind and name.lower().endswith((".las", ".laz")))
+    return kind in LAS_WRITERS or (not kind and named_las(name))
 
 
 def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:

@@ -14,6 +14,7 @@ import numpy as np
 from ..base import checks
 from ..base.errors import OptionError, StageError, suggest
 from ..base.files import whole_files
+from ..base.las import named_las
 from ..base.messages import Progress
 from ..base.resources import map_blocks
 from ..base.settings import Settings, setting
@@ -225,7 +226,7 @@ def write_town(town: Town, path: str | os.PathLike) -> None:
     import laspy
 
     target = Path(path)
-    if target.suffix.lower() not in (".las", ".laz"):
+    if not named_las(target):
         raise OptionError("the output's name must end in .las or .laz", where="write_town", found=str(path))
     if not len(town):
         raise StageError(

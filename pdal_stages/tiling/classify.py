@@ -116,7 +116,7 @@ class ClassifyTask:
         target = named = self.output
         if is_folder(self.output):
             target, named = str(Path(self.output) / ("#.laz" if self._per_tile else "#")), "x.laz"
-        if target.lower().endswith(".copc.laz"):
+        if las.named_copc(target):
             raise OptionError(
                 "runs in tiles write plain LAS or LAZ",
                 found=target,
