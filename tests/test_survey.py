@@ -154,17 +154,17 @@ def test_a_cloud_beyond_the_memory_is_cut(survey, classify, whole, tmp_path):
 
 
 def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, fresh, tmp_path, monkeypatch):
-    from pdal_stages.tiling.tile import TileTask
+    from pdal_stages.tiling import run
 
-    run, calls = TileTask.run, []
+    real, calls = run.run_tile, []
 
-    def some(self):
-        calls.append(self.tile)
+    def some(context, tile, *rest):
+        calls.append(tile)
         if len(calls) == 4:
             raise KeyboardInterrupt
-        return run(self)
+        return real(context, tile, *rest)
 
-    monkeypatch.setattr(TileTask, "run", some)
+    monkeypatch.setattr(run, "run_tile", some)
     code, out, err = classify(survey / "in", tmp_path / "out/", "--tile", 45)
     assert code == 130 and "3 of 6 tiles done" in err and "--resume" in err and "pdal-stages" in err, err
     assert re.search(r"\d of 4 files written", err)

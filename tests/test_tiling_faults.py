@@ -29,7 +29,7 @@ from pdal_stages.base.resources import available_threads
 from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform
 from pdal_stages.tiling import cluster as dask_cluster
-from pdal_stages.tiling.outputs import FileTask
+from pdal_stages.tiling import run as tiled_run
 from pdal_stages.tiling.store import Store
 
 pytestmark = pytest.mark.pdal
@@ -390,7 +390,7 @@ def test_reports_replace_neither_the_pipeline_nor_an_output(tmp_path, folder, ru
 def test_damaged_results_are_made_anew(tmp_path, folder, expected, monkeypatch):
     stages = pipeline(folder, tmp_path / "o_#.laz")
     with monkeypatch.context() as patch:
-        patch.setattr(FileTask, "run", lambda _: 1 / 0)
+        patch.setattr(tiled_run, "write_file", lambda *_: 1 / 0)
         assert run_tiled(stages, 20, workers=0).failures
     result = min((tmp_path / ".pdal-stages" / "kept").glob("*.npz"))
     then, data = result.stat().st_mtime_ns, bytearray(result.read_bytes())

@@ -20,8 +20,7 @@ from pdal_stages.terrain.groundblocks import (
     reach_of_block,
 )
 from pdal_stages.terrain.groundcells import FilterOptions
-from pdal_stages.tiling import tile
-from pdal_stages.tiling.ground import FirstRoundTask
+from pdal_stages.tiling import run, tile
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
 MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")
@@ -75,13 +74,13 @@ def of_files(folder, name):
     "before", [[{"type": "filters.detachednoise"}], [{"type": "filters.range", "limits": "Z[60:]"}]]
 )
 def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
-    run = in_tiles(survey, [*before, HEIGHTS], tmp_path / "out")
-    assert not run.failures
+    made = in_tiles(survey, [*before, HEIGHTS], tmp_path / "out")
+    assert not made.failures
     whole = np.concatenate(ps.run_pipeline([*survey, *before, HEIGHTS]).arrays)
     for name in MADE:
         assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
-    read = sum(job.record["read"] for job in run.tiles)
-    own = sum(job.record["points"] for job in run.tiles)
+    read = sum(job.record["read"] for job in made.tiles)
+    own = sum(job.record["points"] for job in made.tiles)
     assert read <= 1.01 * own  # what noise marked is kept
     assert not list((tmp_path / "out" / ".pdal-stages" / "kept").glob("*.np[yz]"))
 
@@ -110,13 +109,13 @@ def break_a_tile(patch):
 @pytest.mark.pdal
 def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
     """And removes what is left of tiles that have no points any more; a damaged file is made again."""
-    made, real = [], FirstRoundTask.run
+    made, real = [], run.run_first_round
 
-    def noted(self):
-        made.append(self.tile)
-        return real(self)
+    def noted(context, at, *rest):
+        made.append(at)
+        return real(context, at, *rest)
 
-    monkeypatch.setattr(FirstRoundTask, "run", noted)
+    monkeypatch.setattr(run, "run_first_round", noted)
     folder = tmp_path / "out"
     with monkeypatch.context() as patch:
         break_a_tile(patch)
@@ -137,21 +136,20 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
 
 @pytest.mark.pdal
 def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_path, survey, monkeypatch):
-    real = FirstRoundTask.run
+    real, luckless = run.run_first_round, [(0, 0)]
 
-    def failing(self):
-        if self.tile == (0, 0):
+    def failing(context, at, *rest):
+        if at in luckless:
             raise ps.StageError("no luck")
-        return real(self)
+        return real(context, at, *rest)
 
-    monkeypatch.setattr(FirstRoundTask, "run", failing)
+    monkeypatch.setattr(run, "run_first_round", failing)
     small = {**HEIGHTS, "window": 1, "openings": []}
-    run = in_tiles(survey, [small], tmp_path / "out")
-    failed = {job.tile for job in run.tiles if job.state == "failed"}
-    assert (0, 0) in failed and all("no luck" in job.reason for job in run.tiles if job.tile in failed)
-    monkeypatch.setattr(FirstRoundTask, "run", lambda self: (_ for _ in ()).throw(ps.StageError("no luck")))
-    run = in_tiles(survey, [small], tmp_path / "other")
-    assert all("no luck" in job.reason for job in run.tiles)
+    tiles = in_tiles(survey, [small], tmp_path / "out").tiles
+    failed = {job.tile for job in tiles if job.state == "failed"}
+    assert (0, 0) in failed and all("no luck" in job.reason for job in tiles if job.tile in failed)
+    luckless += [job.tile for job in tiles]
+    assert all("no luck" in job.reason for job in in_tiles(survey, [small], tmp_path / "other").tiles)
 
 
 def blocks_of(points, options, near):
@@ -175,8 +173,8 @@ def blocks_of(points, options, near):
 def test_thousands_of_lone_points_are_refused_before_any_of_them_is_worked_on(tmp_path, write_las):
     column, row = np.divmod(np.arange(4100), 64)
     source = write_las(tmp_path / "in.las", {"X": column * 5000.0, "Y": row * 5000.0, "Z": row * 0.0})
-    run = run_tiled([str(source), HEIGHTS, str(tmp_path / "o_#.las")], 1000, workers=0, progress=False)
-    assert "thousands of points lie alone, far from any other (found 4,100 of" in run.unreadable[str(source)]
+    made = run_tiled([str(source), HEIGHTS, str(tmp_path / "o_#.las")], 1000, workers=0, progress=False)
+    assert "thousands of points lie alone, far from any other (found 4,100 of" in made.unreadable[str(source)]
     assert not list(tmp_path.glob("o_*"))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages import run_tiled
-from pdal_stages.tiling.tile import TileTask
+from pdal_stages.tiling import run
 
 pytestmark = pytest.mark.pdal
 
@@ -39,7 +39,7 @@ def test_it_is_found_before_the_first_tile(tmp_path, monkeypatch, write_las, sta
     monkeypatch.chdir(tmp_path)
     text = "[\n" + ",\n".join(json.dumps(stage) for stage in ["a.las", "b.las", *stages]) + "\n]"
     (tmp_path / "job.json").write_text(text)
-    monkeypatch.setattr(TileTask, "run", lambda self: pytest.fail("a tile was begun"))
+    monkeypatch.setattr(run, "run_tile", lambda *_: pytest.fail("a tile was begun"))
     with pytest.raises(ps.StageError, match=words) as raised:
         run_tiled(tmp_path / "job.json", 20, workers=0, buffer=0, dry_run=dry_run, progress=False)
     assert line in str(raised.value)

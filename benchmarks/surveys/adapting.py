@@ -22,7 +22,7 @@ from clouds import slug, true_classes
 from surveys import SHIPPED, SURVEYS
 
 from pdal_stages.pipeline.classify_request import ClassifyRequest
-from pdal_stages.tiling.adapting import SURE, AdaptTask
+from pdal_stages.tiling.adapting import SURE, adapt
 from pdal_stages.tiling.classify import ClassifyTask
 
 CODES = (2, 5, 6)
@@ -32,7 +32,7 @@ def run(data: Path, survey: str, model: Path, sure: float, folder: Path) -> dict
     """Overall accuracy and F1 by both models."""
     files, began = [str(data / name) for name in SURVEYS[survey].files], time.process_time()
     adapted = str(folder / "adapted.model")
-    AdaptTask(files, adapted, str(model), sure).run()
+    adapt(files, adapted, str(model), sure)
     seconds = time.process_time() - began
     found: dict[str, Any] = {"survey": survey, "adapting": round(seconds, 1)}
     for name, used in (("before", str(model)), ("after", adapted)):

@@ -86,11 +86,11 @@ def _train(options: argparse.Namespace) -> None:
 
 def _adapt(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
-    from ..tiling.adapting import AdaptTask
+    from ..tiling.adapting import adapt
 
-    task = AdaptTask(options.inputs, options.model, options.teacher, options.sure, tiles.options_of(options))
+    how = tiles.options_of(options)
     with tiles.interruptible():
-        print_messages(*task.run())
+        print_messages(*adapt(options.inputs, options.model, options.teacher, options.sure, how))
     if Path(options.model).is_file():
         print(load_model(options.model))
 

@@ -7,7 +7,7 @@ ground look like with this sensor and point density and in this region, and a mo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,67 +35,79 @@ FEWEST = 200
 MOST = 20_000_000
 
 
-@dataclass(frozen=True)
-class AdaptTask:
-    """A model to be adapted to a survey."""
+def adapt(
+    inputs: Sequence[str],
+    model: str,
+    teacher: str = "standard",
+    sure: float = SURE,
+    options: TilingOptions | None = None,
+) -> list[str]:
+    """Write a model adapted to a survey; returns messages.
 
-    #: files, folders, patterns, tile indexes of one survey; of their classes only noise and overlap matter
-    inputs: Sequence[str]
-    model: str  #: the file to write
-    teacher: str = "standard"  #: the model that classifies the survey
-    sure: float = SURE  #: the least ``Reliability`` of points to train on
-    options: TilingOptions = field(default_factory=TilingOptions)
+    Parameters
+    ----------
+    inputs : sequence of str
+        Files, folders, patterns, tile indexes of one survey; of their classes only noise and overlap matter.
+    model : str
+        The file to write.
+    teacher : str
+        The model that classifies the survey.
+    sure : float
+        The least ``Reliability`` of points to train on.
+    options : TilingOptions, optional
 
-    def run(self) -> list[str]:
-        """Write the model; returns messages. StageError where the teacher is sure of fewer than two classes."""
-        sure = checks.number("'--sure'", self.sure, 0.0, 1.0)
-        teacher, files = load_model(self.teacher), input_files(self.inputs)
-        check_outputs([Output(self.model, "model", MODEL)], files)
-        chosen, told = spread(files)
-        with work_folder(self.model) as folder:
-            classified = self._classified(chosen, folder)
-            found = sure_points(classified, sure, teacher.codes.tolist())
-            codes = [code for code, count in found.items() if count >= FEWEST]
-            if len(codes) < 2:
-                counts = ", ".join(f"{count:,} of class {code}" for code, count in found.items())
-                raise StageError(
-                    f"'{self.teacher}' is sure of {FEWEST:,} points or more in fewer than two of its classes",
-                    found=counts,
-                    cure="Adapt to more of the survey, or use that model itself",
-                )
-            given: dict[str, Any] = {
-                "classes": ",".join(map(str, codes)),
-                "where": f"Reliability >= {sure:g}",
-                "voxel": teacher.voxel,
-                "count": COUNT,
-                "folds": 0,  # scoring against the teacher's own answers means nothing
-            }
-            made = str(folder / "adapted.model")
-            TrainTask(classified, made, (), given, self.options).run()
-            new, name = load_model(made), Path(self.teacher).stem
-            of = {"name": name, "sha256": digest_of(self.teacher), "sure": sure}
-            replace(new, info={**new.info, "teacher": of}).save(self.model)
-        missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
-        if missing:
-            told.append(
-                f"'{self.teacher}' is sure of too few points of a class ({', '.join(missing)}): the new model leaves it out"
-            )
-        return told
-
-    def _classified(self, files: Sequence[str], folder: Path) -> list[str]:
-        """The inputs as the teacher classifies them."""
-        request = ClassifyRequest(self.teacher, dimensions=("Reliability",))
-        task = ClassifyTask(tuple(files), f"{folder}/classified/", request, self.options)
-        if task.in_one_piece:
-            return [task.run_whole().path]
-        run = task.run_tiles()
-        if run.failures:
+    Raises
+    ------
+    StageError
+        Where the teacher is sure of fewer than two classes.
+    """
+    sure, options = checks.number("'--sure'", sure, 0.0, 1.0), options or TilingOptions()
+    known, files = load_model(teacher), input_files(inputs)
+    check_outputs([Output(model, "model", MODEL)], files)
+    chosen, told = spread(files)
+    with work_folder(model) as folder:
+        request = ClassifyRequest(teacher, dimensions=("Reliability",))
+        classified = _classified(ClassifyTask(tuple(chosen), f"{folder}/classified/", request, options))
+        found = sure_points(classified, sure, known.codes.tolist())
+        codes = [code for code, count in found.items() if count >= FEWEST]
+        if len(codes) < 2:
+            counts = ", ".join(f"{count:,} of class {code}" for code, count in found.items())
             raise StageError(
-                f"{len(run.failures):,} parts of the survey cannot be classified",
-                found="; ".join(str(one) for one in run.failures[:3]),
-                cure="Repair these files, or leave them out",
+                f"'{teacher}' is sure of {FEWEST:,} points or more in fewer than two of its classes",
+                found=counts,
+                cure="Adapt to more of the survey, or use that model itself",
             )
-        return sorted(str(one) for one in (folder / "classified").rglob("*.la[sz]"))
+        given: dict[str, Any] = {
+            "classes": ",".join(map(str, codes)),
+            "where": f"Reliability >= {sure:g}",
+            "voxel": known.voxel,
+            "count": COUNT,
+            "folds": 0,  # scoring against the teacher's own answers means nothing
+        }
+        made = str(folder / "adapted.model")
+        TrainTask(classified, made, (), given, options).run()
+        new, of = load_model(made), {"name": Path(teacher).stem, "sha256": digest_of(teacher), "sure": sure}
+        replace(new, info={**new.info, "teacher": of}).save(model)
+    missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
+    if missing:
+        told.append(
+            f"'{teacher}' is sure of too few points of a class ({', '.join(missing)}): the new model leaves it out"
+        )
+    return told
+
+
+def _classified(task: ClassifyTask) -> list[str]:
+    """The files that a task classifies."""
+    if task.in_one_piece:
+        return [task.run_whole().path]
+    run = task.run_tiles()
+    if run.failures:
+        raise StageError(
+            f"{len(run.failures):,} parts of the survey cannot be classified",
+            found="; ".join(str(one) for one in run.failures[:3]),
+            cure="Repair these files, or leave them out",
+        )
+    return sorted(str(one) for one in Path(task.output).rglob("*.la[sz]"))
 
 
 def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from ..base.arrays import places_among
 from ..pipeline.runtime import points_of
 from ..stages.hag_morphological import HagMorphological, inside_block
-from .inputs import CloudIndex, InputSource
+from .inputs import IndexedSource
 from .outputs import arrays_of
 from .pieces import Piece, cut_all
-from .plan import OUTSIDE, FirstRound, TilePlan
+from .plan import OUTSIDE, TilePlan
 from .settings import Box, TileGrid
 from .store import load_arrays, save_arrays, written
 from .tile import Changed, FromBefore, HeadRun, RunContext, run_head
@@ -48,67 +48,51 @@ def stage_of(plan: TilePlan) -> HagMorphological:
     return HagMorphological(options)
 
 
-@dataclass(frozen=True)
-class FirstRoundTask:
-    """A tile of the first round."""
+def run_first_round(
+    context: RunContext, tile: tuple[int, int], sources: Sequence[IndexedSource], target: str
+) -> dict[str, Any]:
+    """Save what the raster needs of a tile's own points, and the changes by earlier stages; returns a record.
 
-    context: RunContext
-    first: FirstRound
-    tile: tuple[int, int]
-    sources: list[
-        tuple[InputSource, CloudIndex | None]
-    ]  #: inputs that may have points in the tile or its halo
-    target: str  #: file for the result
+    `sources` may have points in the tile or its halo.
+    """
+    plan, first = context.plan, context.plan.first
+    assert first is not None
+    stage, left = stage_of(plan), [{"around": np.empty((0, 4))}]
 
-    def run(self) -> dict[str, Any]:
-        """Save what the raster needs of the tile's own points, and the changes by earlier stages."""
-        context, plan, first = self.context, self.context.plan, self.first
-        stage, left = stage_of(plan), [{"around": np.empty((0, 4))}]
+    def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        mine = ins[OUTSIDE] < 0
+        if mine.any():
+            left.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
 
-        def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-            mine = ins[OUTSIDE] < 0
-            if mine.any():
-                left.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
-
-        before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
-        head = HeadRun([])
-        with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
-            cuts = cut_all(context.grid, self.tile, self.sources, first.halo_m / context.unit, folder)
-            if cuts:
-                head = run_head(replace(context, plan=before), self.tile, cuts, True, last=leave)
-        arrays = {
-            name: np.concatenate([one[name] for one in left if name in one])
-            for name in {name for one in left for name in one}
-        }
-        if first.kept:
-            arrays |= arrays_of(head.results)
-        save_arrays(self.target, arrays)
-        return {"outputs": written([self.target]), "messages": head.messages}
+    before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
+    head = HeadRun([])
+    with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
+        cuts = cut_all(context.grid, tile, sources, first.halo_m / context.unit, folder)
+        if cuts:
+            head = run_head(replace(context, plan=before), tile, cuts, True, last=leave)
+    arrays = {
+        name: np.concatenate([one[name] for one in left if name in one])
+        for name in {name for one in left for name in one}
+    }
+    if first.kept:
+        arrays |= arrays_of(head.results)
+    save_arrays(target, arrays)
+    return {"outputs": written([target]), "messages": head.messages}
 
 
-@dataclass(frozen=True)
-class BlockTask:
-    """A block of the raster, computed from the first round's results around it."""
-
-    plan: TilePlan
-    block: tuple[int, int]
-    tiles: list[str]  #: files of the first round, of the tiles around that are done
-    target: str
-
-    def run(self) -> dict[str, Any]:
-        """Save the block."""
-        assert self.plan.first is not None
-        blocks = self.plan.first.blocks
-        low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(self.block, blocks.reach)
-        parts = [np.empty((4, 0))]  # whose rows are taken as they are
-        for path in self.tiles:
-            x, y, *_ = points = load_arrays(path, ["around"])["around"].T
-            parts.append(points[:, (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)])
-        inside = (load_arrays(path, [inside_block(self.block)]) for path in self.tiles)
-        mine = (points for found in inside for points in found.values())
-        block = stage_of(self.plan).block_of(np.concatenate(parts, axis=1).T, mine, self.block)
-        save_arrays(self.target, block)
-        return {"outputs": written([self.target])}
+def make_block(plan: TilePlan, block: tuple[int, int], tiles: Sequence[str], target: str) -> dict[str, Any]:
+    """Save a block of the raster, computed from the first round's files of the tiles around it; returns a record."""
+    assert plan.first is not None
+    blocks = plan.first.blocks
+    low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(block, blocks.reach)
+    parts = [np.empty((4, 0))]  # whose rows are taken as they are
+    for path in tiles:
+        x, y, *_ = points = load_arrays(path, ["around"])["around"].T
+        parts.append(points[:, (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)])
+    inside = (load_arrays(path, [inside_block(block)]) for path in tiles)
+    mine = (points for found in inside for points in found.values())
+    save_arrays(target, stage_of(plan).block_of(np.concatenate(parts, axis=1).T, mine, block))
+    return {"outputs": written([target])}
 
 
 def blocks_around(context: RunContext, tile: tuple[int, int], around_m: float) -> list[tuple[int, int]]:

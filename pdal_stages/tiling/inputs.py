@@ -179,6 +179,10 @@ class CloudIndex:
         return cls(int(record["count"]), tuple(record["box"]), tiles, cells, copy)
 
 
+#: An input with the index of its points; EPT sources have none.
+IndexedSource = tuple[InputSource, CloudIndex | None]
+
+
 class Survey:
     """The inputs of a run, and its options with tile size and number of workers decided."""
 
@@ -297,7 +301,7 @@ class Survey:
         """Inputs that may have points in a tile or its halo."""
         return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, halo_units))]
 
-    def readable(self, sources: list[InputSource]) -> list[tuple[InputSource, CloudIndex | None]]:
+    def readable(self, sources: list[InputSource]) -> list[IndexedSource]:
         """The readable ones, with the index of their points."""
         return [(s, self.indexes.get(s.path)) for s in sources if s.path not in self.unreadable]
 

@@ -220,79 +220,63 @@ def with_dimensions(
 # ---- an output for each input file -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FileTask:
-    """The output of an input file, to be assembled from tiles."""
+def write_file(
+    plan: TilePlan, source: InputSource, count: int, results: list[str], outputs: list[str], scratch: str
+) -> dict[str, Any]:
+    """Write the outputs of an input file of `count` points from the results of its tiles; the record, with class counts."""
+    tail = with_dimensions(plan.tail, plan.extra_dims, [source.path])
+    writer, names = plan.writers[0], [Path(path).suffix.lower() for path in outputs]
+    plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())
+    if count > MOST_AT_ONCE and plain and names in ([".las"], [".laz"]):  # all parts have the same header
+        return _in_parts(source, count, results, tail, outputs, scratch)
+    new = read_results(results, source, count, 0, count)
+    if not count:  # no tile has results, so the dimensions come from the plan
+        types = plan.makes.items()
+        new = NewValues(new.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types})
+    reader = {**source.reader, "filename": source.path}
+    return run_tail([reader], [new], tail, outputs, scratch) | {"classes": _classes(new)}
 
-    plan: TilePlan
-    source: InputSource
-    count: int  #: points of the input
-    results: list[str]  #: files of tiles
-    outputs: list[str]  #: what each of the writers writes
-    scratch: str  #: folder for temporary files
 
-    def run(self) -> dict[str, Any]:
-        """Write the outputs; returns a record of what was written, with counts of classes."""
-        tail = with_dimensions(self.plan.tail, self.plan.extra_dims, [self.source.path])
-        if self.count > MOST_AT_ONCE and self._can_be_joined:
-            return self._in_parts(tail)
-        new = self._new_values(0, self.count)
-        reader = {**self.source.reader, "filename": self.source.path}
-        return run_tail([reader], [new], tail, self.outputs, self.scratch) | {"classes": _classes(new)}
+def _in_parts(
+    source: InputSource,
+    points: int,
+    results: list[str],
+    tail: list[dict[str, Any]],
+    outputs: list[str],
+    scratch: str,
+) -> dict[str, Any]:
+    """Run the tail on each part into an uncompressed file, and join these under the first one's header."""
+    import laspy
 
-    @property
-    def _can_be_joined(self) -> bool:
-        """Whether the output is one LAS or LAZ file whose parts have the same header."""
-        names = [Path(path).suffix.lower() for path in self.outputs]
-        writer = self.plan.writers[0]
-        plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())
-        return plain and names in ([".las"], [".laz"])
+    classes: Counter[str] = Counter()
+    out: Any = None
+    count = 0
+    tail = [{k: v for k, v in stage.items() if k != "compression"} for stage in tail]
 
-    def _new_values(self, start: int, end: int) -> NewValues:
-        found = read_results(self.results, self.source, self.count, start, end)
-        if self.count:
-            return found
-        # No tile has results, so the dimensions come from the plan.
-        types = self.plan.makes.items()
-        return NewValues(
-            found.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types}
-        )
+    def check(made: Path, final: Path, number: int) -> None:
+        check_complete(made, final, {"type": "writers.las", "filename": final}, count)
 
-    def _in_parts(self, tail: list[dict[str, Any]]) -> dict[str, Any]:
-        """Run the tail on each part into an uncompressed file, and join these under the first one's header."""
-        import laspy
-
-        classes: Counter[str] = Counter()
-        out: Any = None
-        count = 0
-        tail = [{k: v for k, v in stage.items() if k != "compression"} for stage in tail]
-
-        def check(made: Path, final: Path, number: int) -> None:
-            check_complete(made, final, {"type": "writers.las", "filename": final}, count)
-
-        with whole_files(*self.outputs, check=check) as (partial,), contextlib.ExitStack() as stack:
-            folder = stack.enter_context(TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True))
-            piece, part = (os.path.join(folder, name) for name in ("part.las", "out.las"))
-            for start in range(0, self.count, MOST_AT_ONCE):
-                end = min(self.count, start + MOST_AT_ONCE)
-                write_records(piece, header_of(self.source.path), record_blocks(self.source.path, start, end))
-                new = self._new_values(start, end)
-                run_tail([{**self.source.reader, "filename": piece}], [new], tail, [part], self.scratch)
-                classes.update(_classes(new))
-                with laspy.open(part) as made:
-                    if out is None:
-                        how = {"header": made.header, "do_compress": partial.suffix.lower() == ".laz"}
-                        out = stack.enter_context(laspy.open(partial, mode="w", **how))
-                    elif [*made.header.offsets] != [*out.header.offsets]:
-                        raise StageError(
-                            "internal: parts of a file have different offsets", found=str(partial)
-                        )
-                    for points in made.chunk_iterator(BLOCK):
-                        out.write_points(points)
-                    count += int(made.header.point_count)
-            if out.header.evlrs:
-                out.write_evlrs(out.header.evlrs)
-        return {"outputs": written(self.outputs), "written": count, "classes": dict(classes)}
+    with whole_files(*outputs, check=check) as (partial,), contextlib.ExitStack() as stack:
+        folder = stack.enter_context(TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True))
+        piece, part = (os.path.join(folder, name) for name in ("part.las", "out.las"))
+        for start in range(0, points, MOST_AT_ONCE):
+            end = min(points, start + MOST_AT_ONCE)
+            write_records(piece, header_of(source.path), record_blocks(source.path, start, end))
+            new = read_results(results, source, points, start, end)
+            run_tail([{**source.reader, "filename": piece}], [new], tail, [part], scratch)
+            classes.update(_classes(new))
+            with laspy.open(part) as made:
+                if out is None:
+                    how = {"header": made.header, "do_compress": partial.suffix.lower() == ".laz"}
+                    out = stack.enter_context(laspy.open(partial, mode="w", **how))
+                elif [*made.header.offsets] != [*out.header.offsets]:
+                    raise StageError("internal: parts of a file have different offsets", found=str(partial))
+                for chunk in made.chunk_iterator(BLOCK):
+                    out.write_points(chunk)
+                count += int(made.header.point_count)
+        if out.header.evlrs:
+            out.write_evlrs(out.header.evlrs)
+    return {"outputs": written(outputs), "written": count, "classes": dict(classes)}
 
 
 def _classes(new: NewValues) -> dict[str, int]:

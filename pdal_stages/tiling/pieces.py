@@ -21,7 +21,7 @@ from ..base.arrays import begins_run
 from ..base.files import whole_files
 from ..pipeline.parts import header_of, las_chunks
 from ..terrain.cells import refuse_scattered
-from .inputs import CloudIndex, InputSource, fetch_ept
+from .inputs import CloudIndex, IndexedSource, InputSource, fetch_ept
 from .settings import Box, TileGrid, check_number
 
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
@@ -151,7 +151,7 @@ class Piece:
 def cut_all(
     grid: TileGrid,
     tile: tuple[int, int],
-    sources: Sequence[tuple[InputSource, CloudIndex | None]],
+    sources: Sequence[IndexedSource],
     halo_units: float,
     folder: str,
 ) -> list[Piece]:

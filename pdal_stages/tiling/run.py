@@ -23,15 +23,15 @@ from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
-from .ground import BlockTask, FirstRoundTask, block_name, blocks_around, from_before, left_name
-from .inputs import CloudIndex, InputSource, Survey
-from .outputs import FileTask
+from .ground import block_name, blocks_around, from_before, left_name, make_block, run_first_round
+from .inputs import CloudIndex, IndexedSource, Survey
+from .outputs import write_file
 from .pieces import TEMPORARY, sort_points
 from .plan import TilePlan, make_plan, outputs_for
 from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .settings import TilingOptions, worker_bytes
 from .store import Store, fingerprint
-from .tile import RunContext, TileTask
+from .tile import RunContext, run_tile
 
 #: A run stops when this many tiles failed for the same reason and none succeeded.
 _HOPELESS = 10
@@ -341,11 +341,12 @@ class _Run:
                 results = [store.path(each.name) for each in job.jobs]
                 assert job.outputs is not None
                 plan, scratch = context.plan, context.scratch
-                return FileTask(plan, job.source, job.points, results, job.outputs, scratch).run
+                return partial(write_file, plan, job.source, job.points, results, job.outputs, scratch)
             sources = survey.near(job.tile, self.farthest)
             complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
             given = survey.readable(sources)
-            return TileTask(context, job.tile, given, complete, store.path(job.name), job.outputs, before).run
+            result = store.path(job.name)
+            return partial(run_tile, context, job.tile, given, complete, result, job.outputs, before)
 
         for job in self._do("tiles", waiting, task_of):
             if finished is not None and job.state == "done" and job.outputs and job.record["outputs"]:
@@ -389,11 +390,11 @@ class _Run:
         head = self.plan.head[: first.at + 1]
         common = [build(), head, survey.stamps_of(head), survey.grid.size, first.halo_m, unit, first.kept]
 
-        def sources(tile: tuple[int, int]) -> list[tuple[InputSource, CloudIndex | None]]:
+        def sources(tile: tuple[int, int]) -> list[IndexedSource]:
             return survey.readable(survey.near(tile, first.halo_m / unit))
 
         def first_task(job: Job) -> Callable[[], Any]:
-            return FirstRoundTask(context, first, job.tile, sources(job.tile), store.path(job.name)).run
+            return partial(run_first_round, context, job.tile, sources(job.tile), store.path(job.name))
 
         firsts: dict[tuple[int, int], Job] = {}
         for tile in sorted({tile for tiles in near.values() for tile in tiles}):
@@ -405,7 +406,7 @@ class _Run:
 
         def block_task(job: Job) -> Callable[[], Any]:
             left = [store.path(firsts[tile].name) for tile in near[job.tile]]
-            return BlockTask(context.plan, job.tile, left, store.path(job.name)).run
+            return partial(make_block, context.plan, job.tile, left, store.path(job.name))
 
         blocks: dict[tuple[int, int], Job] = {}
         for block, tiles in near.items():

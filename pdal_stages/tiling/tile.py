@@ -22,7 +22,7 @@ from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages.base import stage_types
 from ..stages.hag_morphological import HagMorphological
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
-from .inputs import CloudIndex, InputSource
+from .inputs import IndexedSource
 from .outputs import NewValues, PieceResults, arrays_of, flags_in_classes, read_with, write_tile
 from .pieces import Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, TilePlan
@@ -190,78 +190,86 @@ def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceRe
 # ---- a tile ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TileTask:
-    """The task of a tile."""
+#: Gives the first round's results for a tile that is read with so many meters around it.
+Before = Callable[[RunContext, tuple[int, int], float, list[Piece]], FromBefore]
 
-    context: RunContext
-    tile: tuple[int, int]
-    #: Inputs that may have points in it or its halo; EPT sources have no index.
-    sources: list[tuple[InputSource, CloudIndex | None]]
-    complete: float  #: meters around the tile within which these are all inputs
-    result: str  #: file for the results, where outputs are assembled from tiles
-    outputs: list[str] | None  #: otherwise: the files of the writers
-    #: Gives the first round's results for a tile read with so many meters around it; None where there was none.
-    before: Callable[[RunContext, tuple[int, int], float, list[Piece]], FromBefore] | None
 
-    def run(self) -> dict[str, Any]:
-        """Run the head; save its results, or write the outputs; returns a record."""
-        context = self.context
-        with TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
-            results, record = self._settled(folder)
-            if self.outputs is not None:
-                wrote = write_tile(results, context.plan, self.outputs, context.scratch)
-                return record | wrote | {"messages": [*record["messages"], *wrote.get("messages", [])]}
-            save_arrays(self.result, arrays_of(results))
-        return record | {"outputs": written([self.result])}
+def run_tile(
+    context: RunContext,
+    tile: tuple[int, int],
+    sources: Sequence[IndexedSource],
+    complete: float,
+    result: str,
+    outputs: list[str] | None,
+    before: Before | None,
+) -> dict[str, Any]:
+    """Run the head on a tile; save the results in the file `result`, or write the `outputs`; returns a record.
 
-    def _settled(self, folder: str) -> tuple[list[PieceResults], dict[str, Any]]:
-        """Run the head with a sufficient halo; returns results and a record.
+    `sources` may have points in the tile or its halo; they are all inputs within `complete` meters around it.
+    """
+    with TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
+        results, record = _settled(context, tile, sources, complete, before, folder)
+        if outputs is not None:
+            wrote = write_tile(results, context.plan, outputs, context.scratch)
+            return record | wrote | {"messages": [*record["messages"], *wrote.get("messages", [])]}
+        save_arrays(result, arrays_of(results))
+    return record | {"outputs": written([result])}
 
-        It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that did not
-        suffice (``short``).
-        """
-        context, grid, least_m = self.context, self.context.grid, self.context.plan.halo_m
-        side, halo_m, short = grid.size * context.unit, least_m, False
-        head: HeadRun | None = None
-        for attempt in range(_WIDENINGS + 1):
-            cuts = cut_all(grid, self.tile, self.sources, halo_m / context.unit, folder)
-            read = sum(len(piece.index) for piece in cuts)
-            own = sum(len(piece.own) for piece in cuts)
-            if not own:
-                head = HeadRun([PieceResults(piece, np.empty(0, np.int64), {}) for piece in cuts])
-                break
-            everything = inside(context.bounds, grid.box(self.tile, halo_m / context.unit))
-            before = self.before(context, self.tile, halo_m, cuts) if self.before else None
-            try:
-                head = run_head(context, self.tile, cuts, everything, before)
-                need = head.need
-            except NoTerrainError:
-                if everything:
-                    raise
-                head, need = None, side + 2 * least_m  # look farther away
-            if everything or need <= halo_m:
-                break
-            short = True
-            if math.isinf(need):  # there are too few points
-                need = halo_m + 2 * side
-            estimate = read * ((side + 2 * need) / (side + 2 * halo_m)) ** 2
-            if attempt == _WIDENINGS or estimate > context.most_points or need > self.complete:
-                break
-            halo_m, short = need + 1e-6, False
-        if head is None:
-            raise NoTerrainError(
-                "no terrain: no point near the tile can be part of it", found=f"within {halo_m:.0f} m"
-            )
-        given = (one.values["Classification"] for one in head.results if "Classification" in one.values)
-        return head.results, {
-            "points": own,
-            "read": read,
-            "halo_m": halo_m,
-            "short": short,
-            "widened": halo_m > least_m,
-            "dropped": own - sum(len(result.rows) for result in head.results),
-            "classes": class_counts(np.concatenate([np.zeros(0, np.uint8), *given])),
-            "messages": head.messages,
-            "left_alone": head.left_alone,
-        }
+
+def _settled(
+    context: RunContext,
+    tile: tuple[int, int],
+    sources: Sequence[IndexedSource],
+    complete: float,
+    before: Before | None,
+    folder: str,
+) -> tuple[list[PieceResults], dict[str, Any]]:
+    """Run the head with a sufficient halo; returns results and a record.
+
+    It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that did not
+    suffice (``short``).
+    """
+    grid, least_m = context.grid, context.plan.halo_m
+    side, halo_m, short = grid.size * context.unit, least_m, False
+    head: HeadRun | None = None
+    for attempt in range(_WIDENINGS + 1):
+        cuts = cut_all(grid, tile, sources, halo_m / context.unit, folder)
+        read = sum(len(piece.index) for piece in cuts)
+        own = sum(len(piece.own) for piece in cuts)
+        if not own:
+            head = HeadRun([PieceResults(piece, np.empty(0, np.int64), {}) for piece in cuts])
+            break
+        everything = inside(context.bounds, grid.box(tile, halo_m / context.unit))
+        given = before(context, tile, halo_m, cuts) if before else None
+        try:
+            head = run_head(context, tile, cuts, everything, given)
+            need = head.need
+        except NoTerrainError:
+            if everything:
+                raise
+            head, need = None, side + 2 * least_m  # look farther away
+        if everything or need <= halo_m:
+            break
+        short = True
+        if math.isinf(need):  # there are too few points
+            need = halo_m + 2 * side
+        estimate = read * ((side + 2 * need) / (side + 2 * halo_m)) ** 2
+        if attempt == _WIDENINGS or estimate > context.most_points or need > complete:
+            break
+        halo_m, short = need + 1e-6, False
+    if head is None:
+        raise NoTerrainError(
+            "no terrain: no point near the tile can be part of it", found=f"within {halo_m:.0f} m"
+        )
+    classes = (one.values["Classification"] for one in head.results if "Classification" in one.values)
+    return head.results, {
+        "points": own,
+        "read": read,
+        "halo_m": halo_m,
+        "short": short,
+        "widened": halo_m > least_m,
+        "dropped": own - sum(len(result.rows) for result in head.results),
+        "classes": class_counts(np.concatenate([np.zeros(0, np.uint8), *classes])),
+        "messages": head.messages,
+        "left_alone": head.left_alone,
+    }

@@ -5,8 +5,8 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from itertools import chain
+from functools import cached_property, partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,7 +27,7 @@ from ..pipeline.expansion import expand_stage
 from ..pipeline.inputs_outputs import check_readers, is_ept, is_las, overridden, reader_of
 from ..pipeline.read import Override
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import Callbacks, points_of_views, python_filter
+from ..pipeline.runtime import Callbacks, points_of_views
 from ..stages.checked import CheckedChoice, CheckedPoints
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
@@ -45,18 +45,6 @@ TRAIN_POINT = 400
 _WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
-
-
-#: PDAL calls this for the points of one reader after the other.
-_NUMBER = f"""\
-import numpy as np
-number = 0
-def stage(ins, outs):
-    global number
-    number += 1
-    outs["{FILE_NUMBER}"] = np.full(len(ins["X"]), number, np.uint32)
-    return True
-"""
 
 
 def _lowered(given: Mapping[str, Any]) -> ClassifierModel:
@@ -175,11 +163,19 @@ class TrainTask:
         """The points with heights, and with file numbers where these are the groups of the score."""
         readers = [reader_of(file, f"input{i}") for i, file in enumerate(self.files, 1)]
         told = check_readers(readers)
-        number = python_filter("pdal_stages_file_number", _NUMBER, {}, {FILE_NUMBER: "uint32_t"})
-        numbers = [number] if stage.groups == FILE_NUMBER else []
         own = [one for one in self.overrides if one.selector != stage.type]
-        pipeline = Pipeline([*readers, *numbers, *map(dict, heights)], own)
-        pipeline.execute()
+        numbers = count(1)
+
+        def number(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+            """PDAL calls it for the points of one reader after the other."""
+            outs[FILE_NUMBER] = np.full(len(ins["X"]), next(numbers), np.uint32)
+
+        with Callbacks() as callbacks:
+            numbered = [callbacks.filter(number, {FILE_NUMBER: "uint32_t"})]
+            pipeline = Pipeline(
+                [*readers, *(numbered if stage.groups == FILE_NUMBER else []), *map(dict, heights)], own
+            )
+            pipeline.execute()
         if not any(map(len, pipeline.arrays)):
             raise StageError("there are no points to train on", where=", ".join(self.files[:3]))
         points = points_of_views(pipeline.arrays, pipeline.metadata, stage.points)
@@ -243,7 +239,7 @@ class TrainTask:
         if self.stage.groups == FILE_NUMBER:
             for number, name in enumerate(self.files, 1):
                 numbers[find_sources(readers_of([name]))[0].path] = number
-        plan = replace(plan, takes=Taking(self._writer, numbers), name=self.model)
+        plan = replace(plan, takes=partial(take_points, self._writer, numbers), name=self.model)
         run = run_plan(plan, replace(self.options, per="tile"))
         if run.failures:
             named = "; ".join(f"{what}: {why}" for what, why in run.failures[:_NAMED])
@@ -286,7 +282,7 @@ def _check_same(found: Sequence[str], before: Sequence[str]) -> None:
 
 
 def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCloud:
-    """The points of a tile, as :class:`Taking` wrote them."""
+    """The points of a tile, as :func:`take_points` wrote them."""
     arrays = load_arrays(path)
     wanted, sure = (arrays.pop(f"d/{mark}", np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
     if choice is not None:
@@ -294,45 +290,46 @@ def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCl
     return TrainingCloud(arrays["xyz"], arrays["labels"], name=name).having(arrays)
 
 
-@dataclass(frozen=True)
-class Taking:
-    """Saves a tile's own points for training, in place of a pipeline's writers."""
+def take_points(
+    writer: Mapping[str, Any],
+    numbers: Mapping[str, int],
+    results: list[PieceResults],
+    outputs: list[str],
+    scratch: str,
+) -> dict[str, Any]:
+    """Save a tile's own points for training, in place of a pipeline's writers (:attr:`TilePlan.takes`).
 
-    writer: Mapping[str, Any]  #: the stage that trains
-    numbers: Mapping[str, int]  #: of inputs by path, where points are to have the number of theirs
-
-    def __call__(self, results: list[PieceResults], outputs: list[str], scratch: str) -> dict[str, Any]:
-        stage = _lowered(self.writer)
-        readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
-        new = [self._new_values(result) for result in results]
-        with Callbacks() as callbacks:
-            flags = las_output.files_with_flags_to_split(readers)
-            stages, inputs = read_with(callbacks, readers, new, flags)
-            run = pdal_env.execute([*stages, {"type": "filters.merge", "inputs": inputs}])
-        if not run.count:
-            return {"outputs": []}
-        points = points_of_views(run.arrays, run.metadata, stage.points)
-        run.arrays.clear()
-        training = stage.training_on(points)
-        marks: dict[str, NDArray] = {}
-        looked: dict[str, Any] = {}
-        if stage.checked_only:
-            found, counts = stage.checked_points(points)
-            marks, looked = {_WANTED: found.wanted, _SURE: found.sure}, {"looked": counts}
-        save_arrays(outputs[0], stage.cloud_of(points, training, marks).arrays)
-        return {
-            "outputs": written(outputs),
-            "written": run.count,
-            "messages": points.report.messages,
-            "ignored": int(points.report.figures.get("ignored", 0)),
-            "dimensions": list(training.dimensions),
-            **looked,
-        }
-
-    def _new_values(self, result: PieceResults) -> NewValues:
-        """The results, with the number of each point's file."""
-        found = of_own_points(result)
-        if not self.numbers:
-            return found
-        number = np.full(len(result.piece.index), self.numbers[result.piece.source.path], np.uint32)
-        return NewValues(found.kept, {**found.values, FILE_NUMBER: (None, number)})
+    `writer` is the stage that trains; `numbers` are those of inputs by path, where points are to have the number of theirs.
+    """
+    stage = _lowered(writer)
+    readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
+    new = []
+    for result in results:
+        found, number = of_own_points(result), numbers.get(result.piece.source.path)
+        if number is not None:
+            numbered = (None, np.full(len(result.piece.index), number, np.uint32))
+            found = NewValues(found.kept, {**found.values, FILE_NUMBER: numbered})
+        new.append(found)
+    with Callbacks() as callbacks:
+        flags = las_output.files_with_flags_to_split(readers)
+        stages, inputs = read_with(callbacks, readers, new, flags)
+        run = pdal_env.execute([*stages, {"type": "filters.merge", "inputs": inputs}])
+    if not run.count:
+        return {"outputs": []}
+    points = points_of_views(run.arrays, run.metadata, stage.points)
+    run.arrays.clear()
+    training = stage.training_on(points)
+    marks: dict[str, NDArray] = {}
+    looked: dict[str, Any] = {}
+    if stage.checked_only:
+        checked, counts = stage.checked_points(points)
+        marks, looked = {_WANTED: checked.wanted, _SURE: checked.sure}, {"looked": counts}
+    save_arrays(outputs[0], stage.cloud_of(points, training, marks).arrays)
+    return {
+        "outputs": written(outputs),
+        "written": run.count,
+        "messages": points.report.messages,
+        "ignored": int(points.report.figures.get("ignored", 0)),
+        "dimensions": list(training.dimensions),
+        **looked,
+    }
