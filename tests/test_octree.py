@@ -69,7 +69,7 @@ def test_any_bytes_are_an_octree_or_an_error(tmp_path):
             check_copc(path)
 
 
-SCHEMA = [{"name": name, "type": "signed", "size": 4, "scale": 0.01, "offset": 0} for name in "XYZ"]
+SCHEMA = [{"name": name, "type": "signed", "size": 4, "scale": 1, "offset": 0} for name in "XYZ"]
 ABOUT = {"bounds": [0, 0, 0, 9, 9, 9], "boundsConforming": [0, 0, 0, 9, 9, 9], "points": 3, "schema": SCHEMA, "span": 128,
          "dataType": "binary", "hierarchyType": "json", "version": "1.0.0", "srs": {}}  # fmt: skip
 

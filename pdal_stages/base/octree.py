@@ -92,9 +92,18 @@ def read_ept(path: str) -> dict[str, Any]:
         named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
         if int(found["points"]) < 0 or not there or not named:
             raise ValueError("not a valid description, or its points lie outside its octree")
+        if found.get("dataType") != "laszip" and any(map(_is_rounded, found["schema"])):
+            raise ValueError("PDAL rounds its coordinates to whole numbers; build it as laszip")
         return found
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
+
+
+def _is_rounded(dimension: dict[str, Any]) -> bool:
+    """Whether it is an axis of integers that stand for fractions: PDAL puts the scaled values back into integers."""
+    if dimension["name"] not in ("X", "Y", "Z") or dimension["type"] == "float":
+        return False
+    return any(float(dimension.get(name) or 0) % 1 for name in ("scale", "offset"))
 
 
 def check_ept(path: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ the first round, as halo of their neighbors), so they read the copy. It is remov
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -35,6 +36,8 @@ TEMPORARY = "temporary"
 _PART = 1_000_000
 #: The points are sorted by cells; this many make up the side of a tile.
 _CELLS = 4
+#: Points are alone if no other lies in the same square of this side, at least: small tiles are no sign of damage.
+_PLACE = 250.0
 
 
 # ---- LAS and LAZ files by laspy ------------------------------------------------------------------------------
@@ -70,6 +73,8 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     tiles: Counter[tuple[int, int]] = Counter()
+    places: Counter[tuple[int, int]] = Counter()
+    wide = math.ceil(_PLACE / cells.size)
     found = []
     total = 0
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
@@ -89,10 +94,11 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
             made = np.column_stack([column[starts], line[starts], total + starts, counts]).tolist()
             for i, j, _, number in made:  # cells divide tiles exactly: powers of two do in floats
                 tiles[i // _CELLS, j // _CELLS] += number
+                places[i // wide, j // wide] += number
             check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
             found += made
             total += len(records)
-    refuse_scattered(tiles.values())
+    refuse_scattered(places.values())
     box = [*low.tolist(), *high.tolist()]
     return {"count": total, "box": box, "tiles": [(*t, n) for t, n in sorted(tiles.items())], "cells": found}
 
