@@ -117,6 +117,8 @@ def test_inputs_of_one_name_lie_in_their_folders(folder, classify, tmp_path):
 def test_a_suffix_that_pdal_does_not_know(folder, classify, tmp_path):
     code, _, err = classify(folder / "in/t0.laz", tmp_path / "out.lax")
     assert code == 1 and "out.lax" in err and "Is the suffix mistyped (.laz, .las)?" in err
+    code, _, err = classify(folder / "in/t0.laz", tmp_path / "out.tif")
+    assert code == 1 and "classify writes points" in err and "--objects FILE" in err
 
 
 def test_metadata_of_many(folder, classify, tmp_path):

@@ -73,7 +73,8 @@ def test_the_shipped_model_says_what_it_costs():
     line = said(known, {}, 0.9)[1]
     assert "no point keeps it" in line
     assert "50.0 % of the most reliable were right; with 0.5, 100.0 % would" in line
-    # Of corrections on top of a base: what is known of the base, and of new classes alone what they say.
+    # Of corrections on top of a base: what is known of the base, and of new classes alone what they say: here as many
+    # points of 14 as of the base's classes.
     own = {
         "about": "",
         "classes": {"6": known.to_dict()["classes"]["6"], "14": known.to_dict()["classes"]["6"]},
@@ -81,7 +82,9 @@ def test_the_shipped_model_says_what_it_costs():
     standard = of_the_base({}, {}, find("standard"))
     joined = of_the_base(own, {}, find("standard"))
     assert joined["about"] == standard["about"] and standard["about"].startswith("its base (15 surveys")
-    assert joined["classes"] == {**standard["classes"], "14": own["classes"]["14"]}
+    assert {code: joined["classes"][code] for code in standard["classes"]} == standard["classes"]
+    both = Sureness.from_dict(joined)
+    assert np.isclose(both.points([14]), both.points([2, 5, 6]), rtol=1e-3) and both.points([2, 5, 6]) > 1e6
     assert of_the_base(own, {}, "nowhere.model") == own
     sure = ClassifyRequest(keep_sure=0.98).cost  # buildings stay with 98 %, too
     assert not any("no point keeps it" in line for line in sure)

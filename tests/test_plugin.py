@@ -276,6 +276,8 @@ def test_errors_of_the_work(pipeline, ready_town, ready_models, tmp_path):
     assert "not finite" in finite and "1 of 2 points" in finite
     assert "numpy" not in missing + required + finite and "of a stage that failed" not in finite
     assert not out.exists()
+    nan.write_text("X,Y,Z\n1,1,1\n2,2,2\n")
+    assert "meters were assumed" in pipeline(las([reader, {"type": "filters.hag_minima"}], out)).stderr
 
 
 def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):

@@ -76,7 +76,8 @@ def test_tile_index_to_tiles(ready_halves, ready_models, tmp_path):
     files = "\n".join(map(str, ready_halves.glob("*.laz")))
     subprocess.run(command, input=files, text=True, check=True, capture_output=True)
     words = [f"--stage.input.filename={index}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
-    run("tile-index-to-tiles", *words, f"--stage.classifier.model={ready_models / 'classes.model'}")
+    words.append(f"--stage.classifier.model={ready_models / 'classes.model'}")
+    run_tiled(FOLDER / "tile-index-to-tiles.json", 500, parse_overrides(words)[0], per="tile", workers=0)
     assert list(tmp_path.glob("o_*.laz"))
 
 

@@ -3,7 +3,7 @@ sure it was, on ground that it had not seen: from which reliability on points of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -134,9 +134,7 @@ def held_out(info: Mapping[str, Any]) -> Mapping[str, Any]:
 def score(info: Mapping[str, Any]) -> str:
     """The score in a line, or why there is none."""
     if teacher := info.get("teacher"):
-        return (
-            f"not scored     {teacher['name']}'s answers are its labels; how right it is only your own tell"
-        )
+        return f"not scored     its labels are answers of {teacher['name']}; only labels of your own tell how right it is"
     row = held_out(info)
     if not row:
         return f"not scored     {info['training'].get('unscored', 'the model file holds no score')}"
@@ -204,10 +202,14 @@ class Sureness:
             out[code] = Limit(first / BINS, float(all_[first] / all_[0]), float(right[first] / all_[first]))
         return out
 
+    def points(self, codes: Iterable[int]) -> float:
+        """The points that were given these classes."""
+        return sum(float((self.right[code] + self.wrong[code]).sum()) for code in codes if code in self.right)
+
     def kept(self, limits: Mapping[int, Limit]) -> float:
         """The share of all points that keep their class."""
-        count = {code: float((self.right[code] + self.wrong[code]).sum()) for code in self.right}
-        return sum(limits[code].kept * n for code, n in count.items()) / max(sum(count.values()), 1e-9)
+        kept = sum(limit.kept * self.points([code]) for code, limit in limits.items())
+        return kept / max(self.points(self.right), 1e-9)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a manifest or a file."""
@@ -267,14 +269,19 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
 def of_the_base(own: Mapping[str, Any], base: Mapping[str, Any], path: str) -> Mapping[str, Any]:
     """What a model on top of a base says of itself where its labels are a person's corrections.
 
-    These lie where the base was worst, so its `own` counts are taken for new classes alone, where the base's are known.
+    These lie where the base was worst, so its `own` counts are taken for new classes alone, where the base's are known,
+    as many to one of the base's classes as among the labels.
     """
     try:
         known = sureness_of(base, path)
     except OptionError:
         return own
-    about = f"its base ({known.about}), as its own labels lie where that was looked at"
-    return {"about": about, "classes": {**own.get("classes", {}), **known.to_dict()["classes"]}}
+    mine = Sureness.from_dict({"about": "", "classes": {}, **own})
+    ratio = known.points(known.right) / (mine.points(known.right) or known.points(known.right))
+    for code in mine.right.keys() - known.right.keys():
+        known.right[code], known.wrong[code] = ratio * mine.right[code], ratio * mine.wrong[code]
+    known.about = f"its base ({known.about}), as its own labels lie where that was looked at"
+    return known.to_dict()
 
 
 def said(known: Sureness, names: Mapping[int, str], accuracy: float) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from ..base.errors import ModelError, OptionError, suggest
@@ -163,6 +164,12 @@ class ClassifyRequest:
 
     def pipeline(self, source: str, target: str) -> Pipeline:
         """Read a file, compute heights where the model needs them, classify, and write with everything else kept."""
+        if Path(target).suffix.lower() in (".tif", ".tiff", ".gpkg", ".shp", ".geojson"):
+            raise OptionError(
+                "classify writes points",
+                found=target,
+                cure="Name a .laz or .las file. Buildings, trees and more: --objects FILE; rasters: docs/large-areas.md",
+            )
         writer = writer_of(target)
         if writer.get("type") in LAS_WRITERS:
             listed = extra_dims_option([source], self.extra_dims)

@@ -169,8 +169,8 @@ class WorkerProcesses(AbstractContextManager):
 def _stop_sending(pool: Any) -> None:
     """Let go of a large task that a dead worker did not read; Python before 3.11.5 would wait for it (gh-94777)."""
     if sys.version_info < (3, 11, 5):
-        with suppress(OSError):
-            pool._call_queue._reader.close()
+        with suppress(OSError), open(os.devnull) as nothing:  # the pool's own thread closes the reader
+            os.dup2(nothing.fileno(), pool._call_queue._reader.fileno())
 
 
 def _repeat(pipe: int, stream: LoggedStream) -> None:

@@ -41,9 +41,11 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
         stage, warning = _made(question)
         if question["step"] == "prepare":
             said = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
-            said += [] if warning is None else [runtime.leaf("pdal_stages_warning", warning)]
+            warnings = [warning] if warning else []
         else:
-            said = runtime.leaves(runtime.run_on_view(stage, module, ins, outs))
+            report = runtime.run_on_view(stage, module, ins, outs)
+            said, warnings = runtime.leaves(report), report.messages
+        said += [runtime.leaf("pdal_stages_warning", text) for text in warnings]
     except BaseException as error:
         outs.clear()
         said = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
