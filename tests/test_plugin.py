@@ -191,7 +191,7 @@ def test_a_ready_pipeline_gives_the_same_bytes(
 
 
 def test_points_of_several_readers_see_each_other(pipeline, ready_halves, tmp_path):
-    files = [str(ready_halves / "west.laz"), str(ready_halves / "east.laz")]
+    files, accuracy = [str(ready_halves / f"{side}.laz") for side in ("west", "east")], tmp_path / "a.json"
     for stages in (
         [*files, {"type": "filters.hag_minima"}],
         [
@@ -199,10 +199,14 @@ def test_points_of_several_readers_see_each_other(pipeline, ready_halves, tmp_pa
             {"type": "readers.las", "filename": files[1], "tag": "b"},
             {"type": "filters.hag_minima", "inputs": ["a", "b"]},
         ],
+        [files[0], {"type": "filters.splitter", "length": 30}, {**EVERY[-1], "json": str(accuracy)}],
     ):
         pipeline(las(stages, tmp_path / "stock.las"))
-        ps.Pipeline(las(stages, tmp_path / "ours.las")).execute()
+        stock = accuracy.read_text() if accuracy.exists() else ""
+        count = ps.Pipeline(las(stages, tmp_path / "ours.las")).execute()
         assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
+    made = json.loads(stock)  # one file of all points
+    assert stock == accuracy.read_text() and made["points"] + made["left_out"]["points"] == count
 
 
 # ---- options, metadata, log --------------------------------------------------------------------------------

@@ -27,7 +27,9 @@ from .runtime import TRAMPOLINE, made, place, python_filter
 #: Options of every PDAL stage that an expanded stage passes on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
 #: Stages after which several views are what the user asked for.
-_SPLITS = {f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns")}
+_SPLITS = {
+    f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns", "separatescanline")
+}
 
 
 @dataclass
@@ -72,7 +74,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
                 out.stages.append(flag_splitter(flags))
             continue
         try:
-            if several and _may_be_apart(stages, index):
+            if _may_be_apart(stages, index, several):
                 merge: dict[str, Any] = {"type": "filters.merge"}
                 if "inputs" in stage:
                     merge |= {"inputs": stage["inputs"], "tag": f"pdal_stages_merge_{index}"}
@@ -130,12 +132,17 @@ def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
     return inputs
 
 
-def _may_be_apart(stages: Sequence[dict[str, Any]], number: int) -> bool:
-    """Whether points of several readers may reach a stage in several views, and nobody split them on purpose."""
-    if any(stage.get("type") in _SPLITS for stage in stages[:number]):
-        return False
-    before = stages[number - 1].get("type") if number else None
-    return "inputs" in stages[number] or before not in ("filters.merge", *stage_types())
+def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) -> bool:
+    """Whether points may reach a stage in several views, of several readers, and nobody wants them apart.
+
+    A stage that makes one thing of all points never wants them apart; filters.crop splits, too, where it has several areas.
+    """
+    kinds = [stage.get("type") for stage in stages[:number]]
+    split = not _SPLITS.isdisjoint(kinds)
+    if stage_type(stages[number]["type"]).instead_of_tiles and (split or "filters.crop" in kinds):
+        return kinds[-1] != "filters.merge"
+    joined = "inputs" not in stages[number] and {*kinds[-1:]} <= {"filters.merge", *stage_types()}
+    return several and not split and not joined
 
 
 def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str]) -> None:

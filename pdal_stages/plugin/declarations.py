@@ -25,8 +25,9 @@ def header() -> str:
         name = f"OPTIONS_{number}"
         options.append(f"const Option {name}[] = {{{_options(kind)}}};")
         texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")
+        gathers = str(bool(kind.instead_of_tiles)).lower()
         stages.append(
-            f"    {{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option) }},"
+            f"    {{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option), {gathers} }},"
         )
     version = f"constexpr const char *VERSION = {json.dumps(__version__)};"
     return "\n".join([version, *options, "const Stage STAGES[] = {", *stages, "};", ""])

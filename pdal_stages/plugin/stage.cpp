@@ -61,6 +61,7 @@ struct Stage
     const char *link;
     const Option *options;
     std::size_t count;
+    bool gathers; // makes one thing of all points, as PDAL's own writers do
 };
 
 #include "declarations.hpp"
@@ -101,7 +102,7 @@ def stage(ins, outs):
 
 // Stages after which there is one view, or several are what the user asked for.
 const std::set<std::string> ONE_VIEW { "filters.merge", "filters.splitter", "filters.chipper", "filters.divider",
-    "filters.groupby", "filters.returns" };
+    "filters.groupby", "filters.returns", "filters.separatescanline" };
 
 // Options of every PDAL stage that a stage of ours answers itself, where PDAL must not see them: its own `where` hides
 // points, ours only chooses among them.
@@ -395,7 +396,10 @@ private:
     }
 
     virtual void prerun(const PointViewSet& views)
-        { m_views.assign(views.begin(), views.end()); }
+    {
+        m_views.assign(views.begin(), views.end());
+        m_gather = m_gather || (m_declared.gathers && views.size() > 1);
+    }
 
     virtual PointViewSet run(PointViewPtr view)
     {

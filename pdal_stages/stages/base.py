@@ -68,7 +68,7 @@ class Stage(ABC):
     where_chooses: ClassVar[bool] = False
     #: What a stage that cannot run without points does with them, as a message says it.
     needs_points: ClassVar[str] = ""
-    #: For a stage that needs all points at once: what to do instead of running it in tiles.
+    #: For a stage that makes one thing of all points, and gets them as one view: what to do instead of running it in tiles.
     instead_of_tiles: str = ""
     #: For a stage that a model file may carry, to be run by whoever applies it: the options that the file may give. Model
     #: files come from strangers, so none that holds a path.
