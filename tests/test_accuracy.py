@@ -105,7 +105,7 @@ def test_grading_equals_scikit_learn():
 def test_deciles_of_the_margin():
     rng = np.random.default_rng(3)
     margin, right = rng.random(20_000), rng.random(20_000) < 0.9
-    deciles = Grading.from_values(margin, right).quantiles()
+    deciles = Grading.from_values(margin, right).deciles()
     assert len(deciles) == 10
     order = np.argsort(margin)
     for i, group in enumerate(deciles):

@@ -53,7 +53,7 @@ def test_stdin_and_expand(job, run, monkeypatch, tmp_path):
     code, out, _ = run("expand", job)
     assert code == 0
     plain = json.loads(out)
-    assert [s.get("type") for s in plain["pipeline"]] == [None, "filters.python", "writers.las"]
+    assert [s.get("type") for s in plain["pipeline"]] == ["readers.las", "filters.python", "writers.las"]
     monkeypatch.setattr(sys, "stdin", io.StringIO(job.read_text(encoding="utf-8-sig")))
     assert run("pipeline", "--stdin")[0] == 0
     assert run("expand", job, "-o", tmp_path / "plain.json")[0] == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.algorithms import gather, required, welcome, with_returns
+from pdal_stages.classifier.algorithms import gather, optional, required, with_returns
 from pdal_stages.features import FeaturePlan, returns
 
 
@@ -57,7 +57,7 @@ def test_any_order_of_points_and_a_tile_with_its_halo_give_the_same_bits():
 
 def test_without_return_numbers_all_is_zero():
     xyz, _ = cloud(50)
-    assert required(returns.NAMES) == () and welcome(returns.NAMES) == returns.SOURCES
+    assert required(returns.NAMES) == () and optional(returns.NAMES) == returns.SOURCES
     for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in returns.SOURCES}):
         fed = gather(returns.NAMES, with_returns(returns.NAMES, xyz, dimensions), 50, np.arange(0, 50, 7))
         assert all(len(fed[name]) == 8 and not fed[name].any() for name in returns.NAMES)

@@ -65,7 +65,7 @@ def pipeline(stock, tmp_path_factory):
 
     def run(stages, *words, **how):
         path = folder / f"{next(count)}.json"
-        path.write_text(json.dumps(pdal_env.adapted(stages)))
+        path.write_text(json.dumps(pdal_env.adapted(pdal_env.typed(stages))))
         return stock("pipeline", path, *words, **how)
 
     return run

@@ -78,13 +78,13 @@ class Grading:
             "share_wrong": (n - right) / n if n else None,
         }
 
-    def curve(self, bins: int = 10) -> list[dict[str, Any]]:
-        """Equally wide bins: the reliability curve (mean confidence against share right)."""
-        edges = np.linspace(0, BINS, bins + 1).round().astype(int)
+    def curve(self) -> list[dict[str, Any]]:
+        """Ten equally wide bins: the reliability curve (mean confidence against share right)."""
+        edges = np.linspace(0, BINS, 11).round().astype(int)
         return [self._group(int(a), int(b)) for a, b in pairwise(edges)]
 
-    def quantiles(self, groups: int = 10) -> list[dict[str, Any]]:
-        """Equally filled groups from the least to the most confident points.
+    def deciles(self) -> list[dict[str, Any]]:
+        """Ten equally filled groups, from the least to the most confident points.
 
         A histogram bin is never split, so many points of one value make fewer, unequal groups.
         """
@@ -92,11 +92,11 @@ class Grading:
         if n == 0:
             return []
         filled = np.cumsum(self.count)
-        cuts = [int(np.searchsorted(filled, n * q / groups, side="left")) + 1 for q in range(1, groups)]
+        cuts = [int(np.searchsorted(filled, n * q / 10, side="left")) + 1 for q in range(1, 10)]
         edges = sorted({0, *cuts, BINS})
         return [g for g in (self._group(a, b) for a, b in pairwise(edges)) if g["points"]]
 
-    def expected_calibration_error(self, bins: int = 10) -> float | None:
+    def expected_calibration_error(self) -> float | None:
         """Mean distance between confidence and share right over the curve's bins, weighted by points.
 
         Source: Naeini, Cooper, Hauskrecht 2015, AAAI (ECE).
@@ -104,7 +104,7 @@ class Grading:
         n = self.points
         if n == 0:
             return None
-        filled = [b for b in self.curve(bins) if b["points"]]
+        filled = [b for b in self.curve() if b["points"]]
         return float(sum(b["points"] * abs(b["mean"] - b["share_right"]) for b in filled) / n)
 
     def separation(self) -> float | None:
@@ -125,5 +125,5 @@ class Grading:
             return None
         out: dict[str, Any] = {"mean": self.mean, "separation": self.separation()}
         if kind == "deciles":
-            return {**out, "deciles": self.quantiles()}
+            return {**out, "deciles": self.deciles()}
         return {**out, "expected_calibration_error": self.expected_calibration_error(), "curve": self.curve()}

@@ -73,7 +73,7 @@ class ModelError(StageError):
 
 
 class PipelineError(StageError):
-    """A pipeline cannot be parsed, validated, lowered or run."""
+    """A pipeline cannot be parsed, validated, expanded or run."""
 
 
 class InterruptedStage(StageError):

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 from .errors import StageError
 from .files import disk_is_full
-from .las import LARGEST_RECORD, POINT_BYTES, WAVES, LasHeader, named_las, read_header, records
+from .las import LARGEST_RECORD, POINT_BYTES, WAVES, LasHeader, read_header, records
 
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
@@ -100,8 +100,8 @@ def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) 
 
 def check_complete(
     path: str | os.PathLike, name: str | os.PathLike, writer: Mapping[str, Any], count: int | None = None
-) -> bool:
-    """Refuse a file that was not written completely; return whether its content could be checked.
+) -> None:
+    """Refuse a file that was not written completely.
 
     LAS and LAZ files are checked against their headers and the number of points; for other formats, only whether
     disk and limits left room.
@@ -123,7 +123,7 @@ def check_complete(
         If it is incomplete.
     """
     path = Path(path)
-    las = writer.get("type") in ("writers.las", "writers.copc") or named_las(path)
+    las = writer["type"] in ("writers.las", "writers.copc")
     try:
         size = path.stat().st_size
         with open(path, "rb+") as file:
@@ -137,7 +137,6 @@ def check_complete(
             found=f"{name}: {size:,} bytes were written",
             cure="Make room on the disk (or raise the limit on file sizes)",
         )
-    return las
 
 
 def _is_whole(path: Path, count: int | None) -> bool:

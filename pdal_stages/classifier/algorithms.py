@@ -150,7 +150,7 @@ def required(names: Iterable[str]) -> tuple[str, ...]:
     )
 
 
-def welcome(names: Iterable[str]) -> tuple[str, ...]:
+def optional(names: Iterable[str]) -> tuple[str, ...]:
     """Dimensions that these features can do without but use where the cloud has them."""
     return returns.SOURCES if any(returns.parse(name) is not None for name in names) else ()
 
@@ -163,7 +163,7 @@ def known(
     where: str | None = None,
 ) -> list[npt.NDArray[Any]]:
     """Values (n,) of the dimensions that these features need, checked as by :func:`gather`, and of those that they use."""
-    found = [*required(names), *(name for name in welcome(names) if name in dimensions)]
+    found = [*required(names), *(name for name in optional(names) if name in dimensions)]
     for name in found:
         gather((name,), dimensions, n, rows, where)  # one after the other: it may be a copy
     return [np.asarray(dimensions[name]) for name in found]

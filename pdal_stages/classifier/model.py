@@ -25,9 +25,9 @@ from .algorithms import (
     PredictRequest,
     algorithm,
     known,
+    optional,
     preparation_module,
     required,
-    welcome,
 )
 from .featureforest import weighed
 from .passes import WeightedPass, plan_of, predict
@@ -88,9 +88,9 @@ class Model:
         return required(self.plan.dimensions)
 
     @property
-    def welcome_dimensions(self) -> tuple[str, ...]:
+    def optional_dimensions(self) -> tuple[str, ...]:
         """Dimensions it uses where a cloud has them: return numbers."""
-        return welcome(self.plan.dimensions)
+        return optional(self.plan.dimensions)
 
     @property
     def voxel(self) -> float:
@@ -210,7 +210,7 @@ class Model:
                 rows = np.flatnonzero(np.isin(order, rows))
             taken = order if taken is None else taken[order]
         if taken is not None:
-            needed = (*self.required_dimensions, *self.welcome_dimensions)
+            needed = (*self.required_dimensions, *self.optional_dimensions)
             given = {name: np.asarray(given[name])[taken] for name in needed if name in given}
         shown = progress if representatives is None else None
         request = PredictRequest(xyz, given, rows, how.threads, how.memory_mb, shown, grid)

@@ -7,14 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..base.errors import optional_import, suggest
+from ..base.errors import suggest
 from ..base.messages import Report
 from .bins import ShapeBins
 
 
 @dataclass
 class FeatureTable:
-    """Features of queries: an array with names, which NumPy and scikit-learn take as it is."""
+    """Features of queries: an array with names, which NumPy and scikit-learn take as it is.
+
+    pandas, too: ``pandas.DataFrame(table, columns=list(table))``.
+    """
 
     values: np.ndarray  #: (m, F) float32
     names: tuple[str, ...]  #: of the columns
@@ -39,17 +42,6 @@ class FeatureTable:
 
     def __contains__(self, name: object) -> bool:
         return name in self.names
-
-    def to_dataframe(self):
-        """A pandas.DataFrame with a column for each feature.
-
-        Raises
-        ------
-        DependencyError
-            pandas is not installed.
-        """
-        pandas = optional_import("pandas", "table", "to_dataframe")
-        return pandas.DataFrame(self.values, columns=list(self.names))
 
     def __getitem__(self, name: str | list[str]) -> np.ndarray:
         """The column of that name, a view; or those of several names, (m, names)."""

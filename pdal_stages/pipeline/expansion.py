@@ -56,20 +56,19 @@ class Expanded:
 
 def expand(source: PipelineSource, whole: bool = True) -> Expanded:
     """Expand a pipeline. Not `whole`: it will be run in tiles, which separate flags from classes themselves."""
-    # File names stand for readers and writers. PDAL infers which, so they stay without a type.
-    stages = [copy.deepcopy(one) if isinstance(one, dict) else {"filename": one} for one in source.stages]
+    stages = copy.deepcopy(source.stages)
     places = [source.where(number) for number in range(len(stages))]
     _refuse_several_ends(stages, places)
     check_copc_outputs(stages)
     out = Expanded([], warnings=unread_extra_dimensions(stages))
     flags = _flags_to_split(stages) if whole else []
-    last_reader = max((n for n in range(len(stages)) if is_reader(stages, n)), default=None)
-    readers = [str(stage.get("filename", "")) for n, stage in enumerate(stages) if is_reader(stages, n)]
+    last_reader = max((n for n, stage in enumerate(stages) if is_reader(stage)), default=None)
+    readers = [str(stage.get("filename", "")) for stage in stages if is_reader(stage)]
     several = len(readers) > 1 or any(c in name for name in readers for c in "*?[")
     for index, stage in enumerate(stages):
-        type_name = stage.get("type", "")
+        type_name = stage["type"]
         if type_name not in stage_types():
-            out.stages += _each_file(stage) if flags and is_reader(stages, index) else [stage]
+            out.stages += _each_file(stage) if flags and is_reader(stage) else [stage]
             if flags and index == last_reader:
                 out.stages.append(flag_splitter(flags))
             continue
@@ -87,7 +86,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
         out.ours.append(expanded)
         out.stages.append(expanded.plain)
     _follow_preparations(out)
-    check_writers(out.stages, [(ours.stage, ours.place, ours.index) for ours in out.ours])
+    check_writers(out.stages, out.ours)
     return out
 
 
@@ -99,8 +98,8 @@ def _each_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
-    flags = files_with_flags_to_split(stages, any(stage.get("type") in stage_types() for stage in stages))
-    readers = [number for number in range(len(stages)) if is_reader(stages, number)]
+    flags = files_with_flags_to_split(stages, any(stage["type"] in stage_types() for stage in stages))
+    readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
     if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
         raise PipelineError(
             "this PDAL carries the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into other files only where all "
@@ -124,7 +123,7 @@ def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
         chosen = [str(tag) for tag in ([named] if isinstance(named, str) else named)]
         if any(tag not in tagged for tag in chosen):
             return None
-        reads = is_reader(stages, number)
+        reads = is_reader(stage)
         inputs.append([] if reads else [tagged[tag] for tag in chosen] or waiting)
         waiting = [*(waiting if reads else []), number]
         if "tag" in stage:
@@ -137,7 +136,7 @@ def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) 
 
     A stage that makes one thing of all points never wants them apart; filters.crop splits, too, where it has several areas.
     """
-    kinds = [stage.get("type") for stage in stages[:number]]
+    kinds = [stage["type"] for stage in stages[:number]]
     split = not _SPLITS.isdisjoint(kinds)
     if stage_type(stages[number]["type"]).instead_of_tiles and (split or "filters.crop" in kinds):
         return kinds[-1] != "filters.merge"
@@ -216,7 +215,7 @@ def check_dimensions(expanded: Expanded) -> None:
     for ours in expanded.ours:
         before = list(enumerate(expanded.stages[: ours.index]))
         # Scripts only get the reader's reference
-        moved = [s.get("out_srs", "") for _, s in before if s.get("type") == "filters.reprojection"]
+        moved = [s.get("out_srs", "") for _, s in before if s["type"] == "filters.reprojection"]
         if moved and _DEGREES.search(str(moved[-1])):
             raise PipelineError(
                 "the points are in degrees here; neighborhoods and grids need meters",
@@ -238,8 +237,8 @@ def check_dimensions(expanded: Expanded) -> None:
 
 def _may_make(name: str, stage: Mapping[str, Any]) -> bool:
     """Whether a stage of PDAL may create a dimension; readers of other formats than LAS may create any."""
-    kind = str(stage.get("type") or "readers.")
-    if kind.startswith("readers."):
+    kind = stage["type"]
+    if is_reader(stage):
         files = reader_files(dict(stage), las=True)
         named = name in str(stage.get("extra_dims", ""))
         return not files or named or any(name in extra_dimensions(path) for path in files)

@@ -18,7 +18,7 @@ from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, u
 from ..classifier.modelfile import find
 from ..stages.base import Stage
 from . import pdal as pdal_env
-from .read import Override, apply_overrides, is_writer, reader_files, readers_files
+from .read import Override, apply_overrides, reader_files
 
 #: File name of the description of an EPT source.
 EPT = "ept.json"
@@ -171,11 +171,9 @@ def named_outputs(target: str, names: Sequence[str]) -> list[str]:
 def reader_of(source: str, tag: str) -> dict[str, Any]:
     """A reader; it also reads the extra dimensions of LAS 1.0-1.3, which PDAL leaves out by default."""
     stage: dict[str, Any] = {"filename": str(source), "tag": tag}
-    if is_ept(source):
-        stage["type"] = "readers.ept"
-    elif named_las(source) and not named_copc(source):
+    if named_las(source) and not named_copc(source):
         stage |= {"type": "readers.las", "use_eb_vlr": True}
-    return stage
+    return pdal_env.typed([stage])[0]
 
 
 def writer_of(target: str) -> dict[str, Any]:
@@ -242,8 +240,8 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
 
 def reference_of_file(path: str, horizontal: str = "") -> Reference:
     """The same of a file."""
-    las = named_las(path) and read_header(path) is not None
-    return reference_of({"filename": path} | ({"type": "readers.las", "count": 1} if las else {}), horizontal)
+    las = {"type": "readers.las", "count": 1} if named_las(path) and read_header(path) is not None else {}
+    return reference_of(pdal_env.typed([{"filename": path, **las}])[0], horizontal)
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
@@ -280,13 +278,12 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
 
 def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:
     """Refuse a pipeline whose LAS readers read different references, unless a stage moves points; returns messages."""
-    if any(stage.get("type") in MOVING for stage in stages):
+    if any(stage["type"] in MOVING for stage in stages):
         return []
     readers: dict[str, tuple[str, dict[str, Any]]] = {}
-    for stage in [stage for stage in stages if not is_writer(stage, stages)]:
+    for stage in stages:
         options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}
-        options.setdefault("type", "readers.las")
-        for path in readers_files([stage], las=True):
+        for path in reader_files(stage, las=True):
             readers[path] = f"{projection(path)} {options}", {**options, "filename": path, "count": 1}
     kinds = dict(readers.values())
     if len(kinds) < 2:
@@ -298,11 +295,10 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
 
 def check_octrees(stages: list[dict[str, Any]]) -> None:
     """Refuse damaged octrees of COPC and EPT inputs; StageError."""
-    for stage in [stage for stage in stages if not is_writer(stage, stages)]:
-        name, kind = str(stage.get("filename", "")), stage.get("type", "")
-        if kind == "readers.ept" or (not kind and is_ept(name)):
-            check_ept(ept_address(name))
-        elif pdal_env.knows_copc() and (kind == "readers.copc" or (not kind and named_copc(name))):
+    for stage in stages:
+        if stage["type"] == "readers.ept":
+            check_ept(ept_address(str(stage.get("filename", ""))))
+        elif stage["type"] == "readers.copc" and pdal_env.knows_copc():
             for path in reader_files(stage, las=True):
                 check_copc(path)
 

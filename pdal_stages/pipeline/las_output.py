@@ -8,9 +8,9 @@ become one of class 130.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.las import (
@@ -22,10 +22,13 @@ from ..base.las import (
     named_las,
     supersede_copc,
 )
-from ..stages.base import Stage, stage_types
+from ..stages.base import stage_types
 from . import pdal as pdal_env
 from .read import is_reader, is_writer, reader_files, writes_las
 from .runtime import python_filter
+
+if TYPE_CHECKING:
+    from .expansion import ExpandedStage
 
 #: A variable-length record of LAS holds 65,535 bytes; the description of an extra dimension takes 192.
 _MOST_EXTRA = 65_535 // 192
@@ -72,23 +75,20 @@ def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
 # ---- limits, checked before any work -------------------------------------------------------------
 
 
-def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int]]) -> None:
-    """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS record.
-
-    `ours` are our stages in the expanded pipeline: the stage, its name in messages, its place.
-    """
-    last = [stage for stage, _, _ in ours if "Classification" in stage.creates()][-1:]
-    for stage, place, index in ours:
-        extra = len(stage.creates())
-        for writer in filter(writes_las, stages[index + 1 :]):
-            if (limit := _code_limit(writer, stages[:index])) is not None:
+def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage]) -> None:
+    """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS record."""
+    last = [one.stage for one in ours if "Classification" in one.stage.creates()][-1:]
+    for one in ours:
+        stage, extra = one.stage, len(one.stage.creates())
+        for writer in filter(writes_las, stages[one.index + 1 :]):
+            if (limit := _code_limit(writer, stages[: one.index])) is not None:
                 stage.code_limit = limit if stage in last else None
                 if (largest := stage.largest_class()) > LEGACY_LIMIT:
-                    raise OptionError(limit[0], where=place, found=f"code {largest}", cure=limit[1])
+                    raise OptionError(limit[0], where=one.place, found=f"code {largest}", cure=limit[1])
             if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
                     f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
-                    where=place,
+                    where=one.place,
                     found=f"{extra} features",
                     cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
                     "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no "
@@ -98,7 +98,7 @@ def check_writers(stages: list[dict[str, Any]], ours: list[tuple[Stage, str, int
 
 def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[str, str] | None:
     """The message for codes above 31, and the cure; None for point formats that hold all codes."""
-    if writer.get("type") == "writers.copc":
+    if writer["type"] == "writers.copc":
         return None
     minor, format_id = las_version(writer, before)
     if format_id > 5:
@@ -113,16 +113,14 @@ def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[s
 def check_copc_outputs(stages: list[dict[str, Any]]) -> None:
     """Refuse a plain LAZ file under the name of a COPC file."""
     for stage in stages:
-        name, kind = str(stage.get("filename", "")), stage.get("type", "")
-        last = stage is stages[-1] and len(stages) > 1
-        if not named_copc(name) or not (kind == "writers.las" or (last and not kind)):
+        name = str(stage.get("filename", ""))
+        if stage["type"] != "writers.las" or not named_copc(name):
             continue
         if not pdal_env.knows_copc():
             what = f"PDAL {pdal_env.dotted_version()} cannot write COPC"
             raise PipelineError(what, found=name, cure="Name the output .laz, or use PDAL 2.4 or later")
-        if kind:
-            what = "writers.las writes plain LAZ, not COPC"
-            raise PipelineError(what, found=name, cure='Use "type": "writers.copc"')
+        what = "writers.las writes plain LAZ, not COPC"
+        raise PipelineError(what, found=name, cure='Use "type": "writers.copc"')
 
 
 # ---- flags of LAS 1.0-1.3, before PDAL 2.6 -------------------------------------------------------
@@ -152,16 +150,12 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
     """
     if pdal_env.splits_class_flags():
         return []
-    read = [
-        [header.point_format for header in las_headers([stage])]
-        for number, stage in enumerate(stages)
-        if is_reader(stages, number)
-    ]
+    read = [[header.point_format for header in las_headers([stage])] for stage in stages if is_reader(stage)]
     old = [one <= 5 for formats in read for one in formats or [6]]
     if True not in old:
         return []
     mixed = any(one > 5 for formats in read for one in formats)
-    writers = [s for s in stages if is_writer(s, list(stages)) and s.get("type") not in stage_types()]
+    writers = [s for s in stages if is_writer(s) and s["type"] not in stage_types()]
     written = [las_version(one, stages)[1] for one in writers if writes_las(one)]
     together, apart = any(one <= 5 for one in written), any(one > 5 for one in written)
     if together and (apart or mixed):
@@ -192,7 +186,7 @@ def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]
     compresses = named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
     if (
         pdal_env.version() >= (2, 3, 0)
-        or writer.get("type") not in ("writers.las", None)
+        or writer["type"] != "writers.las"
         or not compresses
         or las_version(writer, before)[1] <= 5
     ):

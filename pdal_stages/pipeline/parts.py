@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.las import NOISE, named_las, read_header
-from ..stages.points import Points
+from ..base.las import named_las, read_header
 from . import pdal as pdal_env
 from .inputs_outputs import reader_of
 
 #: Points read at a time.
 PART = 1_000_000
-#: Dimensions that review reads where they are there.
-WANTED = ("Reliability", "HeightAboveGround", "PointSourceId", "ReturnNumber", "NumberOfReturns")
 _LASPY = {
     "PointSourceId": "point_source_id",
     "ReturnNumber": "return_number",
@@ -28,19 +25,6 @@ _LASPY = {
 def reads_in_parts(path: str) -> bool:
     """Whether parts of a file can be read: LAS, LAZ and COPC files."""
     return named_las(path) and read_header(path) is not None
-
-
-def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
-    """The points of a file that are neither noise nor withheld, in its order.
-
-    Each part has ``xyz`` (n, 3) in meters, ``codes`` (n,), and those of the dimensions :data:`WANTED` that exist.
-    """
-    for arrays, flags in arrays_in_parts(path, WANTED):
-        points = Points(arrays, wkt=wkt, legacy_flags=flags)
-        codes = points.class_codes
-        kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
-        more = {name: np.asarray(points.dimension(name))[kept] for name in WANTED if name in arrays}
-        yield {"xyz": points.xyz[kept], "codes": codes[kept], **more}
 
 
 def arrays_in_parts(

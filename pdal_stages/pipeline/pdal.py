@@ -179,12 +179,32 @@ def stages_of(thing: Any) -> list[dict[str, Any]] | None:
     return [{"type": stage.type, **stage.options} for stage in stages]
 
 
-def inferred_type(filename: str, kind: str) -> str:
-    """The ``reader`` or ``writer`` that PDAL infers from a file's name; empty where it knows none."""
-    bindings()
-    from pdal import libpdalpython
+def typed(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> list[dict[str, Any]]:
+    """Stages as objects with a type: the name of a file stands for the reader or writer that PDAL infers from it.
 
-    return str(getattr(libpdalpython, f"infer_{kind}_driver")(filename))
+    A writer is meant by the last of several stages. PipelineError where PDAL infers none; `where` says where a stage stands.
+    """
+    out = []
+    for number, given in enumerate(stages):
+        stage = dict(given) if isinstance(given, dict) else {"filename": given}
+        if not stage.get("type"):
+            bindings()
+            from pdal import libpdalpython
+
+            name = str(stage.get("filename", ""))
+            kind = "writer" if 0 < number == len(stages) - 1 else "reader"
+            stage["type"] = str(getattr(libpdalpython, f"infer_{kind}_driver")(name))
+            if not name or not stage["type"]:
+                raise PipelineError(
+                    f"PDAL has no {kind} for a file of this name"
+                    if name
+                    else "a stage has neither a type nor the name of a file",
+                    where=where(number) if where else None,
+                    found=name,
+                    cure=f'Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "{kind}s.las"',
+                )
+        out.append(stage)
+    return out
 
 
 def validate(stages: list[dict[str, Any]]) -> None:
@@ -219,10 +239,7 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
     # On one line: what PDAL says quotes names of files, which may hold line breaks.
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    cure = None
-    if unknown := re.search(r"[Cc]annot determine (reader|writer) for", text):
-        cure = f'Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "{unknown[1]}s.las"'
-    return PipelineError("PDAL could not run the pipeline", found="; ".join([*lines, *before]), cure=cure)
+    return PipelineError("PDAL could not run the pipeline", found="; ".join([*lines, *before]))
 
 
 def _log(pipeline) -> str:
@@ -301,15 +318,10 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return stages
     out: list[Any] = []
     for stage in stages:
-        kind = stage.get("type") if isinstance(stage, dict) else None
+        kind = stage["type"]
         if kind == "writers.las" and "forward" not in stage:
             stage = {"filesource_id": 0, **stage}
-        elif kind == "writers.ogr" or (
-            not kind
-            and out
-            and isinstance(stage, dict)
-            and str(stage.get("filename", "")).lower().endswith((".shp", ".geojson"))
-        ):
+        elif kind == "writers.ogr":
             stage = {"measure_dim": "Z", **stage}
         elif kind == "readers.copc":
             if beyond := [name for name in stage if name in _COPC_OPTIONS]:
@@ -320,7 +332,7 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
                     cure="Use PDAL 2.4 or later, or filters.crop after the reader",
                 )
             stage = {**{k: v for k, v in stage.items() if k not in _COPC_TUNING}, "type": "readers.las"}
-        elif isinstance(stage, dict) and (kind or stage is not stages[-1]):
+        else:
             codes = {geotiff_code(path) for path in reader_files(stage, las=True)}
             if len(codes) == 1 and "" not in codes:  # which that PDAL does not look at
                 stage = {"default_srs": codes.pop(), **stage}

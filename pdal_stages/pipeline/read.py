@@ -7,7 +7,7 @@ import glob
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
 from ..base.files import LAS, Output
-from ..base.las import named_las
 
 #: Writers of LAS and COPC.
 LAS_WRITERS = ("writers.las", "writers.copc")
@@ -251,8 +250,6 @@ def apply_overrides(stages: list[Any], overrides: Iterable[Override]) -> list[An
     for override in overrides:
         key = "tag" if override.by_tag else "type"
         hits = [s for s in out if isinstance(s, dict) and str(s.get(key, "")) == override.selector]
-        if not hits and not override.by_tag:
-            hits = _by_file_name(out, override.selector)
         if not hits:
             known = sorted({str(s[key]) for s in out if isinstance(s, dict) and key in s})
             there = f"The pipeline's {key}s: {', '.join(known)}" if known else f"No stage has a {key}"
@@ -266,32 +263,18 @@ def apply_overrides(stages: list[Any], overrides: Iterable[Override]) -> list[An
     return out
 
 
-def _by_file_name(stages: list[Any], selector: str) -> list[dict[str, Any]]:
-    """Stages written as a bare file name, which ``--readers.las.x`` or ``--writers.las.x`` mean too."""
-    hits = []
-    for index, stage in enumerate(stages):
-        name = stage if isinstance(stage, str) else "" if "type" in stage else str(stage.get("filename", ""))
-        kind = "writers" if 0 < index == len(stages) - 1 else "readers"
-        if named_las(name) and selector == f"{kind}.las":
-            if isinstance(stage, str):
-                stages[index] = stage = {"type": selector, "filename": name}
-            hits.append(stage)
-    return hits
+# ---- the files of stages, all of which have a type ---------------------------------------------------
 
 
 def readers_files(stages: list[dict[str, Any]], *, las: bool = False) -> list[str]:
     """Local files that PDAL's readers read, patterns filled in; only LAS and LAZ files with `las`."""
-    reading = [stage for stage in stages if not is_writer(stage, stages)]
-    return [name for stage in reading for name in reader_files(stage, las=las)]
+    return [name for stage in stages for name in reader_files(stage, las=las)]
 
 
 def reader_files(stage: dict[str, Any], *, las: bool = False) -> list[str]:
-    """The same for one stage, which is a reader where it has no type."""
-    name, kind = stage.get("filename"), stage.get("type", "")
-    if not isinstance(name, str) or "://" in name:
-        return []
-    is_las = kind in LAS_READERS or (not kind and named_las(name))
-    if not is_las and (las or (kind and not kind.startswith("readers."))):
+    """The same for one stage."""
+    name, is_las = stage.get("filename"), stage["type"] in LAS_READERS
+    if not is_reader(stage) or not isinstance(name, str) or "://" in name or (las and not is_las):
         return []
     names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
     there = os.path.exists if is_las else os.path.isfile  # other readers may read a pipe
@@ -302,7 +285,7 @@ def named_files(stages: list[dict[str, Any]]) -> list[str]:
     """Existing files named in any option of PDAL's stages: polygons, rasters, scripts."""
     found: list[str] = []
     for stage in stages:
-        own = (*_NO_FILES, *(("filename",) if is_writer(stage, stages) else ()))
+        own = (*_NO_FILES, *(("filename",) if is_writer(stage) else ()))
         texts = _texts({name: value for name, value in stage.items() if name not in own})
         found += [text for text in texts if "\0" not in text and os.path.isfile(text)]
     return found
@@ -316,35 +299,30 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(inner)
 
 
-def is_reader(stages: Sequence[dict[str, Any]], number: int) -> bool:
-    """Whether a stage is a reader: without a type, one that is not the last of several."""
-    kind = stages[number].get("type", "")
-    return kind.startswith("readers.") or (not kind and (number == 0 or number < len(stages) - 1))
+def is_reader(stage: Mapping[str, Any]) -> bool:
+    """Whether a stage is a reader."""
+    return stage["type"].startswith("readers.")
 
 
-def is_writer(stage: dict[str, Any], stages: list[dict[str, Any]]) -> bool:
+def is_writer(stage: Mapping[str, Any]) -> bool:
     """Whether a stage writes a local file."""
-    name, kind = stage.get("filename"), stage.get("type", "")
-    if not isinstance(name, str) or "://" in name:
+    name, kind = stage.get("filename"), stage["type"]
+    if not kind.startswith("writers.") or not isinstance(name, str) or "://" in name:
         return False
-    if not kind.startswith("writers.") and (kind or len(stages) == 1 or stage is not stages[-1]):
-        return False
-    return kind not in ("", "writers.text") or name.upper() != "STDOUT"  # which PDAL prints
+    return kind != "writers.text" or name.upper() != "STDOUT"  # which PDAL prints
 
 
-def writes_las(writer: dict[str, Any]) -> bool:
-    """Whether a writer, or a stage without a type, writes LAS."""
-    kind, name = writer.get("type", ""), str(writer.get("filename", ""))
-    return kind in LAS_WRITERS or (not kind and named_las(name))
+def writes_las(stage: Mapping[str, Any]) -> bool:
+    """Whether a stage writes LAS."""
+    return stage["type"] in LAS_WRITERS
 
 
 def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:
     """Files that PDAL's writers write."""
-    writers = [stage for stage in stages if is_writer(stage, stages)]
-    return [Output(s["filename"], "output", LAS if writes_las(s) else "") for s in writers]
+    return [Output(s["filename"], "output", LAS if writes_las(s) else "") for s in filter(is_writer, stages)]
 
 
 def with_outputs(stages: list[dict[str, Any]], names: list[Any]) -> list[dict[str, Any]]:
     """Stages whose writers write to other names."""
     waiting = iter(names)
-    return [{**s, "filename": str(next(waiting))} if is_writer(s, stages) else s for s in stages]
+    return [{**s, "filename": str(next(waiting))} if is_writer(s) else s for s in stages]

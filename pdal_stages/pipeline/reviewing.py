@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from ..accuracy.expected import Patches, ReviewCells, find_patches, side_for
 from ..base import checks
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, whole_files
-from ..base.las import read_header
+from ..base.las import NOISE, read_header
 from ..base.messages import Progress, counted, duration, one_line, print_messages
 from ..base.version import __version__
 from ..classifier.model import loaded_model
@@ -24,11 +24,14 @@ from ..classifier.modelfile import STANDARD
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, qml, write_layers
 from ..reports.page import render
+from ..stages.points import Points
 from ..stages.preparation import PREPARATION, made_of_coordinates
 from .inputs_outputs import check_one_reference, input_files, reference_of_file
-from .parts import parts_of, reads_in_parts
+from .parts import arrays_in_parts, reads_in_parts
 from .workers import each_file
 
+#: Dimensions that are read where they are there.
+WANTED = ("Reliability", "HeightAboveGround", "PointSourceId", "ReturnNumber", "NumberOfReturns")
 #: What is written, in this order.
 LAYERS = ("patches", "tiles")
 #: Rows in the page's tables, and in text.
@@ -157,6 +160,19 @@ def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[
     return [ReviewCells.join(found)] if found else []
 
 
+def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
+    """The points of a file that are neither noise nor withheld, in its order.
+
+    Each part has ``xyz`` (n, 3) in meters, ``codes`` (n,), and those of the dimensions :data:`WANTED` that exist.
+    """
+    for arrays, flags in arrays_in_parts(path, WANTED):
+        points = Points(arrays, wkt=wkt, legacy_flags=flags)
+        codes = points.class_codes
+        kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
+        more = {name: np.asarray(points.dimension(name))[kept] for name in WANTED if name in arrays}
+        yield {"xyz": points.xyz[kept], "codes": codes[kept], **more}
+
+
 def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, float]:
     """Points and square meters of the files, as their headers say."""
     points, area = 0, 0.0
@@ -175,7 +191,7 @@ def reliability_of(points: Mapping[str, NDArray], model: str) -> NDArray[np.floa
     made = {}
     if list(loaded.info.get("preparation") or []) == list(PREPARATION):  # else it says what it needs
         made = dict(made_of_coordinates(PREPARATION, points["xyz"]))
-    given = {name: points[name] for name in loaded.welcome_dimensions if name in points}
+    given = {name: points[name] for name in loaded.optional_dimensions if name in points}
     found: Any = loaded.predict(points["xyz"], {**made, **given}, probabilities=True).probabilities
     place = np.full(256, -1)
     place[loaded.codes] = np.arange(len(loaded.codes))

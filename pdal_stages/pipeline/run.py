@@ -80,7 +80,10 @@ class Pipeline:
         whole: bool = True,
     ) -> None:
         read = source if isinstance(source, PipelineSource) else read_pipeline(source)
-        self.source = PipelineSource(apply_overrides(read.stages, overrides), read.lines, read.name)
+        overrides = list(overrides)
+        named = apply_overrides(read.stages, [one for one in overrides if one.by_tag])  # of files, too
+        stages = apply_overrides(pdal_env.typed(named, read.where), overrides)
+        self.source = PipelineSource(stages, read.lines, read.name)
         self.expanded: Expanded = expand(self.source, whole)
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
@@ -175,7 +178,7 @@ class Pipeline:
         self.check_outputs()
         stages = self.expanded.stages
         outputs = [output.path for output in writers_outputs(stages)]
-        writers = [stage for stage in stages if is_writer(stage, stages)]
+        writers = list(filter(is_writer, stages))
         alone = len(writers) == 1 and writers[0] is stages[-1] and "where" not in writers[0]
 
         def finish(made: Path, final: Path, number: int) -> None:
@@ -189,7 +192,7 @@ class Pipeline:
             with runtime.Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
                 run = with_outputs(stages, list(partials))
                 for number, stage in enumerate(run):
-                    if is_writer(stage, run):
+                    if is_writer(stage):
                         run[number] = las_output.uncompressed_writer(stage, run[:number])
                 try:
                     with pdal_env.gentle():
@@ -227,9 +230,9 @@ class Pipeline:
             except OSError as error:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
         stages = self.expanded.stages
-        if stages and not is_reader(stages, 0):  # newer PDAL refuses it, older PDAL runs it on nothing
+        if stages and not is_reader(stages[0]):  # newer PDAL refuses it, older PDAL runs it on nothing
             ours = {one.index: one.stage.type for one in self.expanded.ours}
-            found = ours.get(0, stages[0].get("type", ""))
+            found = ours.get(0, stages[0]["type"])
             cure = "Put the file that is to be read first"
             raise PipelineError("the pipeline does not start with a reader", found=found, cure=cure)
         check_dimensions(self.expanded)
@@ -247,7 +250,7 @@ class Pipeline:
         found = str(error.found or "")
         if (named := _STAGE_TYPE.search(found)) is None:
             return error
-        given = [stage.get("type") if isinstance(stage, dict) else None for stage in self.source.stages]
+        given = [stage["type"] for stage in self.source.stages]
         if given.count(named[0]) == 1 and self.source.lines[given.index(named[0])]:
             error.where = self.source.where(given.index(named[0]))
         if error.cure is None and "Unexpected argument" in found:

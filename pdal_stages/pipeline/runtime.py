@@ -293,7 +293,7 @@ class Callbacks(AbstractContextManager):
             return list(stages)
         out: list[dict[str, Any]] = []
         for stage in stages:
-            if stage.get("type") in NEEDS_GROUND:
+            if stage["type"] in NEEDS_GROUND:
                 wired = {"inputs": stage["inputs"]} if "inputs" in stage else {}
                 check = partial(_check_ground, place(stage["type"], stage.get("tag")))
                 out.append(self.filter(check, **wired))

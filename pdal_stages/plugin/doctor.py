@@ -25,7 +25,6 @@ from . import building
 _EXTRAS = {
     "dask": ("distributed", "tiles on several hosts"),
     "deep": ("torch", "the neural network"),
-    "table": ("pandas", "tables as data frames"),
     "vector": ("pyogrio", "objects as vector files, and polygons of a map"),
 }
 #: Memory that a job needs besides the cloud; less is reported.

@@ -30,8 +30,8 @@ HEIGHTS_OUTSIDE = (
 
 def files_read(stages: Sequence[Mapping[str, Any]]) -> list[str]:
     """Files of the readers among stages, as they are written."""
-    readers = [s for s in stages if str(s.get("type") or "readers.").startswith("readers.")]
-    return [str(s["filename"]) for s in readers if "filename" in s]
+    readers = [stage for stage in stages if str(stage.get("type")).startswith("readers.")]
+    return [str(stage["filename"]) for stage in readers if "filename" in stage]
 
 
 class Stage(ABC):

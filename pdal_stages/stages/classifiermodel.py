@@ -20,9 +20,9 @@ from ..classifier.algorithms import (
     CHECKED,
     DEFAULT_DIMENSIONS,
     gather,
+    optional,
     required,
     trainer,
-    welcome,
 )
 from ..classifier.classes import ClassMap
 from ..classifier.clouds import TrainingCloud
@@ -176,8 +176,8 @@ class ClassifierModel(Stage):
         """The trainer's options, with the dimensions that the points have."""
         if not self.automatic:
             return self.training
-        optional = self._trainer.optional_inputs
-        there = [name for name, needs in optional.items() if all(one in points.arrays for one in needs)]
+        more = self._trainer.optional_inputs
+        there = [name for name, needs in more.items() if all(one in points.arrays for one in needs)]
         return replace(self.training, dimensions=(*DEFAULT_DIMENSIONS, *there))
 
     def check(self) -> None:
@@ -217,7 +217,7 @@ class ClassifierModel(Stage):
         what samples are drawn from."""
         needed = required((*training.inputs, *filter(None, [self.groups])))
         dimensions = {name: points.dimension(name) for name in needed}
-        dimensions |= {n: points.arrays[n] for n in welcome(training.inputs) if n in points.arrays}
+        dimensions |= {n: points.arrays[n] for n in optional(training.inputs) if n in points.arrays}
         if self.survey:
             dimensions[self.survey] = points.dimension(self.survey)
         cloud = TrainingCloud(

@@ -163,7 +163,7 @@ class ModelClassifier(Stage):
         inside = points.inside
         points.report.figures["kept"] = points.counted(inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
-        dimensions = {n: points.arrays[n] for n in self.model.welcome_dimensions if n in points.arrays}
+        dimensions = {n: points.arrays[n] for n in self.model.optional_dimensions if n in points.arrays}
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
         current = points.class_codes
         points.keep_only([*dimensions, *self.creates(), HEIGHT])

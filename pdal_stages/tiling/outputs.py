@@ -21,12 +21,12 @@ from ..base.las import LEGACY_LIMIT
 from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.parts import header_of
+from ..pipeline.parts import header_of, las_chunks
 from ..pipeline.read import LAS_WRITERS
 from ..pipeline.runtime import Callbacks
 from ..stages.points import class_counts
 from .inputs import InputSource
-from .pieces import BLOCK, Piece, record_blocks, write_records
+from .pieces import BLOCK, Piece, write_records
 from .plan import TilePlan
 from .settings import MOST_AT_ONCE
 from .store import load_arrays, written
@@ -261,7 +261,8 @@ def _in_parts(
         piece, part = (os.path.join(folder, name) for name in ("part.las", "out.las"))
         for start in range(0, points, MOST_AT_ONCE):
             end = min(points, start + MOST_AT_ONCE)
-            write_records(piece, header_of(source.path), record_blocks(source.path, start, end))
+            chunks = las_chunks(source.path, start, end, BLOCK)
+            write_records(piece, header_of(source.path), (points.array for points in chunks))
             new = read_results(results, source, points, start, end)
             run_tail([{**source.reader, "filename": piece}], [new], tail, [part], scratch)
             classes.update(_classes(new))

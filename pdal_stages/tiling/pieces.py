@@ -10,7 +10,7 @@ import copy
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -43,11 +43,6 @@ _PLACE = 250.0
 # ---- LAS and LAZ files by laspy ------------------------------------------------------------------------------
 
 
-def record_blocks(path: str, start: int = 0, end: int | None = None, most: int = BLOCK) -> Iterator[NDArray]:
-    """Point records from `start` to `end` in blocks, as arrays with laspy's field names."""
-    return (points.array for points in las_chunks(path, start, end, most))
-
-
 def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]) -> None:
     """Write points uncompressed, with the header and all records of the file that they are from."""
     import laspy
@@ -78,7 +73,8 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     found = []
     total = 0
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
-        for records in record_blocks(path, most=_PART):
+        for points in las_chunks(path, most=_PART):
+            records = points.array
             x, y = coordinates(records, header)
             low = np.minimum(low, (x.min(), y.min()))
             high = np.maximum(high, (x.max(), y.max()))
@@ -173,7 +169,7 @@ def cut_all(
             path = os.path.join(folder, f"fetched{number}.las")
             if not fetch_ept(source, box, path):
                 continue
-            records = np.concatenate(list(record_blocks(path)))
+            records = np.concatenate([points.array for points in las_chunks(path)])
             numbers = np.arange(len(records))
         elif index is not None:
             numbers, records = points_near(path, index, grid, box)

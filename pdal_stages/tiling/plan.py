@@ -11,7 +11,6 @@ from typing import Any
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
-from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import MOVING, is_ept, named_outputs, outputs_of
 from ..pipeline.read import Override, PipelineSource, writes_las
 from ..pipeline.run import Pipeline
@@ -112,7 +111,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     steps = []
     for index, stage in enumerate(source.stages):
         made = ours.get(index)
-        given = _object(stage, index, len(source.stages)) if made is None else dict(made.given)
+        given = dict(stage if made is None else made.given)
         steps.append(_Step(given, source.where(index), None if made is None else made.stage))
     _check_linear(steps)
     readers, filters, writers = ([s for s in steps if s.rank == rank] for rank in (0, 1, 2))
@@ -193,20 +192,6 @@ def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:
         return None  # EPT points have no fixed numbers
     made = {name for step in before if step.ours is not None for name in step.ours.creates()}
     return sorted(made) if made <= {"Classification"} else None
-
-
-def _object(stage: Any, index: int, count: int) -> dict[str, Any]:
-    """A stage as an object with a type; bare names become the readers and writer that PDAL infers."""
-    out = dict(stage) if isinstance(stage, dict) else {"filename": stage}
-    if not out.get("type"):
-        name, kind = str(out.get("filename", "")), "writer" if 0 < index == count - 1 else "reader"
-        out["type"] = pdal_env.inferred_type(name, kind)
-        if not out["type"]:
-            raise PipelineError(
-                f"the {kind} of '{name}' cannot be inferred from the file name",
-                cure=f'Give the stage a type: "{kind}s.las"',
-            )
-    return out
 
 
 def _check_linear(steps: list[_Step]) -> None:

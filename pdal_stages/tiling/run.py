@@ -158,7 +158,7 @@ def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> No
     if not inputs:
         return
     reader: dict[str, Any] = {**inputs[0].reader, "type": "readers.las", "filename": inputs[0].path}
-    tags = [stage.get("tag") if isinstance(stage, dict) else None for stage in source.stages[:readers]]
+    tags = [stage.get("tag") for stage in source.stages[:readers]]
     stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
     with contextlib.suppress(DependencyError):  # the program pdal is not there to ask
         Pipeline(replace(source, stages=[*stages, *source.stages[readers:]]), whole=False).prepare()

@@ -114,10 +114,7 @@ def run_head(
         stages[begins]["inputs"] = inputs
         pipeline = Pipeline(stages, whole=False)
         ours = {one.number: one for one in pipeline.expanded.ours}
-        check_writers(
-            [*pipeline.expanded.stages, *plan.tail],
-            [(one.stage, one.place, one.index) for one in ours.values()],
-        )
+        check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
         for one in ours.values():
             one.stage.own_points = OUTSIDE
         if before is not None:  # of the first one alone

@@ -47,7 +47,7 @@ _WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 _NAMED = 3
 
 
-def _lowered(given: Mapping[str, Any]) -> ClassifierModel:
+def _training_stage(given: Mapping[str, Any]) -> ClassifierModel:
     """The stage that trains."""
     return cast(ClassifierModel, expand_stage(dict(given)).stage)
 
@@ -127,7 +127,7 @@ class TrainTask:
     @cached_property
     def stage(self) -> ClassifierModel:
         """The stage that trains."""
-        return _lowered(self._writer)
+        return _training_stage(self._writer)
 
     def in_one_piece(self) -> bool:
         """Whether all points fit into the memory, those of each survey by themselves, or cannot be cut into tiles.
@@ -301,7 +301,7 @@ def take_points(
 
     `writer` is the stage that trains; `numbers` are those of inputs by path, where points are to have the number of theirs.
     """
-    stage = _lowered(writer)
+    stage = _training_stage(writer)
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
     new = []
     for result in results:

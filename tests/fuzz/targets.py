@@ -30,6 +30,7 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.model import assemble
+from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import apply_overrides, decode, parse_overrides, parse_pipeline
 from pdal_stages.tiling import inputs, outputs
@@ -100,6 +101,7 @@ def pipeline(data: bytes) -> str:
     )
     with contextlib.suppress(StageError):  # one that fits no stage
         source.stages = apply_overrides(source.stages, overrides)
+    source.stages = pdal_env.typed(source.stages)
     expanded = expand(source)
     assert json.loads(json.dumps(expanded.stages, allow_nan=False)) == expanded.stages
     types = [str(stage.get("type", "")) for stage in expanded.stages]

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from robustness_kit import HAG, job
 
 from pdal_stages.base.errors import StageError
+from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import parse_pipeline
 
@@ -109,11 +110,12 @@ stages = st.builds(
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(stages | values, max_size=5), st.booleans(), st.sampled_from([None, 0, 2]))
-def test_any_json_is_lowered_or_refused(given_stages, as_object, indent):
+def test_any_json_is_expanded_or_refused(given_stages, as_object, indent):
     value = {"pipeline": given_stages} if as_object else given_stages
     try:
         source = parse_pipeline(json.dumps(value, indent=indent))
         assert source.stages == given_stages
+        source.stages = pdal_env.typed(source.stages)
         expanded = expand(source)
         assert json.loads(json.dumps(expanded.stages, allow_nan=False)) == expanded.stages
     except StageError:
