@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import sys
 
 import laspy
 import pytest
 from block_scene import ground_and_block
+from processes import ended
 
 from pdal_stages.cli import _COMMANDS, main, parsed
 from pdal_stages.stages.base import stage_types
@@ -157,8 +157,8 @@ def test_a_process_that_dies_is_told_of(cloud, tmp_path, kill, number, said):
     ends = f"import os, signal\ndef f(ins, outs):\n    signal.signal(2, signal.SIG_DFL)\n    os.{kill}, {number})\n"
     how = {"type": "filters.python", "source": ends, "function": "f", "module": "ends"}
     (tmp_path / "dies.json").write_text(json.dumps([str(cloud), how, str(tmp_path / "out.las")]))
-    command = [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(tmp_path / "dies.json")]
-    ended = subprocess.run(command, capture_output=True, text=True, start_new_session=True)
-    assert ended.returncode == -number
-    assert said in ended.stderr
+    words = [sys.executable, "-m", "pdal_stages.cli", "pipeline", tmp_path / "dies.json"]
+    done = ended(*words, start_new_session=True)
+    assert done.returncode == -number
+    assert said in done.stderr
     assert not (tmp_path / "out.las").exists()

@@ -82,10 +82,9 @@ def image(tmp_path):
     def start(*words, **variables):
         (root / "calls").unlink(missing_ok=True)
         inherited = {key: text for key, text in os.environ.items() if not key.startswith("NUMBA_")}
-        ended = subprocess.run(
-            [root / "scripts/container", "start", "pdal-stages", *words],
-            env=inherited | {"TMPDIR": str(tmp_path / "tmp")} | variables, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        command = [root / "scripts/container", "start", "pdal-stages", *words]
+        env = inherited | {"TMPDIR": str(tmp_path / "tmp")} | variables
+        ended = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
         return ended, [line.split() for line in (root / "calls").read_text().splitlines()]
 
     return start

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from processes import ended
 
 from pdal_stages import cli
 from pdal_stages.plugin import doctor
@@ -26,10 +25,8 @@ def test_all_that_is_needed_is_here(capsys, monkeypatch):
 
 def test_what_is_missing_has_its_cure(tmp_path):
     """PDAL without filters.python; a process of its own, since PDAL looks for plugins once."""
-    done = subprocess.run(
-        [sys.executable, "-m", "pdal_stages.cli", "doctor"],
-        env={**os.environ, "PDAL_DRIVER_PATH": str(tmp_path)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = [sys.executable, "-m", "pdal_stages.cli", "doctor"]
+    done = ended(*words, env={"PDAL_DRIVER_PATH": str(tmp_path)})
     assert done.returncode == 1, done.stderr
     lines = done.stdout.splitlines()
     missing = [n for n, line in enumerate(lines) if line.startswith("MISSING")]

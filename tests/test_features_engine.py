@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 import textwrap
 import threading
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from processes import printed, python
 
 from pdal_stages.base.errors import DimensionError, OptionError, StageError
 from pdal_stages.base.messages import Progress
@@ -387,15 +387,7 @@ def test_other_number_types(kind):
 
 
 def run_python(code, **environment):
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env={**os.environ, **environment},
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return python(textwrap.dedent(code), env=environment)
 
 
 def test_importing_and_loading_a_model_are_light():
@@ -424,7 +416,7 @@ def test_without_a_writable_folder(tmp_path):
         "@njit\ndef twice(x):\n    return 2 * x\n"
         "print(twice(3))\n"
     )
-    assert subprocess.run([sys.executable, str(file)], capture_output=True, text=True).stdout == "6\n"
+    assert printed(sys.executable, file) == "6\n"
 
 
 def test_cached_code_follows_device_functions(tmp_path):

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from processes import ended, printed
 
 ROOT = Path(__file__).resolve().parent.parent
 SHELL = ["scripts/lib.sh", "scripts/setup", "scripts/install-pdal", "scripts/demo", "scripts/test", ".ci/run"]
@@ -27,9 +28,7 @@ def load(name):
 def bash(text, tmp_path, **environment):
     """Run shell lines that may use scripts/lib.sh, with the log and the state below tmp_path."""
     lines = f"set -euo pipefail; . '{ROOT}/scripts/lib.sh'; STATE='{tmp_path}'; LOG=\"$STATE/log\"; : >\"$LOG\"\n{text}"
-    return subprocess.run(
-        ["bash", "-c", lines], capture_output=True, text=True, env={**os.environ, **environment}, timeout=60
-    )
+    return ended("bash", "-c", lines, env=environment)
 
 
 # ---- the scripts -----------------------------------------------------------------------------------------
@@ -66,16 +65,13 @@ def test_failed_step_says_why(tmp_path, output, message):
 
 @pytest.mark.pdal
 def test_check_pdal_proves_bindings_and_program(pdal_program):
-    command = [sys.executable, ROOT / "scripts/check_pdal.py", "--program", pdal_program]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert re.match(r"PDAL \d+\.\d+\.\d+, python-pdal \d", done.stdout)
+    said = printed(sys.executable, ROOT / "scripts/check_pdal.py", "--program", pdal_program)
+    assert re.match(r"PDAL \d+\.\d+\.\d+, python-pdal \d", said)
 
 
 def test_check_pdal_names_what_is_missing():
     # -S: no site-packages, hence no pdal
-    command = [sys.executable, "-I", "-S", ROOT / "scripts/check_pdal.py"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = ended(sys.executable, "-I", "-S", ROOT / "scripts/check_pdal.py")
     assert done.returncode == 1 and "import pdal" in done.stderr
 
 
@@ -139,14 +135,10 @@ def test_skips_that_must_not_happen_fail(tmp_path):
     for name in ("conftest.py", "block_scene.py"):
         shutil.copy(ROOT / "tests" / name, tmp_path)
     (tmp_path / "test_skips.py").write_text(SKIPS)
-    environment = {
-        **os.environ,
-        "PDAL_STAGES_REQUIRE": "pdal,data",
-        "PDAL_STAGES_DATA": str(tmp_path / "absent"),
-    }
+    environment = {"PDAL_STAGES_REQUIRE": "pdal,data", "PDAL_STAGES_DATA": str(tmp_path / "absent")}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     command += ["-c", os.devnull, "--rootdir", tmp_path]
-    done = subprocess.run([*command, tmp_path], env=environment, capture_output=True, text=True, timeout=120)
+    done = ended(*command, tmp_path, env=environment)
     counts = dict.fromkeys(("failed", "error", "skipped"), 0)
     for number, word in re.findall(r"(\d+) (failed|error|skipped)", done.stdout.splitlines()[-1]):
         counts[word] = int(number)

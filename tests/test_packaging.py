@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import pytest
+from processes import ended, printed, python
 
 from pdal_stages.base.version import __version__
 
@@ -55,22 +55,20 @@ def test_recipes_are_rendered(name):
 def test_a_wheel_has_all_that_it_needs(tmp_path):
     """Built from a copy, installed into a clean environment whose packages are this one's."""
     source = tmp_path / "source"
-    subprocess.run(["git", "-C", ROOT, "rev-parse"], check=True, capture_output=True)
-    listed = subprocess.run(["git", "-C", ROOT, "ls-files", "-z"], check=True, capture_output=True, text=True)
-    for name in filter(None, listed.stdout.split("\0")):
+    listed = printed("git", "-C", ROOT, "ls-files", "-z").split("\0")
+    for name in filter(None, listed):
         if name.startswith("pdal_stages/") or "/" not in name:
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
     wheels = tmp_path / "wheels"
-    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", wheels, source]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    built = ended(sys.executable, "-m", "pip", "wheel", "--no-deps", "-q", "-w", wheels, source)
     if built.returncode and re.search("No matching distribution|connection", built.stderr):
         pytest.skip("pip's index has no setuptools to build with")
     assert built.returncode == 0, built.stderr
     (wheel,) = wheels.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     here = {path.relative_to(ROOT).as_posix() for path in (ROOT / "pdal_stages").rglob("*.py")}
-    assert here - {name for name in here if name not in listed.stdout.split("\0")} <= names
+    assert here - {name for name in here if name not in listed} <= names
     for needed in ("models/standard.model", "reports/templates/style.css", "plugin/stage.cpp", "py.typed"):
         assert f"pdal_stages/{needed}" in names, needed
     target = tmp_path / "env"
@@ -80,10 +78,5 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
         "from pdal_stages.classifier.model import loaded_model\n"
         "print(pdal_stages.__file__, building.SOURCE, len(loaded_model('standard').classes))"
     )
-    said = subprocess.run(
-        [sys.executable, "-c", code], env={"PYTHONPATH": str(target)}, cwd=tmp_path,
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert said.returncode == 0, said.stderr
-    package, sources, classes = said.stdout.split()
+    package, sources, classes = python(code, env={"PYTHONPATH": str(target)}, cwd=tmp_path).split()
     assert package.startswith(str(target)) and sources.startswith(str(target)) and int(classes) >= 2

@@ -10,11 +10,12 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
+import processes
 import pytest
+from processes import ended
 
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
@@ -47,10 +48,7 @@ def stock(environment, pdal_program, tmp_path_factory):
     """Run the program `pdal`; fails unless its exit code is `code`."""
 
     def run(*words, code=0, **how):
-        done = subprocess.run(
-            [pdal_program, *map(str, words)],
-            env=environment, capture_output=True, text=True, timeout=300, check=False, **how,
-        )  # fmt: skip
+        done = ended(pdal_program, *words, env=environment, **how)
         assert done.returncode == code, (done.returncode, done.stdout, done.stderr)
         return done
 
@@ -75,15 +73,7 @@ def pipeline(stock, tmp_path_factory):
 def python(environment):
     """Run Python code in another process, in which python-pdal finds the plugin; what it prints."""
 
-    def run(code, **more):
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env={**environment, **more}, capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, (done.returncode, done.stdout, done.stderr)
-        return done.stdout
-
-    return run
+    return lambda code, **more: processes.python(code, env={**environment, **more})
 
 
 def with_words(name, *words):
@@ -291,10 +281,7 @@ def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
     path.write_text(json.dumps(stages))
 
     def run(folder):
-        done = subprocess.run(
-            [pdal_env.program(), "pipeline", str(path)],
-            env={**environment, "PYTHONPATH": str(folder)}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        done = ended(pdal_env.program(), "pipeline", path, env={**environment, "PYTHONPATH": str(folder)})
         assert done.returncode == 1, (done.returncode, done.stderr)
         return done.stderr
 
@@ -332,10 +319,7 @@ def test_without_filters_python(plugin, pdal_program, ready_town, tmp_path):
     """PDAL that has our plugin but not what runs it."""
     path = tmp_path / "job.json"
     path.write_text(json.dumps(las([str(ready_town), {"type": "filters.hag_minima"}], tmp_path / "o.laz")))
-    done = subprocess.run(
-        [pdal_program, "pipeline", str(path)],
-        env={**os.environ, "PDAL_DRIVER_PATH": str(plugin)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = ended(pdal_program, "pipeline", path, env={"PDAL_DRIVER_PATH": str(plugin)})
     assert done.returncode == 1
     assert "PDAL has no filters.python" in done.stderr and "PDAL_DRIVER_PATH" in done.stderr
 

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import shutil
-import subprocess
 import sys
 import time
 import zipfile
@@ -18,6 +16,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+from processes import ended, printed
 
 from pdal_stages.base.version import __version__
 from pdal_stages.cli import main
@@ -66,12 +65,8 @@ def program(tmp_path_factory):
 @pytest.fixture(scope="module")
 def zipped(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dist")
-    packing = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [ROOT / "scripts" / "qgis-plugin", folder], env=packing, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return Path(done.stdout.strip())
+    packing = {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    return Path(printed(ROOT / "scripts" / "qgis-plugin", folder, env=packing).strip())
 
 
 class Feedback:
@@ -204,10 +199,8 @@ def test_zip_is_the_same_twice_and_complete(zipped):
     assert forms["version"] == __version__ and f"version={__version__}\n" in about
     assert "hasProcessingProvider=yes" in about and "qgisMinimumVersion=3.22" in about
     before = zipped.read_bytes()
-    packing = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
-    subprocess.run(
-        [ROOT / "scripts" / "qgis-plugin", zipped.parent], env=packing, check=True, capture_output=True
-    )
+    packing = {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    printed(ROOT / "scripts" / "qgis-plugin", zipped.parent, env=packing)
     assert zipped.read_bytes() == before
 
 
@@ -241,14 +234,7 @@ def qgis(around):
     """Run qgis_process; what it printed."""
 
     def run(*words, code=0, **more):
-        done = subprocess.run(
-            [PROCESS, *map(str, words)],
-            env={**around, **more},
-            capture_output=True,
-            text=True,
-            timeout=500,
-            check=False,
-        )
+        done = ended(PROCESS, *words, env={**around, **more})
         said = done.stdout + done.stderr
         assert (done.returncode == 0) == (code == 0), said
         return said
@@ -263,12 +249,8 @@ def session(around, profile):
 
     def run(*words, **more):
         plugins = profile / "profiles/default/python/plugins"
-        done = subprocess.run(
-            ["/usr/bin/python3", ROOT / "tests" / "qgis_session.py", plugins, *map(str, words)],
-            env={**around, **more}, capture_output=True, text=True, timeout=500, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout.splitlines()[-1])
+        command = "/usr/bin/python3", ROOT / "tests" / "qgis_session.py", plugins
+        return json.loads(printed(*command, *words, env={**around, **more}).splitlines()[-1])
 
     return run
 

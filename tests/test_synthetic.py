@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import subprocess
 
 import laspy
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from processes import printed
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.model import load_model
@@ -190,8 +190,7 @@ def test_pdal_reads_the_file_back(tmp_path, pdal_program):
     for name in names.split():
         assert np.array_equal(np.asarray(las[name]), getattr(t, name)), name
     assert np.abs(las["scan_angle"] * 0.006 - t.scan_angle).max() <= 0.004
-    command = [pdal_program, "info", "--metadata", path]
-    said = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)["metadata"]
+    said = json.loads(printed(pdal_program, "info", "--metadata", path))["metadata"]
     assert said["count"] == len(t) and said["dataformat_id"] == 6 and said["minor_version"] == 4
     assert 'AUTHORITY["EPSG","25832"]' in said["srs"]["horizontal"]
     assert said["srs"]["units"]["horizontal"] == "metre" and said["scale_x"] == 0.001

@@ -11,6 +11,7 @@ import pytest
 import tiling_clouds as clouds
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import printed
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
@@ -371,15 +372,8 @@ def test_outputs_need_names(tmp_path, town_file):
 
 
 def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, whole):
-    import subprocess
-
     for name, driver in (("b.gpkg", "GPKG"), ("d.geojson", "GeoJSON")):
-        done = subprocess.run(
-            [pdal_program, "tindex", "create", tmp_path / name, town_file, "-f", driver, "--fast_boundary"],
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr
+        printed(pdal_program, "tindex", "create", tmp_path / name, town_file, "-f", driver, "--fast_boundary")
         assert locations(str(tmp_path / name)) == [str(town_file)]
         with pytest.raises(StageError, match="cannot be read"):
             locations(str(tmp_path / name), "nothing")

@@ -8,10 +8,10 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 import sys
 
 import pytest
+from processes import ended
 from robustness_kit import HAG, job
 
 no_strace = shutil.which("strace") is None
@@ -33,10 +33,7 @@ def written(folder, *words: object) -> set[str]:
     log = folder / "trace.txt"
     calls = "trace=open,openat,creat,rename,renameat,renameat2,link,linkat,symlink,symlinkat,truncate,unlink,unlinkat,mkdir,mkdirat,rmdir"
     strace = ["strace", "-f", "--seccomp-bpf", "-qq", "-y", "-s", "4096", "-o", str(log), "-e", calls]
-    command = [*strace, sys.executable, "-m", "pdal_stages.cli"]
-    done = subprocess.run(
-        [*command, *map(str, words)], cwd=folder, capture_output=True, text=True, timeout=500
-    )
+    done = ended(*strace, sys.executable, "-m", "pdal_stages.cli", *words, cwd=folder)
     if not log.exists() or "ptrace" in done.stderr:
         pytest.skip(f"nothing may be traced here: {done.stderr[:200]}")
     assert done.returncode == 0, done.stderr[-2000:]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
 
 import numpy as np
 import pytest
+from processes import ended
 from robustness_kit import HAG
 from stage_message import message_of
 
@@ -31,8 +31,7 @@ def test_errors_through_stock_pdal(tmp_path, pdal_program, cloud, model):
     copy.write_bytes(b"")
     for says, pipeline in jobs.items():
         (tmp_path / "plain.json").write_text(pipeline)
-        words = [pdal_program, "pipeline", tmp_path / "plain.json"]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+        done = ended(pdal_program, "pipeline", tmp_path / "plain.json")
         text = done.stdout + done.stderr
         assert done.returncode == 1, (done.returncode, text)  # not a signal: PDAL's own filters abort on NaN
         assert says in text and message_of(text), text
