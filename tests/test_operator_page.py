@@ -52,5 +52,9 @@ def test_the_hour_of_an_operator(tmp_path, monkeypatch, capsys):
         assert main(words) == 0, (line, capsys.readouterr().err)
     checked = np.asarray(laspy.read("checked.laz")["Checked"]) == 1
     assert (checked >= seen).all() and seen.sum() > 100
+    for name in ("second.laz", "sure.laz"):  # what a person decided stays
+        last, kept = laspy.read(name), laspy.read("checked.laz")
+        assert (last.classification[checked] == kept.classification[checked]).all()
+        assert (last["Checked"] == checked).all() and (last["Reliability"][checked] == 1).all()
     assert "to be right in 90 % of the points of each class" in capsys.readouterr().err
     assert (tmp_path / "review.html").stat().st_size > 3_000

@@ -31,7 +31,7 @@ def write_corrections(
 ) -> list[str]:
     """Mark what was checked, and write the points of `before` with the classes of `after`; returns messages.
 
-    Everything else stays as in `before`, whatever the editing program dropped.
+    The Reliability of checked points becomes 1. Everything else stays as in `before`, whatever the editing program dropped.
 
     `after` is a file of the same points after editing, empty for none. `areas` are files of polygons in which everything was
     checked, so what was not changed is right; the same holds within `around` meters of a changed point.
@@ -80,6 +80,8 @@ def write_corrections(
     if CHECKED not in las.point_format.extra_dimension_names:
         las.add_extra_dim(laspy.ExtraBytesParams(CHECKED, "uint8", "1: a person has checked it"))
     las.classification, las[CHECKED] = new, checked.astype(np.uint8)
+    if "Reliability" in las.point_format.extra_dimension_names:  # of another class, or of less than a person
+        las["Reliability"] = np.where(checked, 1.0, las["Reliability"])
     with whole_files(output) as (part,):
         las.write(str(part))
     lines = [
