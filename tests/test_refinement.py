@@ -15,6 +15,7 @@ from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import foresttraining, modelfile
 from pdal_stages.classifier.algorithms import PredictRequest
+from pdal_stages.classifier.clouds import label_classes
 from pdal_stages.classifier.context import count_shares
 from pdal_stages.classifier.featureforest import EVEN, Blend, trust, weighed
 from pdal_stages.classifier.passes import predict
@@ -148,15 +149,19 @@ def test_a_class_without_labels_is_kept(base, passes):
     assert np.abs(after - before).max() < 1e-3  # of what the base hands on in 65535ths
 
 
-def test_a_new_class_is_learnt(base):
+@pytest.mark.parametrize(("new", "passes"), [(17, 2), (1, 1)])
+def test_a_new_class_is_learnt(base, new, passes):
     xyz, label, dimensions = scene(seed=3)
     tall = (label == 6) & ((xyz[:, 0] // 10 + xyz[:, 1] // 10) % 2 == 0)
     xyz[tall, 2] += 6
     dimensions["HeightAboveGround"] = xyz[:, 2].copy()
-    label[tall] = 17
+    label[tall] = new
     cloud = TrainingCloud(xyz, label, dimensions, "b.laz")
-    model = train([cloud], TrainingOptions(**FEW, base=base, folds=0, passes=2), progress=False)
-    assert set(model.codes.tolist()) == {*base.codes.tolist(), 17}
+    options = TrainingOptions(**FEW, base=base, folds=0, passes=passes, classes=[*BEFORE, new])
+    model = train([cloud], options, progress=False)
+    assert set(model.codes.tolist()) == {*base.codes.tolist(), new}
+    if passes == 1:  # and is one for who trains on top of it, even if its label often tells nothing
+        assert new in label_classes([cloud], TrainingOptions(**FEW, base=model)).classes.codes
     found = model.predict(xyz, dimensions).classification
     assert (found == label).mean() > (base.predict(xyz, dimensions).classification == label).mean() + 0.05
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,18 +40,22 @@ class ClassMap:
     labels: tuple[tuple[int, ...], ...]  #: labels in the training clouds that become the class
 
     @classmethod
-    def parse(cls, spec: Any, found: Iterable[int] = ()) -> ClassMap:
+    def parse(
+        cls, spec: Any, found: Iterable[int] = (), left_out: Collection[int] = UNINFORMATIVE
+    ) -> ClassMap:
         """Read the option `classes`.
 
         Parameters
         ----------
         spec : None, str, list of codes or mapping
-            None: every label found as it is, except those in 0, 1, 7, 12 and 18. A list: those labels
+            None: every label found as it is, except those `left_out`. A list: those labels
             as they are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
             name (``"5 Trees"``), ``{"code": 5, "name": "Trees"}``, or ``"drop"``. Labels not mentioned are
             dropped. Text is a comma-separated list, or JSON.
         found : iterable of int
             Labels in the training clouds, for None.
+        left_out : collection of int
+            Labels that are no classes of themselves.
         """
         if isinstance(spec, str):
             try:
@@ -59,7 +63,7 @@ class ClassMap:
             except ValueError as error:
                 raise OptionError("'classes' is not valid JSON", found=str(error), cure=_CURE) from None
         if spec is None:
-            spec = [label for label in sorted(set(map(int, found))) if label not in UNINFORMATIVE]
+            spec = [label for label in sorted(set(map(int, found))) if label not in left_out]
             if any(label > MAX_CODE for label in spec):
                 raise OptionError(
                     f"labels above {MAX_CODE} cannot be class codes",

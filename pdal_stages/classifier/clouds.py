@@ -133,7 +133,7 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     if options.base is None:
         return part
     # Labels are few, and each counts: a representative without one gets the least of its voxel that may be trained on.
-    usable = np.isin(labels, list(named)) if named else ~np.isin(labels, UNINFORMATIVE)
+    usable = np.isin(labels, list(named)) if named else ~np.isin(labels, _left_out(options))
     if cloud.mask is not None:
         usable &= np.asarray(cloud.mask)
     points, place = representatives.members(slice(None))
@@ -143,6 +143,12 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     lent = ~usable[rows] & (least <= MAX_LABEL)
     told = np.where(lent, least, labels[rows])
     return replace(part, labels=told, mask=None if cloud.mask is None else usable[rows] | lent)
+
+
+def _left_out(options: TrainingOptions) -> list[int]:
+    """Labels that become no classes by themselves: those that tell nothing, but for classes of the base."""
+    known = () if options.base is None else options.base.codes
+    return [label for label in UNINFORMATIVE if label not in known]
 
 
 def spooled(clouds: Iterable[TrainingCloud], folder: Path) -> list[TrainingCloud]:
@@ -273,7 +279,7 @@ def label_classes(
             bar.update(len(cloud))
     found = {int(label): int(number[label]) for label in np.flatnonzero(number)}
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"
-    classes = ClassMap.parse(options.classes, found)
+    classes = ClassMap.parse(options.classes, found, _left_out(options))
     if options.strategy == "binary" and options.target is not None:
         classes = classes.binary(options.target, options.background)
     for code, name, members in zip(classes.codes, classes.names, classes.labels, strict=True):
@@ -287,7 +293,7 @@ def label_classes(
         raise OptionError(
             "a classifier needs at least two classes",
             found=f"labels {listing}",
-            cure=f"Labels {', '.join(map(str, UNINFORMATIVE))} are left out unless 'classes' names them",
+            cure=f"Labels {', '.join(map(str, _left_out(options)))} are left out unless 'classes' names them",
         )
     return Labeled(clouds, classes)
 

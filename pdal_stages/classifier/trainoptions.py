@@ -57,7 +57,7 @@ class TrainingOptions(Settings):
         None,
         "mapping",
         'Class codes, e.g. 2,5,6, or labels and their classes: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: '
-        "every label but 0, 1, 7, 12 and 18",
+        "every label but 0, 1, 7, 12 and 18, and these where the base has them",
     )
     strategy: str = setting(
         "multiclass",
