@@ -12,7 +12,7 @@ import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
 from pdal_stages.cli import main
-from pdal_stages.pipeline.inputs_outputs import reference_of_file
+from pdal_stages.pipeline.references import reference_of_file
 
 pytestmark = pytest.mark.pdal
 

@@ -288,7 +288,7 @@ def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monke
     model = on_top(base, passes=2, voxel=0, n=300)
     ((passes, folds, (forests,), context),) = kept
     (cloud,) = passes.clouds
-    xyz, fold = cloud.xyz, folds.points(cloud.xyz, cloud.flight)
+    xyz, fold = cloud.xyz, folds.points(cloud.xyz, cloud.survey)
     values = computed(passes.features, xyz, cloud.dimensions)
     read = np.hstack([values, (of_the_base(base, xyz, cloud.dimensions) / WHOLE).astype(np.float32)])
     grown = np.array(

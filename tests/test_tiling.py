@@ -19,10 +19,10 @@ from pdal_stages.pipeline.inputs_outputs import locations
 from pdal_stages.synthetic.town import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling.classify import ClassifyTask
+from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.inputs import CloudIndex, InputSource, find_sources, las_extent, one_format
 from pdal_stages.tiling.pieces import cut_all, sort_points
 from pdal_stages.tiling.run import TilingOptions, run_tiled
-from pdal_stages.tiling.settings import TileGrid
 
 pytestmark = pytest.mark.pdal
 

@@ -42,7 +42,7 @@ def cut(cloud, side, folder, seed=1):
     random = np.random.default_rng(seed)
     for tile in np.unique(place, axis=0):
         rows = random.permutation(np.flatnonzero((place == tile).all(axis=1)))
-        tiles.put(tuple(tile.tolist()), replace(cloud.part(rows), survey=None))
+        tiles.put(tuple(tile.tolist()), replace(cloud.part(rows), survey=""))
     return tiles
 
 

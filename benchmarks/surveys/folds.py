@@ -62,7 +62,7 @@ class LeaveOneOut:
                 self.tables.append(np.load(path, mmap_mode="r"))
         labeled = label_classes(self.clouds, OPTIONS)
         self.classes = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
-        of = [cloud.flight for cloud in self.clouds]
+        of = [cloud.survey for cloud in self.clouds]
         self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
         self.fold_of = np.array([SURVEYS[name].fold for name in of])
         self.fold = self.fold_of[self.samples.cloud]

@@ -27,7 +27,7 @@ from surveys import SHIPPED, SURVEYS, VEGETATION
 import pdal_stages
 from pdal_stages import cli
 from pdal_stages.accuracy.expected import ReviewCells, find_patches, side_for
-from pdal_stages.classifier.summary import Sureness
+from pdal_stages.classifier.sureness import Sureness
 
 #: The part of the area that is looked at first.
 FIRST = 0.1

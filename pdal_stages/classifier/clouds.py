@@ -42,12 +42,13 @@ class TrainingCloud:
     name: str = "cloud"  #: for messages and the model file; a path is cut to its last part
     #: (n,) bool, points samples may be drawn from; all points serve as neighbors
     mask: npt.ArrayLike | None = None
-    survey: str | None = None  #: the flight it belongs to; by default it is one of its own
+    survey: str = ""  #: the survey it belongs to; by default one of its own, called as it is
     copy: str = ""  #: which of the survey's copies it is, where there are several
     own: npt.ArrayLike | None = None  #: (n,) bool, of a tile its own points; the others are only neighbors
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
+        object.__setattr__(self, "survey", self.survey or self.name)
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -56,11 +57,6 @@ class TrainingCloud:
     def codes(self) -> npt.NDArray[np.uint16]:
         """The labels, or StageError where they are none."""
         return as_codes(self.labels, f"label of {self.name}")
-
-    @property
-    def flight(self) -> str:
-        """The survey, or the cloud's own name."""
-        return self.survey or self.name
 
     @property
     def points(self) -> int:
@@ -90,7 +86,7 @@ class TrainingCloud:
         """Some of its points, as a cloud of the same survey."""
         some = {name: values[rows] for name, values in self.arrays.items()}
         name, copy = f"{self.name} {copy}".strip(), copy or self.copy
-        return self.having(some, name=name, survey=self.flight, copy=copy)
+        return self.having(some, name=name, copy=copy)
 
 
 def prepared(sources: Iterable[TrainingCloud], options: TrainingOptions) -> Iterator[TrainingCloud]:
@@ -311,7 +307,7 @@ def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
     """Smallest and largest density of some clouds, as a manifest has it; of tiles the median."""
     found: dict[object, list[float]] = {}
     for number, cloud in enumerate(clouds):
-        key = number if cloud.own is None else (cloud.name, cloud.flight, cloud.copy)
+        key = number if cloud.own is None else (cloud.name, cloud.survey, cloud.copy)
         found.setdefault(key, []).append(density(cloud.xyz))
     there = [one for each in found.values() if (one := float(np.median(each)))]  # empty ones do not count
     return {"low": min(there, default=0.0), "high": max(there, default=0.0)}

@@ -25,7 +25,7 @@ from .forest import Forest, grow_forest
 from .model import Model
 from .passes import FoldForests, WeightedPass, sample_context
 from .sampling import BLOCK, Folds, draw_samples, figures, split
-from .summary import Sureness
+from .sureness import Sureness
 from .trainoptions import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
@@ -73,8 +73,8 @@ class _ForestTraining:
             gather((options.groups,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name)
         self.labeled = label_classes(clouds, options, progress)
         self.codes = self.labeled.classes.codes
-        self.flights = [cloud.flight for cloud in clouds]
-        shares = [f"{cloud.flight} {cloud.copy}" for cloud in clouds]
+        self.surveys = [cloud.survey for cloud in clouds]
+        shares = [f"{cloud.survey} {cloud.copy}" for cloud in clouds]
         total = sum(map(len, clouds)) * (1 + len(self.codes))  # which are read for each class
         with self.progress(total, "drawing samples") as bar:
             self.samples = draw_samples(
@@ -268,7 +268,7 @@ class _ForestTraining:
         """What a cloud's points are held out with: their `groups`, or all of them with the survey."""
         cloud, name = self.clouds[number], self.options.groups
         if not name:
-            return np.broadcast_to(np.array(cloud.flight), len(cloud))
+            return np.broadcast_to(np.array(cloud.survey), len(cloud))
         return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
 
     def _count_sure(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
@@ -304,8 +304,8 @@ class _ForestTraining:
         held_out: list[list[FeatureForest]] = []
         values, folds = self.first, None
         if o.passes > 1:
-            folds = Folds.of_ground(self.xy, samples.label, samples.weight, self.flights, PASS_FOLDS)
-            fold = samples.take(lambda number: folds.points(self.clouds[number].xyz, self.flights[number]))
+            folds = Folds.of_ground(self.xy, samples.label, samples.weight, self.surveys, PASS_FOLDS)
+            fold = samples.take(lambda number: folds.points(self.clouds[number].xyz, self.surveys[number]))
         for number in range(o.passes):
             if number:
                 # Ground beside a fold is not left out as for the score: the forests miss the fold's samples already,
@@ -341,7 +341,7 @@ class _ForestTraining:
                     continue
                 mine = []
                 if folds is not None:
-                    fold = folds.points(cloud.xyz, self.flights[place])
+                    fold = folds.points(cloud.xyz, self.surveys[place])
                     each = (FoldForests(forests, fold) for forests in held_out)
                     mine = [WeightedPass(one, len(self._codes_after(k))) for k, one in enumerate(each)]
                 request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)

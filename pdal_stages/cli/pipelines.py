@@ -96,8 +96,8 @@ def _pipeline(options: argparse.Namespace) -> int:
 
 
 def _in_tiles(options: argparse.Namespace) -> int:
-    from ..pipeline.read import writers_outputs
     from ..pipeline.run import Pipeline
+    from ..pipeline.stagefiles import writers_outputs
     from ..tiling.plan import make_plan
     from ..tiling.run import run_tiled
 

@@ -16,8 +16,9 @@ from ..stages.base import stage_types
 from .expansion import expand_stage
 from .inputs_outputs import overridden, reader_of, writer_of
 from .las_output import extra_dims_option
-from .read import LAS_WRITERS, Override
+from .read import Override
 from .run import Pipeline
+from .stagefiles import LAS_WRITERS
 
 #: The stage that finds bridge decks along with the heights.
 _DECKS = "filters.hag_morphological"

@@ -17,8 +17,8 @@ from ..base.las import LEGACY_LIMIT, named_copc
 from ..classifier.algorithms import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
-from .inputs_outputs import reference_of_file
 from .parts import header_of, las_chunks, reads_in_parts
+from .references import reference_of_file
 
 #: If more than this share of the points has no partner, the files hold different points.
 _MOST_LOST = 0.1

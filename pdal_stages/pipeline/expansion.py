@@ -21,8 +21,9 @@ from ..stages.base import Stage, stage_type, stage_types
 from ..stages.points import MAKERS
 from . import pdal as pdal_env
 from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
-from .read import PipelineSource, is_reader, reader_files
+from .read import PipelineSource
 from .runtime import TRAMPOLINE, made, place, python_filter
+from .stagefiles import is_reader, reader_files
 
 #: Options of every PDAL stage that an expanded stage passes on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")

@@ -24,8 +24,8 @@ from ..base.las import (
 )
 from ..stages.base import stage_types
 from . import pdal as pdal_env
-from .read import is_reader, is_writer, reader_files, writes_las
 from .runtime import python_filter
+from .stagefiles import is_reader, is_writer, reader_files, writes_las
 
 if TYPE_CHECKING:
     from .expansion import ExpandedStage

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from ..base.errors import DependencyError, PipelineError
 from ..base.las import check_texts, geotiff_code
 from ..base.lascheck import DAMAGED, check_readable
-from .read import reader_files, readers_files
+from .stagefiles import reader_files, readers_files
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "

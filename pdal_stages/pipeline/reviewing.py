@@ -26,8 +26,9 @@ from ..reports.objectlayers import Layer, check_target, qml, write_layers
 from ..reports.page import render
 from ..stages.points import Points
 from ..stages.preparation import PREPARATION, made_of_coordinates
-from .inputs_outputs import check_one_reference, input_files, reference_of_file
+from .inputs_outputs import input_files
 from .parts import arrays_in_parts, reads_in_parts
+from .references import check_one_reference, reference_of_file
 from .workers import each_file
 
 #: Dimensions that are read where they are there.

@@ -20,19 +20,10 @@ from ..stages.base import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand, merge_filters
-from .inputs_outputs import check_octrees, check_readers, stage_files
-from .read import (
-    Override,
-    PipelineSource,
-    apply_overrides,
-    is_reader,
-    is_writer,
-    named_files,
-    read_pipeline,
-    readers_files,
-    with_outputs,
-    writers_outputs,
-)
+from .inputs_outputs import check_octrees, stage_files
+from .read import Override, PipelineSource, apply_overrides, read_pipeline
+from .references import check_readers
+from .stagefiles import is_reader, is_writer, named_files, readers_files, with_outputs, writers_outputs
 
 #: Points that got no class from the classifier, or were changed after it, by their keys in the reports of stages.
 LEFT_ALONE = {

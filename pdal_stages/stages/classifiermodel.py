@@ -29,7 +29,7 @@ from ..classifier.clouds import TrainingCloud
 from ..classifier.foresttraining import SHORT
 from ..classifier.model import Model, loaded_model
 from ..classifier.modelfile import digest_of, find
-from ..classifier.summary import of_the_base
+from ..classifier.sureness import of_the_base
 from ..classifier.training import train
 from ..classifier.trainoptions import TrainingOptions
 from .base import Stage, files_read
@@ -297,7 +297,7 @@ class ClassifierModel(Stage):
             return [(0.0, cloud)]
         value = gather((self.survey,), cloud.dimensions, len(cloud), where=cloud.name)[self.survey]
         parts = [(float(one), cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
-        return [(one, replace(part, name=f"{self.survey} {one:g}", survey=None)) for one, part in parts]
+        return [(one, replace(part, name=f"{self.survey} {one:g}", survey="")) for one, part in parts]
 
 
 def _number(text: Any) -> Any:

@@ -14,7 +14,7 @@ from ..base.las import LOW, MEDIUM, by_height
 from ..base.messages import Progress
 from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.modelfile import find
-from ..classifier.summary import Limit, Sureness, said, sureness_of
+from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from .base import Stage
 from .options import code_option, ignore_option, keep_option, option, vegetation_heights_option
 from .points import Points, class_counts

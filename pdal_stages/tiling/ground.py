@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from ..base.arrays import places_among
 from ..pipeline.runtime import points_of
 from ..stages.hag_morphological import HagMorphological, inside_block
+from .grid import Box, TileGrid
 from .inputs import IndexedSource
 from .outputs import arrays_of
 from .pieces import Piece, cut_all
 from .plan import OUTSIDE, TilePlan
-from .settings import Box, TileGrid
 from .store import load_arrays, save_arrays, written
 from .tile import Changed, FromBefore, HeadRun, RunContext, run_head
 

@@ -19,29 +19,12 @@ from ..base.errors import OptionError, PipelineError, StageError
 from ..base.octree import check_ept, read_ept
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import (
-    Reference,
-    check_one_reference,
-    ept_address,
-    is_ept,
-    is_las,
-    locations,
-    reference_of,
-)
-from ..pipeline.read import LAS_READERS, named_files
+from ..pipeline.inputs_outputs import ept_address, is_ept, is_las, locations
+from ..pipeline.references import Reference, check_one_reference, reference_of
+from ..pipeline.stagefiles import LAS_READERS, named_files
+from .grid import Box, TileGrid, check_number, touching, union
 from .plan import TilePlan, outputs_for
-from .settings import (
-    Box,
-    Density,
-    Extent,
-    TileGrid,
-    TilingOptions,
-    block_bytes,
-    check_number,
-    settled,
-    touching,
-    union,
-)
+from .settings import Density, Extent, TilingOptions, block_bytes, settled
 from .store import fingerprint
 
 #: Options of readers.tindex that select files or points, or change them.

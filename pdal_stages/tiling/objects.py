@@ -21,9 +21,10 @@ from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
 from ..objects.find import find_objects
 from ..objects.found import Objects, ObjectSettings
-from ..pipeline.inputs_outputs import check_one_reference, input_files, reference_of_file
+from ..pipeline.inputs_outputs import input_files
 from ..pipeline.parts import arrays_in_parts, reads_in_parts
 from ..pipeline.read import Override
+from ..pipeline.references import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter

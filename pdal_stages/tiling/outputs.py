@@ -22,8 +22,8 @@ from ..base.lascheck import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.parts import header_of, las_chunks
-from ..pipeline.read import LAS_WRITERS
 from ..pipeline.runtime import Callbacks
+from ..pipeline.stagefiles import LAS_WRITERS
 from ..stages.points import class_counts
 from .inputs import InputSource
 from .pieces import BLOCK, Piece, write_records

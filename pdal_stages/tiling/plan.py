@@ -11,9 +11,11 @@ from typing import Any
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
-from ..pipeline.inputs_outputs import MOVING, is_ept, named_outputs, outputs_of
-from ..pipeline.read import Override, PipelineSource, writes_las
+from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of
+from ..pipeline.read import Override, PipelineSource
+from ..pipeline.references import MOVING
 from ..pipeline.run import Pipeline
+from ..pipeline.stagefiles import writes_las
 from ..stages.base import Stage
 from ..stages.hag_morphological import Blocks, HagMorphological
 

@@ -1,4 +1,4 @@
-"""Tiles: the user's options, the size that memory allows, and their grid."""
+"""Tiles: the user's options, and the size that memory allows."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base import checks
-from ..base.errors import OptionError, StageError
+from ..base.errors import OptionError
 from ..base.resources import available_threads, free_memory
 from ..stages.hag_morphological import Blocks
+from .grid import Box
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
@@ -30,13 +30,6 @@ PARENT = 350 << 20
 _MOST_OF_A_TILE = 3_000_000
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 800,000.
 _SIDES = [mantissa * 10**power for power in range(6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)]
-
-#: Most tiles of a run.
-MOST_TILES = 1_000_000
-#: Larger column and row numbers are not exact.
-_FARTHEST = 2.0**52
-
-Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -183,81 +176,3 @@ def settled(
         cure="Give more with --memory, or fewer --workers"
         + (", or a smaller --tile" if options.tile else ""),
     )
-
-
-# ---- the grid: anchored at zero, half-open, the same for every run -----------------------------------------------
-
-
-@dataclass(frozen=True)
-class TileGrid:
-    """Square tiles of one size; tile (i, j) holds ``i*size <= x < (i+1)*size``, likewise y."""
-
-    size: float  #: side of a tile, in the unit of the coordinates
-
-    def index(self, coordinate: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Column or row of every coordinate.
-
-        The edges decide, not the quotient: a point on an edge belongs to the tile it begins,
-        whatever the division rounds to, so each point has exactly one tile.
-        """
-        with np.errstate(over="ignore", invalid="ignore"):
-            where = np.floor(coordinate / self.size)
-        if where.size and not np.abs(where).max() < _FARTHEST:  # not finite too
-            raise StageError(
-                "coordinates are too large for tiles of this size",
-                found=f"{coordinate[np.abs(where).argmax()]:g}, tiles of {self.size:g}",
-                cure="Take larger tiles, or repair the coordinates",
-            )
-        where -= coordinate < where * self.size
-        where += coordinate >= (where + 1.0) * self.size
-        return where.astype(np.int64)
-
-    def box(self, tile: tuple[int, int], halo_units: float = 0.0) -> Box:
-        """(min x, min y, max x, max y) of a tile, grown by as much on each side."""
-        i, j = tile
-        return (
-            i * self.size - halo_units,
-            j * self.size - halo_units,
-            (i + 1) * self.size + halo_units,
-            (j + 1) * self.size + halo_units,
-        )
-
-    def name(self, tile: tuple[int, int]) -> str:
-        """South-west corner, e.g. ``500000_5400500``."""
-        return "_".join(f"{n * self.size:.10g}" for n in tile)
-
-    def covering(self, box: Box) -> list[tuple[int, int]]:
-        """Every tile that a box touches, row by row; StageError for more than :data:`MOST_TILES`."""
-        x0, y0, x1, y1 = (int(self.index(np.array([v]))[0]) for v in box)
-        check_number((x1 - x0 + 1) * (y1 - y0 + 1), f"bounds {box}, tiles of {self.size:g}")
-        return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]
-
-
-def check_number(tiles: int, found: str) -> None:
-    """Refuse more tiles than a run may have."""
-    if tiles > MOST_TILES:
-        raise StageError(
-            f"more than {MOST_TILES:,} tiles",
-            found=found,
-            cure="Take larger tiles, or repair the bounding box in the header",
-        )
-
-
-def touching(boxes: list[Box] | NDArray[np.float64], box: Box) -> list[int]:
-    """Numbers of the boxes that share a point with a box, edges included."""
-    b = np.asarray(boxes, np.float64).reshape(-1, 4)
-    return np.flatnonzero(((b[:, :2] <= box[2:]) & (b[:, 2:] >= box[:2])).all(axis=1)).tolist()
-
-
-def inside(a: Box, b: Box) -> bool:
-    """Whether box a lies in box b."""
-    return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
-
-
-def union(boxes: list[Box] | NDArray[np.float64]) -> Box:
-    """The box around boxes."""
-    if not len(boxes):
-        return (math.inf, math.inf, -math.inf, -math.inf)
-    low = np.asarray(boxes)[:, :2].min(axis=0)
-    high = np.asarray(boxes)[:, 2:].max(axis=0)
-    return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))

@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.las import LEGACY_LIMIT
-from ..pipeline.inputs_outputs import NO_REFERENCE
 from ..pipeline.las_output import check_writers
+from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages.base import stage_types
 from ..stages.hag_morphological import HagMorphological
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
+from .grid import Box, TileGrid, inside
 from .inputs import IndexedSource
 from .outputs import NewValues, PieceResults, arrays_of, flags_in_classes, read_with, write_tile
 from .pieces import Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, TilePlan
-from .settings import Box, TileGrid, inside
 from .store import save_arrays, written
 
 #: How many times a tile is read again with a wider halo.

@@ -24,8 +24,9 @@ from ..classifier.trainoptions import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import expand_stage
-from ..pipeline.inputs_outputs import check_readers, is_ept, is_las, overridden, reader_of
+from ..pipeline.inputs_outputs import is_ept, is_las, overridden, reader_of
 from ..pipeline.read import Override
+from ..pipeline.references import check_readers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views
 from ..stages.checked import CheckedChoice, CheckedPoints

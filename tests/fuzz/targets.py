@@ -34,8 +34,8 @@ from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import apply_overrides, decode, parse_overrides, parse_pipeline
 from pdal_stages.tiling import inputs, outputs
+from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.pieces import sort_points
-from pdal_stages.tiling.settings import TileGrid
 from pdal_stages.tiling.store import Store
 
 TESTS = Path(__file__).resolve().parents[1]
