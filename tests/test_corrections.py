@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pdal_stages as ps
-from pdal_stages import cli
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las import records_of
 from pdal_stages.pipeline.correcting import near_any, partners, write_corrections
@@ -74,20 +73,17 @@ def test_near_any_is_what_distances_say():
 
 
 @pytest.mark.parametrize("how", [{}, {"drop": 30}, {"scale": 0.01}])
-def test_changes_are_found_in_any_order(town, tmp_path, how, capsys):
+def test_changes_are_found_in_any_order(town, tmp_path, how, run):
     corner, _ = changed_copy(town, tmp_path / "after.laz", **how)
     out = tmp_path / "checked.laz"
-    assert (
-        cli.main(["corrections", str(town), str(tmp_path / "after.laz"), "--out", str(out), "--around", "0"])
-        == 0
-    )
+    code, said, _ = run("corrections", town, tmp_path / "after.laz", "--out", out, "--around", "0")
+    assert code == 0 and ("missing" in said) == bool(how.get("drop"))
     las, before = laspy.read(out), laspy.read(town)
     assert np.array_equal(las.xyz, before.xyz)
     same = las.classification != before.classification
     lost = how.get("drop", 0)
     assert np.count_nonzero(np.asarray(same) != corner) <= lost
     assert np.count_nonzero((np.asarray(las["Checked"]) == 1) != corner) <= lost
-    assert ("missing" in capsys.readouterr().out) == bool(lost)
     for name in before.point_format.dimension_names:
         if name != "classification":
             assert np.array_equal(las[name], before[name]), name
@@ -161,26 +157,23 @@ def test_areas_that_were_looked_at(town, tmp_path):
     assert not (tmp_path / "x.laz").exists()
 
 
-def test_other_points_are_refused(town, tmp_path, capsys):
+def test_other_points_are_refused(town, tmp_path, run):
     las = laspy.read(town)
     las.x = np.asarray(las.x) + 5.0
     las.write(tmp_path / "moved.laz")
-    assert (
-        cli.main(["corrections", str(town), str(tmp_path / "moved.laz"), "--out", str(tmp_path / "o.laz")])
-        == 1
-    )
-    assert "do not hold the same points" in capsys.readouterr().err
+    code, _, err = run("corrections", town, tmp_path / "moved.laz", "--out", tmp_path / "o.laz")
+    assert code == 1 and "do not hold the same points" in err
     las.add_extra_dims([laspy.ExtraBytesParams(name, "uint8") for name in ("one", "two")])
     las.write(twice := tmp_path / "twice.las")
     twice.write_bytes(twice.read_bytes().replace(b"two" + bytes(29), b"one" + bytes(29)))
-    assert cli.main(["corrections", str(town), str(twice), "--out", str(tmp_path / "o.las")]) == 1
-    assert "occurs more than once" in capsys.readouterr().err
-    assert cli.main(["corrections", str(town), "--out", str(tmp_path / "o.laz")]) == 1
-    assert "nothing to mark" in capsys.readouterr().err
-    assert cli.main(["corrections", str(town), str(town), "--out", str(town)]) == 1
+    code, _, err = run("corrections", town, twice, "--out", tmp_path / "o.las")
+    assert code == 1 and "occurs more than once" in err
+    code, _, err = run("corrections", town, "--out", tmp_path / "o.laz")
+    assert code == 1 and "nothing to mark" in err
+    assert run("corrections", town, town, "--out", town)[0] == 1
 
 
-def test_training_draws_from_checked_points_alone(town, tmp_path, capsys):
+def test_training_draws_from_checked_points_alone(town, tmp_path, run):
     las = laspy.read(town)
     truth = np.asarray(las.classification).copy()
     xyz = np.asarray(las.xyz)
@@ -191,18 +184,16 @@ def test_training_draws_from_checked_points_alone(town, tmp_path, capsys):
     las.classification[wrong] = 2  # nobody looked at these
     las.write(tmp_path / "checked.laz")
     model = tmp_path / "m.model"
-    common = ["train", str(tmp_path / "checked.laz"), "--model", str(model)]
-    common += ["--base", "standard", "--classes", "2,5,6"]
-    assert cli.main(common) == 0
-    said = capsys.readouterr()
-    assert "were checked by a person" in said.err + said.out
+    words = ["--model", model, "--base", "standard", "--classes", "2,5,6"]
+    code, out, err = run("train", tmp_path / "checked.laz", *words)
+    assert code == 0 and "were checked by a person" in err + out
     counts = {one["code"]: one["available"] for one in ps.load_model(str(model)).info["classes"]}
     for code, available in counts.items():
         assert 0 < available <= np.count_nonzero(east & (truth == code)), code
 
 
 @pytest.mark.pdal
-def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path, capsys):
+def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path, run):
     """Where the points have a Reliability, as many of those that nobody looked at as of the most frequent checked class."""
     las = laspy.read(town)
     codes = np.asarray(las.classification).copy()
@@ -216,14 +207,14 @@ def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path,
     las["Reliability"] = np.where(sure, 0.97, 0.9).astype(np.float32)
     las.write(tmp_path / "checked.laz")
     model = tmp_path / "m.model"
-    assert cli.main(["train", str(tmp_path / "checked.laz"), "--base", "standard", "--classes", "2,5,6",
-                     "--model", str(model)]) == 0  # fmt: skip
-    said = capsys.readouterr()
+    words = ["--model", model, "--base", "standard", "--classes", "2,5,6"]
+    code, out, err = run("train", tmp_path / "checked.laz", *words)
     mine = {code: np.count_nonzero(checked & (codes == code)) for code in (2, 5, 6)}
     anchors = {
         code: min(np.count_nonzero(sure & (codes == code)), max(mine.values())) for code in mine if mine[code]
     }
-    assert f"from about {sum(anchors.values()):,} others of which the base is sure" in said.err + said.out
+    said = f"from about {sum(anchors.values()):,} others of which the base is sure"
+    assert code == 0 and said in err + out
     info = ps.load_model(str(model)).info
     for one in info["classes"]:
         most = mine[one["code"]] + anchors[one["code"]]

@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 
-from pdal_stages import cli
 from pdal_stages.objects.compare import compare_buildings, compare_trees, matched_by_overlap, matched_by_place
 
 shapely = pytest.importorskip("shapely")
@@ -93,67 +92,69 @@ def test_figures_of_trees():
     assert got["objects"]["matched"] == 2 and got["height"]["bias"] == 1.0 and got["place"]["median"] == 1.0
 
 
-def test_the_command(tmp_path, capsys):
+def test_the_command(tmp_path, run):
     houses = [shapely.box(0, 0, 10, 10), shapely.box(20, 0, 30, 10)]
     found, true = tmp_path / "found.gpkg", tmp_path / "true.gpkg"
     write(found, houses[:1], verdict=["sure"])
     write(found, [shapely.Point(5, 30)], "Point", "trees", height=[8.0])
     write(true, houses)
     write(true, [shapely.Point(6, 30), shapely.Point(50, 30)], "Point", "trees", height=[8.5, 9.0])
-    command = ["accuracy", str(found), "--objects", str(true), "--json", str(tmp_path / "a.json")]
-    assert cli.main(command) == 0
+    command = ["accuracy", found, "--objects", true, "--json", tmp_path / "a.json"]
+    code, out, _ = run(*command)
+    assert code == 0 and "buildings: 1 found, 2 in the reference" in out
     figures = json.loads((tmp_path / "a.json").read_text())
     assert (
         figures["buildings"]["objects"]["completeness"] == 0.5 and figures["trees"]["objects"]["matched"] == 1
     )
-    assert "buildings: 1 found, 2 in the reference" in capsys.readouterr().out
     area = write(tmp_path / "area.gpkg", [shapely.box(-1, -1, 12, 40)])
-    assert cli.main([*command, "--area", area]) == 0
+    assert run(*command, "--area", area)[0] == 0
     figures = json.loads((tmp_path / "a.json").read_text())
     assert figures["buildings"]["objects"]["f1"] == 1 and figures["trees"]["objects"]["f1"] == 1
 
 
-def test_errors(tmp_path, capsys):
+def test_errors(tmp_path, run):
     house = [shapely.box(0, 0, 10, 10)]
     found = write(tmp_path / "found.gpkg", house)
     other = write(tmp_path / "other.gpkg", house, crs="EPSG:2154")
     (tmp_path / "cloud.laz").write_bytes(b"LASF" + b"\0" * 400)
     for command, text in (
         (["accuracy", found, "--objects", other], "another reference system"),
-        (["accuracy", str(tmp_path / "cloud.laz"), "--objects", found], "pdal-stages objects classified.laz"),
-        (["accuracy", found, "--objects", str(tmp_path / "none.gpkg")], "no such file"),
+        (["accuracy", tmp_path / "cloud.laz", "--objects", found], "pdal-stages objects classified.laz"),
+        (["accuracy", found, "--objects", tmp_path / "none.gpkg"], "no such file"),
         (["accuracy", found, found, "--objects", other], "one vector file"),
         (["accuracy", found, "--objects", found, "--html", "a.html"], "--area and --json alone"),
         (["accuracy", found, "--area", other], "--area needs --objects"),
     ):
-        assert cli.main(command) == 1
-        assert text in capsys.readouterr().err
+        code, _, err = run(*command)
+        assert code == 1 and text in err
 
 
 @pytest.mark.data
 @pytest.mark.pdal
-def test_files_that_lie_apart_and_trees_without_heights_are_told(tmp_path, capsys):
+def test_files_that_lie_apart_and_trees_without_heights_are_told(tmp_path, run):
     for name, x in (("one", 0), ("near", 5), ("far", 5000)):
         write(tmp_path / f"{name}.gpkg", [shapely.box(x, 0, x + 10, 10)])
     write(tmp_path / "bare.gpkg", [shapely.Point(1, 1)], "Point", "trees")
     write(tmp_path / "high.gpkg", [shapely.Point(1, 1)], "Point", "trees", height=[7.0])
 
     def said(found, reference):
-        files = [str(tmp_path / f"{name}.gpkg") for name in (found, reference)]
-        assert cli.main(["accuracy", files[0], "--objects", files[1]]) == 0
-        return " ".join(capsys.readouterr().err.split())
+        code, _, err = run(
+            "accuracy", tmp_path / f"{found}.gpkg", "--objects", tmp_path / f"{reference}.gpkg"
+        )
+        assert code == 0
+        return " ".join(err.split())
 
     assert "lie apart" not in said("one", "near") + said("one", "one")
     assert "5000 to 5010, 0 to 10" in said("one", "far") and "lie apart" in said("far", "one")
     assert "no heights" in said("high", "bare") and "no heights" not in said("high", "high")
 
 
-def test_delft_against_official_outlines(tmp_path, capsys, data_dir):
+def test_delft_against_official_outlines(tmp_path, run, data_dir):
     """Houses stand wall to wall, so they are covered rather than told apart."""
     outlines = tmp_path / "delft.gpkg"
-    assert cli.main(["objects", f"{data_dir}/delft/train.laz", str(outlines)]) == 0
-    command = ["accuracy", str(outlines), "--objects", f"{data_dir}/delft/buildings_train.geojson"]
-    assert cli.main([*command, "--json", str(tmp_path / "a.json")]) == 0
+    assert run("objects", f"{data_dir}/delft/train.laz", outlines)[0] == 0
+    command = ["accuracy", outlines, "--objects", f"{data_dir}/delft/buildings_train.geojson"]
+    assert run(*command, "--json", tmp_path / "a.json")[0] == 0
     figures = json.loads((tmp_path / "a.json").read_text())["buildings"]
     assert figures["covered"] >= 0.96 and figures["area"]["completeness"] >= 0.96
     assert figures["boundary"]["median"] <= 0.4
@@ -171,16 +172,17 @@ def test_heights_of_trees_may_be_texts_of_numbers_or_missing(tmp_path):
     assert np.isnan(Things(path).trees[1]).all()
 
 
-def test_heights_that_are_none(tmp_path, capsys, bad="12,5 m"):
+def test_heights_that_are_none(tmp_path, run, bad="12,5 m"):
     spots = [shapely.Point(0, 0), shapely.Point(9, 9)]
     one = write(tmp_path / "one.gpkg", spots, "Point", "trees", height=[4.0, 5.0])
     two = write(tmp_path / "two.gpkg", spots, "Point", "trees", height=np.array(["5", bad], object))
-    assert cli.main(["accuracy", one, "--objects", two]) == 1
-    said = capsys.readouterr().err
-    assert "the column 'height' must hold heights" in said and bad in said and "two.gpkg" in said
+    code, _, said = run("accuracy", one, "--objects", two)
+    assert (
+        code == 1 and "the column 'height' must hold heights" in said and bad in said and "two.gpkg" in said
+    )
 
 
-def test_a_damaged_file_of_objects_is_told(tmp_path, capsys):
+def test_a_damaged_file_of_objects_is_told(tmp_path, run):
     shapes = [shapely.box(10 * n, 0, 10 * n + 8, 8) for n in range(400)]
     good, bad = write(tmp_path / "good.gpkg", shapes), tmp_path / "bad.gpkg"
     data = bytearray((tmp_path / "good.gpkg").read_bytes())
@@ -188,10 +190,8 @@ def test_a_damaged_file_of_objects_is_told(tmp_path, capsys):
     assert at > 0
     data[at + 1 : at + 5] = b"\xff\xff\xff\x7f"  # no kind of geometry
     bad.write_bytes(data)
-    assert cli.main(["accuracy", good, "--objects", str(bad)]) in (0, 1)
-    said = capsys.readouterr().err
-    assert "Traceback" not in said and "report it" not in said
+    code, _, said = run("accuracy", good, "--objects", bad)
+    assert code in (0, 1) and "Traceback" not in said and "report it" not in said
     bad.write_bytes(data[: len(data) // 2])
-    assert cli.main(["accuracy", good, "--objects", str(bad)]) == 1
-    said = capsys.readouterr().err
-    assert "bad.gpkg" in said and "Traceback" not in said and "report it" not in said
+    code, _, said = run("accuracy", good, "--objects", bad)
+    assert code == 1 and "bad.gpkg" in said and "Traceback" not in said and "report it" not in said

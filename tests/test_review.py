@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages import cli
 from pdal_stages.accuracy.expected import BLOCK, ReviewCells, find_patches
 from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline import reviewing
@@ -102,12 +101,11 @@ def folder(ready_town, tmp_path_factory):
 
 
 @pytest.mark.pdal
-def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, capsys):
+def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
     pytest.importorskip("pyogrio")
     out = tmp_path / "review.gpkg"
-    assert cli.main(["review", str(folder / "parts"), str(out), "--json", str(tmp_path / "r.json")]) == 0
-    said = capsys.readouterr().out
-    assert "east.laz" in said and "written to" in said
+    code, said, _ = run("review", folder / "parts", out, "--json", tmp_path / "r.json")
+    assert code == 0 and "east.laz" in said and "written to" in said
     figures = json.loads((tmp_path / "r.json").read_text())
     east, west = figures["tiles"]
     assert (east["tile"], west["tile"]) == ("east.laz", "west.laz") and east["expected"] > 3 * west[
@@ -129,29 +127,27 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, capsys):
     assert rank == tuple(range(1, len(rank) + 1)) and all(reason) and min(expected) >= 0
     assert set(styles) == {"patches", "tiles"} and "looked at" in styles["patches"]
     # One file or two: the same is expected in all.
-    whole = [str(folder / "whole.laz"), str(tmp_path / "w.gpkg"), "--json", str(tmp_path / "w.json")]
-    assert cli.main(["review", *whole]) == 0
+    assert run("review", folder / "whole.laz", tmp_path / "w.gpkg", "--json", tmp_path / "w.json")[0] == 0
     assert np.isclose(json.loads((tmp_path / "w.json").read_text())["expected"], figures["expected"])
 
 
 @pytest.mark.pdal
 @pytest.mark.parametrize("last", ["review_page", "write_layers"])
-def test_all_files_are_written_or_none(folder, tmp_path, monkeypatch, capsys, last):
+def test_all_files_are_written_or_none(folder, tmp_path, monkeypatch, run, last):
     def full(*_):
         raise StageError("no room")
 
     monkeypatch.setattr(reviewing, last, full)
-    out = [str(tmp_path / f"r.{ending}") for ending in ("gpkg", "json", "html")]
-    assert cli.main(["review", str(folder / "whole.laz"), out[0], "--json", out[1], "--html", out[2]]) == 1
-    assert "no room" in capsys.readouterr().err and not list(tmp_path.iterdir())
+    out = [tmp_path / f"r.{ending}" for ending in ("gpkg", "json", "html")]
+    code, _, err = run("review", folder / "whole.laz", out[0], "--json", out[1], "--html", out[2])
+    assert code == 1 and "no room" in err and not list(tmp_path.iterdir())
 
 
 @pytest.mark.pdal
-def test_what_is_missing_is_made_and_said(folder, tmp_path, capsys):
+def test_what_is_missing_is_made_and_said(folder, tmp_path, run):
     pytest.importorskip("pyogrio")
-    out = str(tmp_path / "r.gpkg")
-    assert cli.main(["review", str(folder / "town.laz"), out]) == 0
-    assert "has no Reliability: now computed by the model standard" in capsys.readouterr().err
+    code, _, err = run("review", folder / "town.laz", tmp_path / "r.gpkg")
+    assert code == 0 and "has no Reliability: now computed by the model standard" in err
 
 
 @pytest.mark.pdal
@@ -159,17 +155,16 @@ def test_what_is_missing_is_made_and_said(folder, tmp_path, capsys):
     ("words", "what"),
     [(["--share", "0"], "'--share'"), (["--cell", "0.1"], "'--cell'"), (["--workers", "0"], "--workers")],
 )
-def test_what_cannot_be_is_refused(folder, tmp_path, words, what, capsys):
-    assert cli.main(["review", str(folder / "whole.laz"), str(tmp_path / "r.gpkg"), *words]) == 1
-    assert what in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
+def test_what_cannot_be_is_refused(folder, tmp_path, words, what, run):
+    code, _, err = run("review", folder / "whole.laz", tmp_path / "r.gpkg", *words)
+    assert code == 1 and what in err and not list(tmp_path.iterdir())
 
 
 @pytest.mark.pdal
-def test_points_that_nobody_classified_are_refused(folder, tmp_path, capsys):
+def test_points_that_nobody_classified_are_refused(folder, tmp_path, run):
     las = laspy.read(folder / "whole.laz")
     las.classification[:] = 1
     las.write(tmp_path / "raw.laz")
-    assert cli.main(["review", str(tmp_path / "raw.laz"), str(tmp_path / "r.gpkg")]) == 1
-    assert "no point is ground, vegetation or a building" in capsys.readouterr().err
-    assert cli.main(["review", str(folder / "whole.laz"), str(tmp_path / "r.txt")]) == 1
+    code, _, err = run("review", tmp_path / "raw.laz", tmp_path / "r.gpkg")
+    assert code == 1 and "no point is ground, vegetation or a building" in err
+    assert run("review", folder / "whole.laz", tmp_path / "r.txt")[0] == 1

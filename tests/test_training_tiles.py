@@ -41,16 +41,17 @@ def town(tmp_path_factory, write_las):
     return folder
 
 
-def both(town, tmp_path, capsys, *more, files=("",)):
+def both(town, tmp_path, run, *more, files=("",)):
     """The forests of one run in one piece and one in tiles, and what the two said."""
     models, said = [], []
     for name, tiles in (("whole", ()), ("tiles", ("--tile", "23.5", "--workers", "0"))):
-        words = ["train", *(str(town / one) for one in files), "--model", str(tmp_path / f"{name}.model")]
-        assert main([*words, *WORDS, *tiles, *more]) == 0
+        words = ["train", *(town / one for one in files), "--model", tmp_path / f"{name}.model"]
+        code, *told = run(*words, *WORDS, *tiles, *more)
+        assert code == 0
         model = ps.load_model(tmp_path / f"{name}.model")
         arrays = [array.tolist() for one in model.passes for array in one.arrays().values()]
         models.append((arrays, model.classes, model.info["classes"], model.info["training"]["clouds"]))
-        said.append(capsys.readouterr())
+        said.append(told)
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     return models, said
 
@@ -62,26 +63,24 @@ def base(town):
     return str(path)
 
 
-def test_on_top_of_a_model(town, base, tmp_path, capsys):
-    (whole, tiles), _ = both(town, tmp_path, capsys, "--base", base, "--passes", "2")
+def test_on_top_of_a_model(town, base, tmp_path, run):
+    (whole, tiles), _ = both(town, tmp_path, run, "--base", base, "--passes", "2")
     assert whole == tiles
     assert len(ps.load_model(tmp_path / "tiles.model").passes) == 4
 
 
-def test_the_forests_are_the_same(town, tmp_path, capsys):
-    (whole, tiles), (one, _other) = both(town, tmp_path, capsys)
+def test_the_forests_are_the_same(town, tmp_path, run):
+    (whole, tiles), ((out, _), _) = both(town, tmp_path, run)
     assert whole == tiles
-    assert "files held out" in one.out and "t0.laz, t1.laz, t2.laz, t3.laz" in one.out
+    assert "files held out" in out and "t0.laz, t1.laz, t2.laz, t3.laz" in out
     model = ps.load_model(tmp_path / "tiles.model")
     assert model.info["preparation"][0]["type"] == "filters.hag_morphological"
     assert "EarlierReturn_box2" in model.plan.names
 
 
-def test_octrees_are_read_in_tiles_too(tmp_path, capsys):
+def test_octrees_are_read_in_tiles_too(tmp_path, run):
     data = Path(__file__).parent / "data"
-    (whole, tiles), (_one, _other) = both(
-        data, tmp_path, capsys, "--classes", "2,4,6", files=("town.copc.laz",)
-    )
+    (whole, tiles), _ = both(data, tmp_path, run, "--classes", "2,4,6", files=("town.copc.laz",))
     assert whole == tiles
 
 
@@ -96,29 +95,28 @@ def test_octrees_are_read_in_tiles_too(tmp_path, capsys):
     ],
     ids=["groups", "surveys"],
 )
-def test_with_other_options_too(town, tmp_path, capsys, more):
-    (whole, tiles), _ = both(town, tmp_path, capsys, *more)
+def test_with_other_options_too(town, tmp_path, run, more):
+    (whole, tiles), _ = both(town, tmp_path, run, *more)
     assert whole == tiles
 
 
-def test_surveys_that_do_not_see_each_other(town, tmp_path, capsys):
-    more = ["--surveys", "west=*t[01].laz"]
-    (whole, tiles), (_one, _other) = both(town, tmp_path, capsys, *more)
+def test_surveys_that_do_not_see_each_other(town, tmp_path, run):
+    (whole, tiles), _ = both(town, tmp_path, run, "--surveys", "west=*t[01].laz")
     assert whole == tiles
     info = ps.load_model(tmp_path / "tiles.model").info
     assert info["accuracy"]["cross_validation"]["by"] == "surveys"
     assert [one["name"] for one in info["training"]["clouds"]] == ["west", "t2", "t3"]
 
 
-def test_one_file_and_feet(tmp_path, capsys, write_las):
+def test_one_file_and_feet(tmp_path, run, write_las):
     pyproj = pytest.importorskip("pyproj")
     xyz = (MADE().xyz - (499_000.0, 5_399_000.0, 0.0)) / 0.3048
     points = {axis: xyz[:, n] for n, axis in enumerate("XYZ")} | {"Classification": MADE().classification}
     wkt = pyproj.CRS("EPSG:2994").to_wkt("WKT1_GDAL")
     write_las(tmp_path / "feet.laz", points, point_format=6, wkt=wkt)
-    words = ["train", str(tmp_path / "feet.laz"), *WORDS]
-    assert main([*words, "--model", str(tmp_path / "whole.model")]) == 0
-    assert main([*words, "--model", str(tmp_path / "tiles.model"), "--tile", "90", "--workers", "0"]) == 0
+    words = ["train", tmp_path / "feet.laz", *WORDS]
+    assert run(*words, "--model", tmp_path / "whole.model")[0] == 0
+    assert run(*words, "--model", tmp_path / "tiles.model", "--tile", "90", "--workers", "0")[0] == 0
     assert (tmp_path / "whole.model").read_bytes() == (tmp_path / "tiles.model").read_bytes()
 
 
@@ -139,16 +137,16 @@ def test_tiles_where_the_points_do_not_fit(town, tmp_path, monkeypatch):
     ).in_one_piece()
 
 
-def test_what_is_wrong_is_said_and_no_model_is_written(town, tmp_path, capsys, write_las):
-    words = ["--model", str(tmp_path / "m.model"), *WORDS, "--tile", "23.5", "--workers", "0"]
+def test_what_is_wrong_is_said_and_no_model_is_written(town, tmp_path, run, write_las):
+    words = ["--model", tmp_path / "m.model", *WORDS, "--tile", "23.5", "--workers", "0"]
     for name in ("t0.laz", "t1.laz"):
         (tmp_path / name).write_bytes((town / name).read_bytes())
     data = (tmp_path / "t1.laz").read_bytes()
     (tmp_path / "t1.laz").write_bytes(data[: len(data) // 2])
-    assert main(["train", str(tmp_path / "t0.laz"), str(tmp_path / "t1.laz"), *words]) == 1
-    assert "nothing was trained" in (said := capsys.readouterr().err) and "t1.laz" in said
-    assert main(["train", str(town), *words, "--writers.classifiermodel.dimensions=Nowhere"]) == 1
-    assert "'Nowhere' is missing" in capsys.readouterr().err
+    code, _, err = run("train", tmp_path / "t0.laz", tmp_path / "t1.laz", *words)
+    assert code == 1 and "nothing was trained" in err and "t1.laz" in err
+    code, _, err = run("train", town, *words, "--writers.classifiermodel.dimensions=Nowhere")
+    assert code == 1 and "'Nowhere' is missing" in err
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"t0.laz", "t1.laz"}
 
@@ -183,17 +181,16 @@ def corrected(tmp_path_factory, write_las):
     ],
     ids=["base", "surveys", "as all others"],
 )
-def test_corrections_are_trained_on(corrected, base, tmp_path, capsys, more):
+def test_corrections_are_trained_on(corrected, base, tmp_path, run, more):
     more = tuple(base if word == "BASE" else word for word in more)
-    (whole, tiles), (one, other) = both(corrected, tmp_path, capsys, *more)
-    assert whole == tiles
-    assert one.out == other.out
-    assert ("were checked by a person" in one.out + one.err) == ("=false" not in "".join(more))
+    (whole, tiles), ((out, err), (other, _)) = both(corrected, tmp_path, run, *more)
+    assert whole == tiles and out == other
+    assert ("were checked by a person" in out + err) == ("=false" not in "".join(more))
 
 
-def test_corrections_outside_of_what_is_drawn_from(corrected, tmp_path, capsys):
-    words = ["train", str(corrected), *WORDS, "--model", str(tmp_path / "m.model")]
+def test_corrections_outside_of_what_is_drawn_from(corrected, tmp_path, run):
+    words = ["train", corrected, *WORDS, "--model", tmp_path / "m.model"]
     words += ["--writers.classifiermodel.where=X > 500070"]
     for tiles in ((), ("--tile", "23.5", "--workers", "0")):
-        assert main([*words, *tiles]) == 1
-        assert "no checked point lies inside 'where'" in capsys.readouterr().err
+        code, _, err = run(*words, *tiles)
+        assert code == 1 and "no checked point lies inside 'where'" in err
