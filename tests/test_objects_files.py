@@ -248,7 +248,7 @@ def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path,
         raise StageError("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(objects, "write_layers", broken)
+        patch.setattr(objects, "write_objects", broken)
         assert cli.main([*command, *more]) == 1
     assert "the disk is full" in capsys.readouterr().err
     assert html.exists() and not target.exists() and len(list(out.glob("*.laz"))) == 2

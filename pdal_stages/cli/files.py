@@ -42,11 +42,11 @@ def add_commands(parser: Parser) -> None:
 
 
 def _objects(options: argparse.Namespace) -> None:
-    from ..tiling.objects import write_objects, writer
+    from ..tiling.objects import objects_of_files, writer
 
     given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}
     stage = writer(options.output, options.overrides, **given)
-    write_objects(options.inputs, stage, options.workers, options.metadata)
+    objects_of_files(options.inputs, stage, options.workers, options.metadata)
 
 
 def _review(options: argparse.Namespace) -> None:

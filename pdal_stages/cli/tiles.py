@@ -81,7 +81,7 @@ def _classify(options: argparse.Namespace) -> int:
 
     own, others = [], list(options.overrides)
     if options.objects:
-        from ..tiling.objects import OPTIONS_OF, refuse_tiles, write_objects, writer
+        from ..tiling.objects import OPTIONS_OF, objects_of_files, refuse_tiles, writer
 
         own = [one for one in others if not one.by_tag and one.selector in OPTIONS_OF]
         others = [one for one in others if one not in own]
@@ -104,8 +104,7 @@ def _classify(options: argparse.Namespace) -> int:
         options.output,
         request,
         options_of(options),
-        metadata=options.metadata or "",
-        extra_files=tuple(extra_files(options)),
+        tuple(extra_files(options)),
     )
     then = None
     if options.objects and not options.dry_run:
@@ -113,7 +112,7 @@ def _classify(options: argparse.Namespace) -> int:
             task.make_folders()
         stage = writer(options.objects, own)
         refuse_tiles(task, options.objects)
-        then = partial(write_objects, task.outputs, stage, max(1, task.options.local_workers))
+        then = partial(objects_of_files, task.outputs, stage, max(1, task.options.local_workers))
     names = {code: one_line(name) for code, name in request.loaded.classes}
     if not task.in_one_piece:
         return _classify_tiles(task, options, names, then)
@@ -125,6 +124,8 @@ def _classify(options: argparse.Namespace) -> int:
     if options.is_program and not options.polygons:  # laspy loads them, half of its import, for nothing
         sys.modules.update(dict.fromkeys({"requests", "pyproj"} - sys.modules.keys()))  # type: ignore[arg-type]
     written = task.run_whole()
+    if options.metadata:
+        write_whole(options.metadata, (json.dumps(written.metadata, indent=2, default=str) + "\n").encode())
     print_messages(*written.messages)
     print(f"{counted(written.points, 'point')} written to {written.path}")
     print_classes(written.classes, written.left_alone, names)

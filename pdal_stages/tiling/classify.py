@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from ..base import las
 from ..base.errors import OptionError, StageError
-from ..base.files import Output, check_outputs, write_whole
+from ..base.files import Output, check_outputs
 from ..base.lascheck import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
@@ -28,6 +28,7 @@ class Written:
     classes: dict[str, int]  #: number of points by code
     left_alone: dict[str, int]  #: of points that got no class, by reason
     messages: list[str]
+    metadata: dict[str, Any]  #: PDAL's, of the run
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,7 @@ class ClassifyTask:
     output: str  #: a file; of several inputs a folder, or a name with ``#`` for the input's
     request: ClassifyRequest = field(default_factory=ClassifyRequest)
     options: TilingOptions = field(default_factory=TilingOptions)
-    metadata: str = ""  #: a file that a run in one piece writes
-    extra_files: tuple[Output, ...] = ()  #: files that the caller writes, metadata among them
+    extra_files: tuple[Output, ...] = ()  #: files that the caller writes
 
     @cached_property
     def files(self) -> list[str]:
@@ -88,9 +88,6 @@ class ClassifyTask:
         pipeline = self.request.pipeline(source, target)
         pipeline.check_outputs(*self.extra_files)
         count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
-        if self.metadata:
-            text = json.dumps(pipeline.metadata, indent=2, default=str) + "\n"
-            write_whole(self.metadata, text.encode())
         reports = [each[-1] for _, each in pipeline.reports if each]
         codes = [report.codes for report in reports if report.codes is not None]
         messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
@@ -98,7 +95,8 @@ class ClassifyTask:
             written = las.read_header(target)
             odd = beyond_box(source, written.box) if written else None
             messages += [odd] if odd else []
-        return Written(target, count, codes[-1] if codes else {}, pipeline.left_alone, messages)
+        classes = codes[-1] if codes else {}
+        return Written(target, count, classes, pipeline.left_alone, messages, pipeline.metadata)
 
     def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
         """Classify all inputs in tiles; `finished` is called with every output that was written."""

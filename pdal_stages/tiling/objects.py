@@ -26,7 +26,7 @@ from ..pipeline.parts import arrays_in_parts, reads_in_parts
 from ..pipeline.read import Override
 from ..pipeline.references import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
-from ..reports.objectlayers import check_target, object_layers, target_files, write_layers
+from ..reports.objectlayers import check_target, target_files, write_objects
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def refuse_tiles(task: ClassifyTask, output: str) -> None:
     check_outputs([Output(output, "objects")], task.files)
 
 
-def write_objects(
+def objects_of_files(
     names: Sequence[str], stage: ObjectsWriter, workers: int = 1, metadata: str | None = None
 ) -> dict[str, Any]:
     """Find objects in classified files, write and summarize them; returns the files, and counts by kind."""
@@ -60,10 +60,9 @@ def write_objects(
     more = [Output(metadata, "metadata", JSON)] if metadata else []
     wanted = [Output(str(file), "objects") for file in target_files(stage.filename)]
     check_outputs([*wanted, *more], [*inputs, *names])
-    found, units, wkt = _objects_of_files(inputs, stage, workers)
+    found, units, wkt = _find_in_files(inputs, stage, workers)
     found, refused = found.without(stage.refuse)
-    layers = object_layers(found, straight=stage.outlines == STRAIGHT, units=units)
-    files = [str(file) for file in write_layers(stage.filename, layers, wkt)]
+    files = write_objects(stage.filename, found, stage.outlines == STRAIGHT, units, wkt)["files"]
     summary = found.summary()
     for kind, one in summary.items():
         word = kind if one["objects"] != 1 else kind.removesuffix("s")
@@ -99,9 +98,7 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
     return stage
 
 
-def _objects_of_files(
-    inputs: Sequence[str], stage: ObjectsWriter, workers: int
-) -> tuple[Objects, Units, str]:
+def _find_in_files(inputs: Sequence[str], stage: ObjectsWriter, workers: int) -> tuple[Objects, Units, str]:
     """The objects of all files together; the units of the coordinates and their reference (WKT)."""
     references = {path: reference_of_file(path, stage.horizontal_unit) for path in inputs}
     print_messages(*check_one_reference(references))
