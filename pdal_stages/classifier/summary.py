@@ -11,6 +11,9 @@ from .algorithms import REFINED, Column
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"
+#: How many clouds a model's text names.
+_CLOUDS = 8
+
 GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 
 
@@ -64,6 +67,7 @@ def text(info: Mapping[str, Any]) -> str:
             f"features       {len(one['feature_names'])}: {' '.join(one['features']['neighborhoods'])}",
             f"context        {' '.join(one['context']) or '-'}",
         ]
+    clouds = info["training"]["clouds"]
     rows: list[tuple[str, Any, str]] = [
         ("needs", True, ", ".join(info["required_dimensions"]) or "coordinates only"),
         ("halo", True, f"{info['halo_m']:g} m"),
@@ -76,7 +80,8 @@ def text(info: Mapping[str, Any]) -> str:
         ("densities", info.get("densities"), f"{range_text(info.get('densities') or {})} points/m2"),
         ("voxel", info.get("voxel"), "{0:g} m, which one point stands for"),
         ("on top of", info.get("base"), "{0[name]}, the passes before (SHA-256 {0[sha256]})"),
-        *(("trained on", c, "{0[name]}, {0[points]:,} points") for c in info["training"]["clouds"]),
+        *(("trained on", c, "{0[name]}, {0[points]:,} points") for c in clouds[:_CLOUDS]),
+        ("", len(clouds[_CLOUDS:]), "and {0:,} more (--showjson lists them)"),
         ("labels", info.get("teacher"), "what {0[name]} is sure of ({0[sure]:g} and more); no person's"),
     ]
     lines += [f"{name:<15}{said.format(value)}" for name, value, said in rows if value]
@@ -126,7 +131,8 @@ def score(info: Mapping[str, Any]) -> str:
         return f"not scored     its labels are answers of {teacher['name']}; only labels of your own tell how right it is"
     row = held_out(info)
     if not row:
-        return f"not scored     {info['training'].get('unscored', 'the model file holds no score')}"
+        why = "no score in the file (the shipped model: docs/models.md)"
+        return f"not scored     {info['training'].get('unscored', why)}"
     label = "ground held out, which chose the best epoch"
     if crossed := info["accuracy"]["cross_validation"]:
         by = crossed.get("by", "blocks")

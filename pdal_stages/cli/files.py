@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 
-from . import Parser, takes_options
+from . import Parser
 
 
 def add_commands(parser: Parser) -> None:
@@ -14,7 +14,10 @@ def add_commands(parser: Parser) -> None:
     takes = parser.command("objects", _objects, what, overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    takes_options(takes, "writers.objects", "outlines", "cell")
+    straight = "Outlines along walls, or along the grid's cells (default: straight)"
+    takes("--outlines", choices=("straight", "cells"), help=straight)
+    wide = "Side of the grid's cells (default: by density, 0.5 to 4 m)"
+    takes("--cell", type=float, metavar="METERS", help=wide)
     takes("--workers", type=int, default=1, metavar="N", help="Files to read at the same time (default: 1)")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 

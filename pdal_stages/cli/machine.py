@@ -86,9 +86,10 @@ def _options(options: argparse.Namespace) -> None:
         with contextlib.suppress(DependencyError, PipelineError):
             answer = ask_program("--options", name, *(["--showjson"] if options.showjson else []))
         if not answer.strip() or "Unable to create" in answer or "not found" in answer:
+            theirs = [one["name"] for one in json.loads(ask_program("--drivers", "--showjson"))]
             raise PipelineError(
                 f"there is no stage '{name}', neither of ours nor of PDAL's",
-                cure=f"{suggest(name, stage_types())}List them with: pdal-stages drivers",
+                cure=f"{suggest(name, [*stage_types(), *theirs])}List them with: pdal-stages drivers",
             )
         print(answer, end="")
         return

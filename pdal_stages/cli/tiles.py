@@ -190,7 +190,7 @@ def add_sizes(
 ) -> Callable:
     """Add the flags of ``train``, whose only output is a model; returns a function that adds more."""
     takes = command.add_argument_group("large areas", what).add_argument
-    takes("--tile", type=_side, metavar="SIZE", help="Side of the tiles in the cloud's unit, or auto")
+    takes("--tile", type=_side, metavar="SIZE", help="Side of the tiles in the cloud's unit (default: auto)")
     takes("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
     takes("--workers", type=int, metavar="N", help="Worker processes, 0 for none (default: half the cores)")
     return takes

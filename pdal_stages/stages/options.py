@@ -217,9 +217,7 @@ def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[
         if name in given:
             values[name] = option.parse(given[name])
         elif option.required:
-            raise OptionError(
-                f"option '{name}' is required", cure=f"It is {_KINDS[option.kind][1]}: {option.help}"
-            )
+            raise OptionError(f"option '{name}' is required", cure=option.help)
         elif option.kind == "selection" and option.default is not None:
             values[name] = option.parse(option.default)
         else:
