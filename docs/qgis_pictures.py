@@ -3,16 +3,18 @@
     PDAL_STAGES_DATA=FOLDER xvfb-run -s "-screen 0 1500x950x24" \
         qgis --nologo --noversioncheck --profiles-path /tmp/profile --code docs/qgis_pictures.py
 
-Run it in the checkout, with `pdal-stages` on PATH or named by PDAL_STAGES_PROGRAM. QGIS closes by itself.
+Run it in the checkout, with PDAL_STAGES_PROGRAM=.venv/bin/pdal-stages, in a shell where no virtual environment is active:
+QGIS would take its Python. QGIS closes by itself.
 """
 
 import os
 import sys
 import tempfile
 import traceback
+from collections import Counter
 
 from qgis.core import QgsProject, QgsRasterLayer
-from qgis.PyQt.QtCore import QEventLoop, Qt, QTimer
+from qgis.PyQt.QtCore import QEventLoop, QTimer
 from qgis.PyQt.QtGui import QImage
 from qgis.PyQt.QtWidgets import QTreeView
 from qgis.utils import iface
@@ -46,9 +48,11 @@ def settle(seconds=1.0):
 
 
 def keep(widget, name):
-    """A picture of few colors, which is small."""
-    image = widget.grab().toImage().convertToFormat(QImage.Format_Indexed8, Qt.AvoidDither)
-    image.save(os.path.join(PICTURES, name), quality=0)
+    """A picture of its 256 commonest colors, which is small."""
+    image = widget.grab().toImage().convertToFormat(QImage.Format_RGB32)
+    pixels = memoryview(image.constBits().asstring(image.sizeInBytes())).cast("I")
+    colors = [color for color, _ in Counter(pixels).most_common(256)]
+    image.convertToFormat(QImage.Format_Indexed8, colors).save(os.path.join(PICTURES, name), quality=0)
 
 
 def dialogs():

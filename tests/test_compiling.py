@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 
 def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     code = (
@@ -29,3 +31,20 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     assert not said()
     index.parent.chmod(0o777)
     assert "other users can write to" in said()
+
+
+@pytest.mark.pdal
+def test_after_warmup_a_job_compiles_nothing(ready_town, tmp_path):
+    pytest.importorskip("pyogrio")
+    code = (
+        "from sys import argv; from pdal_stages.base.jit import _functions; from pdal_stages.cli import main\n"
+        "def compiled():\n"
+        "    made = [kernel._dispatcher for kernel in _functions if kernel._dispatcher]\n"
+        "    return {(one.__name__, str(types)) for one in made for types in one.signatures}\n"
+        "main(['warmup'])\nbefore = compiled()\n"
+        "assert main(['classify', '--wires', *argv[1:3]]) == main(['objects', *argv[2:]]) == 0\n"
+        "assert compiled() == before, compiled() - before"
+    )
+    files = [ready_town, tmp_path / "c.laz", tmp_path / "o.gpkg"]
+    ended = subprocess.run([sys.executable, "-c", code, *files], text=True, capture_output=True)
+    assert ended.returncode == 0, ended.stderr

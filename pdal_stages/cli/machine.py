@@ -220,21 +220,34 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    """Run the kernels of the demo, the default heights, training and classification on a few meaningless points."""
+    """Run the kernels of the demo, the default heights, training, classification and objects on a few points."""
     import numpy as np
 
     from ..classifier.clouds import TrainingCloud
     from ..classifier.training import train
     from ..classifier.trainoptions import TrainingOptions
+    from ..objects.consistency import consistent
+    from ..objects.crowns import crown_cells
+    from ..objects.roofs import roof_planes
     from ..synthetic import make_town
     from ..terrain import detached_noise, filtered_ground, hag_minima
+    from ..terrain.towers import find_towers
+    from ..terrain.wires import find_wires
 
     make_town(20.0, 1.0, threads=1, progress=False)
     # A deck over a valley, with land at both ends, so that the kernels for decks run as well.
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
     z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))
     filtered_ground(x, y, z, openings=(5,), decks=True, threads=1)
+    # A wire that sags on both sides of a pole, so that the kernels for both run.
+    x, z = np.arange(-60.0, 60.0, 0.5), np.arange(0.0, 12.0, 0.5)
+    span = np.zeros((len(x) + len(z), 3))
+    span[: len(x), 0], span[:, 2] = x, np.concatenate((12.0 - abs(x) / 20.0, z))
+    every = np.ones(len(span), bool)
+    find_wires(span, span[:, 2], every)
+    find_towers(span, span[:, 2], np.arange(len(span)) < len(x), every)
     xyz = np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
+    xyz[1] = xyz[0]  # one stands for both
     axes = np.ascontiguousarray(xyz.T)
     detached_noise(*axes)
     dimensions = filtered_ground(*axes, openings=(5,), threads=1)
@@ -249,8 +262,12 @@ def _warmup(options: argparse.Namespace) -> None:
         count=50,
         threads=1,
     )
-    model = train(TrainingCloud(xyz, np.where(xyz[:, 2] > 6.0, 6, 2), dimensions), how, progress=False)
+    classes = np.where(xyz[:, 2] > 6.0, 6, 2)
+    model = train(TrainingCloud(xyz, classes, dimensions), how, progress=False)
     model.predict(xyz, dimensions, threads=1)
+    consistent(xyz, classes)
+    crown_cells(np.ones((9, 9)), 0.5, 0.5, 2.0)
+    roof_planes(np.ones((9, 9)), 0.5)
     if options.all:
         from ..features import warmup as every_neighborhood
 

@@ -236,6 +236,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
                 geometry_type=layer.kind,
                 crs=wkt or None,
                 layer=named,
+                **({"VERSION": "1.2"} if named else {}),  # of which GDAL before 3.7 does not warn
             )
         found = pyogrio.read_info(path, layer=named, force_feature_count=True)["features"]
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
@@ -297,6 +298,7 @@ def _write_styles(path: Path, styles: Mapping[str, str]) -> None:
         "f_table_catalog": empty, "f_table_schema": empty, "f_table_name": list(styles),
         "f_geometry_column": ["geom"] * len(styles), "styleName": list(styles), "styleQML": list(styles.values()),
         "styleSLD": empty, "useAsDefault": one, "description": empty, "owner": empty, "ui": empty,
+        "update_time": ["2020-01-01T00:00:00.000Z"] * len(styles),  # QGIS sorts by it, and else loads no style
     }  # fmt: skip
     vector("pyogrio").raw.write(
         path,

@@ -297,7 +297,6 @@ class Train(Algorithm):
         target = self.destination(parameters, "MODEL", context)
         chosen = [*self.arguments(parameters, context), f"--model={target}"]
         self.execute(["train", *chosen, *self.inputs(parameters, context)], feedback)
-        self.execute(["model", target], feedback)
         return {"MODEL": target}
 
 

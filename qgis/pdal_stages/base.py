@@ -1,5 +1,6 @@
 """What all algorithms share: the program, its run, its arguments as parameters."""
 
+import difflib
 import os
 
 from qgis.core import (
@@ -9,6 +10,8 @@ from qgis.core import (
     QgsProcessingParameterFile,
     QgsProcessingParameterFileDestination,
     QgsProcessingParameterMultipleLayers,
+    QgsProcessingParameterNumber,
+    QgsProcessingParameterRasterDestination,
 )
 
 from . import environment, form, running
@@ -81,6 +84,27 @@ class Algorithm(Named):
         return True, ""
 
     # ---- parameters ------------------------------------------------------------------------------------
+
+    def checkParameterValues(self, parameters, context):
+        """Refuse what QGIS passes over: unknown names, rasters of other formats, text for an optional number."""
+        known = {one.name(): one for one in self.parameterDefinitions()}
+        for key, value in parameters.items():
+            one = known.get(key)
+            if one is None:
+                near = difflib.get_close_matches(key.upper(), known, 1)
+                cure = f"Did you mean {near[0]}?" if near else f"There are {', '.join(known)}."
+                return False, f"There is no parameter {key}. {cure}"
+            if isinstance(one, QgsProcessingParameterRasterDestination) and value:
+                ok, why = self.provider().isSupportedOutputValue(value, one, context)
+                if not ok:
+                    return False, f"{key}: {why}. Give a name that ends in .tif."
+            if isinstance(one, QgsProcessingParameterNumber) and isinstance(value, str) and value.strip():
+                whole = one.dataType() == QgsProcessingParameterNumber.Integer
+                try:
+                    int(value) if whole else float(value)
+                except ValueError:
+                    return False, f"{key} must be a {'whole ' * whole}number (found '{value}')."
+        return super().checkParameterValues(parameters, context)
 
     def add_declared(self):
         """The command's or stage's own arguments: those of `listed`, then all others as advanced."""

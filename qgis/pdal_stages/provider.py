@@ -26,6 +26,12 @@ class Provider(QgsProcessingProvider):
     def icon(self):
         return QIcon(os.path.join(os.path.dirname(__file__), "icon.svg"))
 
+    def supportedOutputRasterLayerExtensions(self):
+        return ["tif", "tiff"]
+
+    def supportsNonFileBasedOutput(self):
+        return False
+
     def load(self):
         ProcessingConfig.settingIcons[self.name()] = self.icon()
         text = "Program pdal-stages, or the folder of its environment (empty: it is looked for)"
