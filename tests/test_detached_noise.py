@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from itertools import product
 
 import laspy
@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
@@ -97,7 +99,7 @@ def slow_small(count, usual, most, widest):
 
 
 def slow_covered(count, whole, spacing, most):
-    """Voxels of clusters of more than `most` points that others lie above, in most of their columns."""
+    """Voxels of clusters that others lie above, in most of their columns, of more than `most` points, or steep."""
     top, above = {}, defaultdict(list)
     for k in sorted(count):
         top[k[:2]] = k
@@ -106,13 +108,15 @@ def slow_covered(count, whole, spacing, most):
             near = [n for n in range(3) if n < spacing(k) * detached.SPACINGS / SIDE + 0.5]
             columns = product(range(-near[-1], near[-1] + 1), repeat=2)
             tops = [top.get((k[0] + b, k[1] + a)) for b, a in columns]
-            above[whole[k]].append(any(t is not None and whole[t] != whole[k] for t in tops))
-    under = {c for c, seen in above.items() if np.mean(seen) >= detached.COVERED}
-    return {
-        k
-        for k in count
-        if whole[k] in under and sum(n for o, n in count.items() if whole[o] == whole[k]) > most
-    }
+            above[whole[k]].append(any(t is not None and whole[t] != whole[k] and t[2] > k[2] for t in tops))
+    under = set()
+    for c, seen in above.items():
+        members = [k for k in count if whole[k] == c]
+        *wide, tall = np.ptp(members, axis=0)
+        steep = tall > detached.EXTENT and tall >= detached.STEEP * max(wide)
+        if np.mean(seen) >= detached.COVERED and (steep or sum(count[k] for k in members) > most):
+            under |= set(members)
+    return under
 
 
 def slow_plane(low, j, i, radius, blocks, inner=-1):
@@ -243,16 +247,18 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
     limit = slow_below(low, base, SIDE, depth)
     codes |= {k: 7 for k in lone if highest[k] < limit[k[:2]]}
     out = np.array([codes.get(k, 0) for k in voxel], np.uint8)
-    points, lows = np.zeros((2, h, w), np.int64)
+    points, lows, clusters = np.zeros((3, h, w), np.int64)
     np.add.at(points, (at[:, 0], at[:, 1]), 1)
-    bare = np.array([k not in covered for k in voxel])
-    np.add.at(lows, (at[:, 0], at[:, 1]), (out == 7) & bare)
+    np.add.at(lows, (at[:, 0], at[:, 1]), out == 7)
+    of = Counter(cluster.values())
+    for k in (k for k, code in codes.items() if code == 7):
+        clusters[k[:2]] += detached.PARTS // (of[cluster[k]] if cluster[k] else 1)
     for c in zip(*np.nonzero(lows), strict=True):
         near = np.maximum(abs(j - c[0]), abs(i - c[1])) <= 20
-        held, filled = (lows[near] > 0).sum(), (points[near] > 0).sum()
+        held, filled = clusters[near].sum() / detached.PARTS, (points[near] > 0).sum()
         share = min(held / filled, lows[near].sum() / points[near].sum())
-        if held >= detached.COLUMNS and share > detached.TOO_MANY:
-            out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7) & bare] = 0
+        if held > detached.CLUSTERS and share > detached.TOO_MANY:
+            out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7)] = 0
     return out
 
 
@@ -286,14 +292,31 @@ def slow_supported(base):
     return out
 
 
+def slow_linked(raster, side):
+    """Number of each cell's set, of those linked across small steps, -1 in holes."""
+    cells = np.argwhere(np.isfinite(raster))
+    z, number = raster[tuple(cells.T)], np.full(raster.shape, -1)
+    away = np.linalg.norm(cells[:, None] - cells[None], axis=2)
+    step = np.abs(z[:, None] - z[None]) <= (0.35 + 0.15 * side * away).astype(np.float32)
+    one, other = np.nonzero((away <= 3) & step)
+    pairs = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(z),) * 2)
+    number[tuple(cells.T)] = connected_components(pairs)[1]
+    return number
+
+
 def slow_company(base, supported, at, z, plane, side):
-    """Whether enough columns with others of their level are about as deep as z, and below the plane."""
+    """Whether enough columns with others of their level are about as deep as z, below the plane, and not of land above."""
     j, i = np.mgrid[: base.shape[0], : base.shape[1]]
     away = side * np.hypot(j - at[0], i - at[1])
     half = 0.5 * (plane[0] - z)
     below = plane[0] + plane[1] * (i - at[1]) + plane[2] * (j - at[0]) - base
     most = np.minimum(half, belowground.LEVEL + belowground.ROOM * away)
     deep = (base <= z + most) & (below >= half) & (away <= belowground.FAR)
+    around = np.maximum(abs(j - at[0]), abs(i - at[1]))
+    seen, beside = supported & (around <= np.ceil(belowground.FAR / side)), around <= belowground.BESIDE
+    number = slow_linked(np.where(seen, base, np.inf), side)
+    for k in set(number[beside & (number >= 0)]):
+        deep[(number == k) & (base[beside & (number == k)].min() > z + half)] = False
     return (deep & supported).sum() >= belowground.COMPANY
 
 
@@ -321,6 +344,24 @@ def test_so_they_do_under_a_closed_canopy():
     noise = np.flatnonzero(ground)[::5]
     xyz[noise, 2] -= np.linspace(2, 25, len(noise))
     assert np.array_equal(detached_noise(xyz), slow_noise(xyz))
+
+
+@pytest.mark.parametrize(
+    ("density", "clusters", "size", "extent", "depth"),
+    [(3.0, 1, 10, 0.5, 3), (0.4, 1, 30, 10, 60), (0.4, 3, 30, 4, 22)],
+)
+def test_clusters_below_land_that_falls_as_deep_and_below_thin_clouds(density, clusters, size, extent, depth):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 60, (2, int(3600 * density)))
+    z = -0.3 * np.maximum(x - 32, 0) + rng.normal(0, 0.03, len(x))
+    balls = rng.normal(0, 1, (clusters, size, 3))
+    balls *= extent / 2 / np.linalg.norm(balls, axis=2, keepdims=True)
+    balls *= rng.random((clusters, size, 1)) ** (1 / 3)
+    balls += [[[20, 15 * k + 15, -depth - extent / 2]] for k in range(clusters)]
+    xyz = np.vstack([np.column_stack([x, y, z]), *balls])
+    found = detached_noise(xyz)
+    assert np.array_equal(found == 7, np.arange(len(xyz)) >= len(x))
+    assert np.array_equal(found, slow_noise(xyz))
 
 
 # ---- what must hold -------------------------------------------------------------------------------------

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from test_detached_noise import closed_wood, slow_below
+from test_detached_noise import closed_wood, slow_below, slow_linked
 
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.belowground import pits, pits_reach
@@ -19,19 +17,13 @@ from pdal_stages.terrain.cells import HOLE
 
 
 def slow_pits(raster, highest, cell=1.0):
-    cells = np.argwhere(np.isfinite(raster))
-    z = raster[tuple(cells.T)]
-    away = np.linalg.norm(cells[:, None] - cells[None], axis=2)
-    step = np.abs(z[:, None] - z[None]) <= (0.35 + 0.15 * cell * away).astype(np.float32)
-    one, other = np.nonzero((away <= 3) & step)
-    count, label = connected_components(coo_matrix((np.ones(len(one)), (one, other)), shape=(len(z),) * 2))
-    sets = [cells[label == k] for k in range(count)]
+    number = slow_linked(raster, cell)
+    sets = [np.argwhere(number == k) for k in range(number.max() + 1)]
     covered = np.pad(highest > raster + 2.5, 1)
     under = lambda j, i: covered[j : j + 3, i : i + 3].any()  # noqa: E731
     few = [len(mine) <= 30 or np.mean([under(*at) for at in mine]) >= 0.8 for mine in sets]
     small = [some and (np.ptp(mine, axis=0) < 20).all() for some, mine in zip(few, sets, strict=True)]
-    island = np.zeros(raster.shape, bool)
-    island[tuple(cells.T)] = np.array(small)[label]
+    island = np.append(small, False)[number]
     low, base = np.where(island, raster, np.inf), np.where(island, np.inf, raster)
     return np.isfinite(slow_below(low.astype(float), base.astype(float), cell))
 

@@ -1,8 +1,9 @@
 """What lies below the ground, as echoes from below do: by a plane under its surroundings.
 
 A low place lies below the plane by more than its surroundings scatter about it. It is ground after all where ground as deep
-is near, as a street is to a courtyard; and under a closed canopy, where few columns are level with others, if it is not
-below the plane under the lowest points of wide blocks around: single points reach the ground, in the wood or beside it.
+is near, as a street is to a courtyard, unless one walks from there to land above the place, as on a slope; and under a
+closed canopy, where few columns are level with others, if it is not below the plane under the lowest points of wide blocks
+around: single points reach the ground, in the wood or beside it.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from .openings import highest_around
 NEAR, ENOUGH = 9, 12
 #: How far below the plane a low place lies at least, in units of the scatter.
 SCATTERS = 4.0
-#: How far away other ground is looked for, in meters, how many columns of it show that a deep place is ground, and how much
-#: higher these may be per meter of distance.
-FAR, COMPANY, ROOM = 30.0, 4, 0.05
+#: How far away other ground is looked for, in meters, how many columns of it show that a deep place is ground, how much
+#: higher these may be per meter of distance; and within how many columns their land does not run above the place.
+FAR, COMPANY, ROOM, BESIDE = 30.0, 4, 0.05, 4
 #: A column of ground has so many others of its level, in meters, in the 5 x 5 round it, and such a share of those.
 SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
 #: A canopy is closed where at most such a share of the columns near is level with others; the blocks with which low places
@@ -119,19 +120,57 @@ def _supported(base):
     return out
 
 
-@device
+@device(_nrt=True)
+def _of_land_above(levels, left, deep, side, j, i, height):
+    """How many of the `deep` columns (h, w) are of linked sets that come near a place, and lie above a height there.
+
+    `left` are the columns that may be linked; those that were looked at are taken out.
+    """
+    h, w = left.shape
+    queue = np.empty((h * w, 2), np.int64)
+    many = 0
+    for row in range(max(j - BESIDE, 0), min(j + BESIDE + 1, h)):
+        for column in range(max(i - BESIDE, 0), min(i + BESIDE + 1, w)):
+            lowest, found, waiting = np.inf, 0, 0
+            if left[row, column]:
+                left[row, column], queue[0, 0], queue[0, 1], waiting = False, row, column, 1
+            while waiting:
+                waiting -= 1
+                b, a = queue[waiting]
+                found += deep[b, a]
+                if max(abs(b - j), abs(a - i)) <= BESIDE:
+                    lowest = min(lowest, levels[b, a])
+                for y in range(max(b - LINK, 0), min(b + LINK + 1, h)):
+                    for x in range(max(a - LINK, 0), min(a + LINK + 1, w)):
+                        away = np.sqrt(float((y - b) ** 2 + (x - a) ** 2))
+                        step = abs(levels[y, x] - levels[b, a])
+                        if left[y, x] and away <= LINK and step <= STEP + GRADE * side * away:
+                            left[y, x], queue[waiting, 0], queue[waiting, 1] = False, y, x
+                            waiting += 1
+            many += found * (lowest > height)
+    return many
+
+
+@device(_nrt=True)
 def _has_company(base, supported, side, j, i, z, height, across, along):
-    """Whether enough other columns are about as deep as z: at least half as far below the plane."""
-    h, w = base.shape
-    far = int(np.ceil(FAR / side))
-    company, half = 0, 0.5 * (height - z)
-    for b in range(max(j - far, 0), min(j + far + 1, h)):
-        for a in range(max(i - far, 0), min(i + far + 1, w)):
-            if supported[b, a]:
+    """Whether enough other columns are about as deep as z, at least half as far below the plane, and not of land above."""
+    far, half, company = int(np.ceil(FAR / side)), 0.5 * (height - z), 0
+    bottom, left = max(j - far, 0), max(i - far, 0)
+    levels = base[bottom : j + far + 1, left : i + far + 1]
+    seen = supported[bottom : j + far + 1, left : i + far + 1].copy()
+    j, i = j - bottom, i - left
+    deep = np.zeros_like(seen)
+    for b in range(seen.shape[0]):
+        for a in range(seen.shape[1]):
+            if seen[b, a]:
                 away = side * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))
-                below = height + across * (a - i) + along * (b - j) - base[b, a]
-                company += away <= FAR and base[b, a] <= z + min(half, LEVEL + ROOM * away) and below >= half
-    return company >= COMPANY
+                below = height + across * (a - i) + along * (b - j) - levels[b, a]
+                most = z + min(half, LEVEL + ROOM * away)
+                deep[b, a] = away <= FAR and levels[b, a] <= most and below >= half
+                company += deep[b, a]
+    return (
+        company >= COMPANY and company - _of_land_above(levels, seen, deep, side, j, i, z + half) >= COMPANY
+    )
 
 
 @njit

@@ -6,8 +6,8 @@ extremes, so that no order of points and no tile matters:
 1. A point is suspect if it is of a small cluster that nothing joins to the rest: a component of voxels that touch, by a
    corner at least, with few points and little extent. In dense clouds, voxels with next to no points do not join others;
    in thin ones, voxels are widened until they hold several spacings of points. A cluster that lies under others in nearly
-   all of its columns may have any number of points. What is not suspect gives every column of the grid its lowest and its
-   highest point.
+   all of its columns may have any number of points, or be taller. What is not suspect gives every column of the grid its
+   lowest and its highest point.
 2. A suspect is high noise if it lies above all that is near, by a gap. The thinner the cloud, the wider the gap and the
    way looked: a tree, or a mast, may be a single point there. What hangs in line with others, as wires do, stays.
 3. A suspect is low noise if it lies below the ground (:mod:`.belowground`).
@@ -55,10 +55,12 @@ FAR = 20
 #: A line has others at so many places of three columns each, and such a share of all suspects near: two wires hang side
 #: by side, as over pylons.
 STRUNG, STRUNG_SHARE = 4, 0.3
-#: More than such a share of the points and of the columns within so many around, so many columns at least, is no noise.
-TOO_MANY, COLUMNS, AROUND = 0.025, 6, 20
-#: Low noise of any size has others above it in such a share of its voxels.
-COVERED = 0.8
+#: Within so many columns around, low noise has at most such a share of the points, or no more clusters than such a share of
+#: the columns, or so many. A voxel counts as its part of a cluster, in whole numbers of which a cluster has so many.
+AROUND, TOO_MANY, CLUSTERS, PARTS = 20, 0.025, 5, 1 << 20
+#: Low noise of any size has others above it in such a share of its voxels; of few points, it rises by so much per meter, as
+#: ground hardly does.
+COVERED, STEEP = 0.8, 0.5
 #: How far away, in meters, points can change what a point is: the halo a tile needs.
 REACH = (below_reach(SIDE) + FAR + 2) * SIDE + CLUSTER_REACH
 
@@ -132,7 +134,7 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     np.minimum.at(lowest, voxel, z)
     np.maximum.at(highest, voxel, z)
     top, base, low = np.full(h * w, -np.inf), np.full(h * w, np.inf), np.full(h * w, np.inf)
-    large = _covered(place, number, voxels.counts, spacing, w, h * w, cluster)
+    large = _covered(voxels, number, spacing, h * w, cluster)
     plain = ~(suspect | large)
     np.minimum.at(base, place[plain], lowest[plain])
     np.maximum.at(top, place[~suspect], highest[~suspect])
@@ -149,16 +151,15 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     np.minimum.at(low, place[suspect], lowest[suspect])
     limit = below_ground(low.reshape(h, w), base.reshape(h, w), SIDE, depth)
     low = suspect & (highest < limit.ravel()[place])
-    # Where more is low than noise is, it is none, but for large clusters under others.
-    lows, points = (
-        np.bincount(place[of], voxels.counts[of], h * w).reshape(h, w) for of in (low & ~large, slice(None))
+    # Where more is low than noise is, it is none.
+    part, grouped = np.full(len(place), PARTS), number >= 0
+    part[grouped] //= np.bincount(number[grouped])[number[grouped]]
+    lows, points, clusters, full = (
+        sums_around(np.bincount(place, counts, h * w).astype(np.int64).reshape(h, w), AROUND)
+        for counts in (low * voxels.counts, voxels.counts, low * part, begins[:-1] * PARTS)
     )
-    share = [
-        sums_around(few, AROUND) > TOO_MANY * sums_around(all_, AROUND)
-        for few, all_ in ((lows, points), (lows > 0, points > 0))
-    ]
-    many = share[0] & share[1] & (sums_around(lows > 0, AROUND) >= COLUMNS)
-    verdict[low & (large | ~many.ravel()[place])] = LOW
+    many = (lows > TOO_MANY * points) & (clusters > TOO_MANY * full) & (clusters > CLUSTERS * PARTS)
+    verdict[low & ~many.ravel()[place]] = LOW
     return verdict[voxel]
 
 
@@ -266,19 +267,25 @@ def small_clusters(
     return small, size, number
 
 
-def _covered(place, number, counts, spacing, width, columns, most):
-    """Voxels of clusters of more than `most` points that others lie above in nearly all of their columns."""
+def _covered(voxels, number, spacing, columns, most):
+    """Voxels of clusters that others lie above in nearly all of their columns: of more than `most` points, or taller than
+    small ones and steeper than ground is."""
+    place = voxels.keys >> BITS
     top = np.full(columns, -1)
     top[place] = np.arange(len(place))  # the last of a column is its highest
     asked = np.flatnonzero(number >= 0)
     place, number_of, within = place[asked], number[asked], spacing[asked] * SPACINGS / SIDE + 0.5
+    row, column, level = voxels.places
     above = np.zeros(len(asked), bool)
     for dj, di in product(range(-2, 3), repeat=2):
-        other = top[np.clip(place + dj * width + di, 0, columns - 1)]
+        other = top[np.clip(place + dj * voxels.width + di, 0, columns - 1)]
         near = max(abs(dj), abs(di)) < within
-        above |= near & (other >= 0) & (number[other] != number_of)
-    size = np.bincount(number_of, counts[asked])
-    mostly = (size > most) & (np.bincount(number_of, above) >= COVERED * np.bincount(number_of))
+        above |= near & (other >= 0) & (number[other] != number_of) & (level[other] > level[asked])
+    size = np.bincount(number_of, voxels.counts[asked])
+    wide = longest_sides(number_of, (row[asked], column[asked]), len(size))
+    tall = longest_sides(number_of, (level[asked],), len(size))
+    mostly = np.bincount(number_of, above) >= COVERED * np.bincount(number_of)
+    mostly &= (size > most) | (tall > EXTENT) & (tall >= STEEP * wide)
     covered = np.zeros(len(number), bool)
     covered[asked] = mostly[number_of]
     return covered
