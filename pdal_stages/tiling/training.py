@@ -158,7 +158,8 @@ class TrainTask:
         report = Report()
         made = (self._whole if self.in_one_piece() else self._tiled)(heights, report)
         stage.finish(made, report)
-        return [*told, *report.messages]
+        said = [*told, *report.messages]  # once what the preparation says as well
+        return [one for one in said if not any(one.endswith(f": {other}") for other in said)]
 
     def _read(self, heights: Sequence[Mapping[str, Any]], stage: ClassifierModel) -> Points:
         """The points with heights, and with file numbers where these are the groups of the score."""
