@@ -164,7 +164,7 @@ def check_target(path: str | Path, layers: Sequence[str] = LAYERS) -> None:
     """Refuse a name with another ending, and files that cannot be written; `layers`: their names."""
     if Path(path).suffix.lower() not in DRIVERS:
         raise StageError(
-            "objects are written to a vector file",
+            "the output must be a vector file",
             found=str(path),
             cure=f"Give a name that ends in {', '.join(DRIVERS)}",
         )
