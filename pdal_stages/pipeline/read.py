@@ -69,6 +69,9 @@ def _content(path: Path) -> bytes:
 
 def decode(data: bytes, name: str) -> str:
     """The text of a pipeline file, which is UTF-8, with or without a byte order mark."""
+    if data.startswith(b"LASF"):
+        cure = "Give the JSON file of a pipeline; or classify the points: pdal-stages classify IN OUT"
+        raise PipelineError("this is a point cloud, not a pipeline", where=name, cure=cure)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
