@@ -316,7 +316,7 @@ def slow_company(base, supported, at, z, plane, side):
     seen, beside = supported & (around <= np.ceil(belowground.FAR / side)), around <= belowground.BESIDE
     number = slow_linked(np.where(seen, base, np.inf), side)
     for k in set(number[beside & (number >= 0)]):
-        deep[(number == k) & (base[beside & (number == k)].min() > z + half)] = False
+        deep[(number == k) & (base[beside & (number == k)].min() > z + max(half, belowground.HIGHER))] = False
     return (deep & supported).sum() >= belowground.COMPANY
 
 

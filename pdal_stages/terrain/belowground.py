@@ -22,8 +22,8 @@ NEAR, ENOUGH = 9, 12
 #: How far below the plane a low place lies at least, in units of the scatter.
 SCATTERS = 4.0
 #: How far away other ground is looked for, in meters, how many columns of it show that a deep place is ground, how much
-#: higher these may be per meter of distance; and within how many columns their land does not run above the place.
-FAR, COMPANY, ROOM, BESIDE = 30.0, 4, 0.05, 4
+#: higher these may be per meter of distance; within how many columns their land is not so many meters above the place.
+FAR, COMPANY, ROOM, BESIDE, HIGHER = 30.0, 4, 0.05, 4, 2.0
 #: A column of ground has so many others of its level, in meters, in the 5 x 5 round it, and such a share of those.
 SUPPORT, SUPPORT_SHARE, LEVEL = 2, 0.2, 1.0
 #: A canopy is closed where at most such a share of the columns near is level with others; the blocks with which low places
@@ -169,7 +169,8 @@ def _has_company(base, supported, side, j, i, z, height, across, along):
                 deep[b, a] = away <= FAR and levels[b, a] <= most and below >= half
                 company += deep[b, a]
     return (
-        company >= COMPANY and company - _of_land_above(levels, seen, deep, side, j, i, z + half) >= COMPANY
+        company >= COMPANY
+        and company - _of_land_above(levels, seen, deep, side, j, i, z + max(half, HIGHER)) >= COMPANY
     )
 
 
