@@ -185,7 +185,7 @@ def test_noise_and_withheld_points_are_not_there(tmp_path, run, write_las, model
         code, said, err = run("classify", source, tmp_path / "o.las", "--model", model)
         assert code == 0, err
         out[name] = laspy.read(tmp_path / "o.las")
-    assert "left out: noise, withheld (ignore)" in said and "120" in said
+    assert "noise and withheld points, not classified (ignore)" in said and "120" in said
     for name in ("classification", "Reliability", "HeightAboveGround"):
         assert np.array_equal(np.asarray(out["bad"][name])[:n], np.asarray(out["clean"][name])), name
     assert np.array_equal(np.asarray(out["bad"].classification)[n:], bad["Classification"][n:])

@@ -28,7 +28,7 @@ from .stagefiles import is_reader, is_writer, named_files, readers_files, with_o
 #: Points that got no class from the classifier, or were changed after it, by their keys in the reports of stages.
 LEFT_ALONE = {
     "rejected": "rejected as unreliable",
-    "ignored": "left out: noise, withheld (ignore)",
+    "ignored": "noise and withheld points, not classified (ignore)",
     "kept": "class kept (keep)",
     "outside_where": "outside where",
     "decks": "bridge decks (bridges)",
