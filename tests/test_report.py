@@ -151,7 +151,7 @@ def test_every_figure_is_there(full, accuracy):
         assert f"{100 * share:.1f} %" in text
     assert "Building taken for High vegetation" in text
     assert f"{accuracy.left_out_points} points (1 Unclassified: 50)" in text
-    assert "30 points were given a class that is not compared (1 Unclassified)" in text
+    assert "Points given a class that is not compared, which count as errors: 30 (1 Unclassified)." in text
     assert "nan" not in text.lower().replace("national", "")
 
 
