@@ -151,7 +151,7 @@ class TrainTask:
         base = stage.training.base
         made_by = preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
         heights = [overridden(one, self.overrides) for one in made_by]
-        told = [said] if (said := stage.follows(heights)) is not None else []
+        told = [follows] if (follows := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
         stage.check()
         check_outputs(stage.outputs(), list(self.files))
