@@ -234,6 +234,18 @@ def test_the_workers_stop_too(tmp_path, folder, expected):
     check_same(tmp_path, expected)
 
 
+def test_no_room_for_workers(monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", refuse)
+    with (
+        pytest.raises(StageError, match=r"Permission denied.*--workers 0"),
+        workers.WorkerProcesses(1, 1) as pool,
+    ):
+        pool.submit(dict)
+
+
 def _workers(parent: int) -> list[int]:
     """Children that are workers, or about to become ones, not programs that were asked something."""
     found = []

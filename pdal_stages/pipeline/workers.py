@@ -130,7 +130,11 @@ class WorkerProcesses(AbstractContextManager):
             future = pool.submit(perform, task)
         else:
             with _environment(self.threads), self._logged():
-                pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
+                try:
+                    pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
+                except OSError as error:
+                    cure = "Make /dev/shm writable, or do without them: --workers 0"
+                    raise StageError("worker processes cannot be started", found=error, cure=cure) from None
                 future = pool.submit(perform, task)
         self._busy[future] = pool
         return future
