@@ -200,7 +200,7 @@ def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_p
     assert said[0] == said[1] == said[2]
     assert classes[0] == classes[1] == classes[2]
     lines = "\n".join(said[0])
-    for text in ("rejected as unreliable", "left out: noise", "class kept (keep)", "outside where"):
+    for text in ("rejected as unreliable", "noise and withheld points", "class kept (keep)", "outside where"):
         assert text in lines, lines
 
 
