@@ -193,7 +193,8 @@ def typed(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> l
 
             name = str(stage.get("filename", ""))
             kind = "writer" if 0 < number == len(stages) - 1 else "reader"
-            stage["type"] = str(getattr(libpdalpython, f"infer_{kind}_driver")(name))
+            plain = "".join(c if c.isascii() else "_" for c in name)  # that no locale refuses
+            stage["type"] = str(getattr(libpdalpython, f"infer_{kind}_driver")(plain))
             if not name or not stage["type"]:
                 raise PipelineError(
                     f"PDAL has no {kind} for a file of this name"
