@@ -22,7 +22,7 @@ from ..stages.points import MAKERS
 from . import pdal as pdal_env
 from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
 from .read import PipelineSource
-from .runtime import TRAMPOLINE, made, place, python_filter
+from .runtime import TRAMPOLINE, ExpandedStage, made, place, python_filter
 from .stagefiles import is_reader, reader_files
 
 #: Options of every PDAL stage that an expanded stage passes on.
@@ -31,19 +31,6 @@ PDAL_OWN = ("tag", "inputs", "user_data", "log")
 _SPLITS = {
     f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns", "separatescanline")
 }
-
-
-@dataclass
-class ExpandedStage:
-    """One of our stages after expanding."""
-
-    stage: Stage
-    place: str  #: its type and tag, for messages
-    label: str  #: the unique `module` label, under which the runtime knows it
-    number: int  #: its index in the given list
-    index: int  #: its index in the expanded list
-    given: dict[str, Any]  #: the stage as it was written
-    plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
 
 
 @dataclass

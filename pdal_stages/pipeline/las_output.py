@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.las import (
@@ -24,11 +24,8 @@ from ..base.las import (
 )
 from ..stages.base import stage_types
 from . import pdal as pdal_env
-from .runtime import python_filter
+from .runtime import ExpandedStage, python_filter
 from .stagefiles import is_reader, is_writer, reader_files, writes_las
-
-if TYPE_CHECKING:
-    from .expansion import ExpandedStage
 
 #: A variable-length record of LAS holds 65,535 bytes; the description of an extra dimension takes 192.
 _MOST_EXTRA = 65_535 // 192

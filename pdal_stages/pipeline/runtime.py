@@ -16,6 +16,7 @@ import uuid
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
 from weakref import WeakValueDictionary
@@ -28,6 +29,20 @@ from ..stages.base import Stage, stage_type
 from ..stages.points import Points
 from ..stages.preparation import NEEDS_GROUND
 from . import pdal as pdal_env
+
+
+@dataclass
+class ExpandedStage:
+    """One of our stages after expanding."""
+
+    stage: Stage
+    place: str  #: its type and tag, for messages
+    label: str  #: the unique `module` label, under which the runtime knows it
+    number: int  #: its index in the given list
+    index: int  #: its index in the expanded list
+    given: dict[str, Any]  #: the stage as it was written
+    plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
+
 
 #: What ``source`` of an expanded stage holds. PDAL sets the globals before each call.
 TRAMPOLINE = """\
