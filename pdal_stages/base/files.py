@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import re
 import shutil
@@ -202,6 +203,11 @@ def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -
     with whole_files(path, what=what) as (partial,), open(partial, "xb") as file:
         file.write(content)
     return Path(path)
+
+
+def write_json(path: str | os.PathLike, value: Any, what: str = "output", indent: int = 1) -> Path:
+    """The same of a JSON file; what JSON does not have becomes text."""
+    return write_whole(path, (json.dumps(value, indent=indent, default=str) + "\n").encode(), what)
 
 
 @contextlib.contextmanager

@@ -122,7 +122,7 @@ def _accuracy(options: argparse.Namespace) -> None:
 
 def _compare_objects(options: argparse.Namespace) -> None:
     """``accuracy town.gpkg --objects reference.gpkg``."""
-    from ..base.files import write_whole
+    from ..base.files import write_json
     from ..objects.compare import compare_objects, remarks, table, to_json
 
     if len(options.inputs) != 1 or options.reference or options.overrides or options.html:
@@ -137,7 +137,7 @@ def _compare_objects(options: argparse.Namespace) -> None:
     print(table(figures), end="")
     print_messages(*remarks(one, two))
     if options.json:
-        write_whole(options.json, (json.dumps(to_json(figures), indent=1) + "\n").encode(), "json")
+        write_json(options.json, to_json(figures), "json")
 
 
 def _model(options: argparse.Namespace) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..base.errors import StageError
-from ..base.files import JSON, Output, check_outputs, write_whole
+from ..base.files import JSON, Output, check_outputs, write_json, write_whole
 from ..base.messages import print_messages
 from . import Parser, tiles
 
@@ -90,7 +90,7 @@ def _pipeline(options: argparse.Namespace) -> int:
     if len(lines) > len(shown):
         print_messages(f"PDAL says {len(lines) - len(shown):,} more lines; -v 2 shows them")
     if metadata:
-        write_whole(metadata, (json.dumps(pipeline.metadata, indent=2, default=str) + "\n").encode())
+        write_json(metadata, pipeline.metadata, indent=2)
     print_messages(*(line for line in pipeline.messages if line not in before))
     return 0
 

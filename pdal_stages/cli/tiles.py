@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import signal
 import sys
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..base.errors import OptionError, StageError
-from ..base.files import HTML, JSON, Output, write_whole
+from ..base.files import HTML, JSON, Output, write_json, write_whole
 from ..base.las import class_name
 from ..base.messages import counted, one_line, print_messages
 from ..base.resources import parse_size
@@ -125,7 +124,7 @@ def _classify(options: argparse.Namespace) -> int:
         sys.modules.update(dict.fromkeys({"requests", "pyproj"} - sys.modules.keys()))  # type: ignore[arg-type]
     written = task.run_whole()
     if options.metadata:
-        write_whole(options.metadata, (json.dumps(written.metadata, indent=2, default=str) + "\n").encode())
+        write_json(options.metadata, written.metadata, indent=2)
     print_messages(*written.messages)
     print(f"{counted(written.points, 'point')} written to {written.path}")
     print_classes(written.classes, written.left_alone, names)
@@ -270,10 +269,9 @@ def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
         if name in options.report and Path(name).suffix.lower() != ".json":
             from ..reports.runpage import run_page
 
-            text = run_page(told)
+            write_whole(name, run_page(told).encode(), "report")
         else:
-            text = json.dumps(told, indent=1) + "\n"
-        write_whole(name, text.encode(), "report")
+            write_json(name, told, "report")
     if not again:
         return 1 if run.failures else 0
     states = run.summary["states"]

@@ -28,7 +28,7 @@ from .stagefiles import is_reader, reader_files
 #: Options of every PDAL stage that an expanded stage passes on.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
 #: Stages after which several views are what the user asked for.
-_SPLITS = {
+SPLITS = {
     f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns", "separatescanline")
 }
 
@@ -125,7 +125,7 @@ def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) 
     A stage that makes one thing of all points never wants them apart; filters.crop splits, too, where it has several areas.
     """
     kinds = [stage["type"] for stage in stages[:number]]
-    split = not _SPLITS.isdisjoint(kinds)
+    split = not SPLITS.isdisjoint(kinds)
     if stage_type(stages[number]["type"]).instead_of_tiles and (split or "filters.crop" in kinds):
         return kinds[-1] != "filters.merge"
     joined = "inputs" not in stages[number] and {*kinds[-1:]} <= {"filters.merge", *stage_types()}

@@ -6,6 +6,7 @@ import hashlib
 import json
 
 from ..base.version import __version__
+from ..pipeline.expansion import SPLITS
 from ..stages.base import Stage, stage_types
 from ..stages.options import Option
 
@@ -30,7 +31,12 @@ def header() -> str:
             f"    {{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option), {gathers} }},"
         )
     version = f"constexpr const char *VERSION = {json.dumps(__version__)};"
-    return "\n".join([version, *options, "const Stage STAGES[] = {", *stages, "};", ""])
+    names = ", ".join(map(json.dumps, sorted({"filters.merge", *SPLITS})))
+    one_view = (
+        "// Stages after which there is one view, or several are what the user asked for.\n"
+        f"const std::set<std::string> ONE_VIEW {{ {names} }};"
+    )
+    return "\n".join([version, one_view, *options, "const Stage STAGES[] = {", *stages, "};", ""])
 
 
 def digest(kind: type[Stage]) -> str:

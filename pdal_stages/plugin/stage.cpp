@@ -100,10 +100,6 @@ def stage(ins, outs):
     return answer(globals(), ins, outs)
 )python";
 
-// Stages after which there is one view, or several are what the user asked for.
-const std::set<std::string> ONE_VIEW { "filters.merge", "filters.splitter", "filters.chipper", "filters.divider",
-    "filters.groupby", "filters.returns", "filters.separatescanline" };
-
 // Options of every PDAL stage that a stage of ours answers itself, where PDAL must not see them: its own `where` hides
 // points, ours only chooses among them.
 const std::vector<std::string> TAKEN { "where", "where_merge", "option_file" };
@@ -176,7 +172,7 @@ std::string newLabel(const std::string& type)
 size_t viewsOf(Stage& stage)
 {
     const std::string name = stage.getName();
-    if (startsWith(name, "readers.") || ONE_VIEW.count(name))
+    if (startsWith(name, "readers.") || declared::ONE_VIEW.count(name))
         return 1;
     for (const declared::Stage& ours : declared::STAGES)
         if (name == ours.type)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import StageError
-from ..base.files import write_whole
+from ..base.files import write_json
 from ..classifier.modelfile import STANDARD
 from ..stages.preparation import PREPARATION
 
@@ -47,7 +46,7 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
         write_town(made, str(folder / "town.laz"))
     stages = pipelines(folder, float(np.floor((made.x.min() + made.x.max()) / 2)), seed)
     for name, listed in stages.items():
-        write_whole(folder / f"{name}.json", (json.dumps(listed, indent=4) + "\n").encode())
+        write_json(folder / f"{name}.json", listed, indent=4)
     with _step("training on the western half"):
         Pipeline(stages["train"]).execute(arrays=False)
     with _step("classifying the eastern half; how right that is"):

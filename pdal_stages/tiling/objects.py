@@ -5,7 +5,6 @@ Each file is read once into records of cells; then objects are found in all.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
-from ..base.files import JSON, Output, check_outputs, write_whole
+from ..base.files import JSON, Output, check_outputs, write_json
 from ..base.messages import Progress, print_messages
 from ..base.units import Units
 from ..base.version import __version__
@@ -81,7 +80,7 @@ def objects_of_files(
             "objects": summary,
             "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
-        write_whole(metadata, (json.dumps(about, indent=1) + "\n").encode(), "metadata")
+        write_json(metadata, about, "metadata")
     return {"files": files, **summary}
 
 

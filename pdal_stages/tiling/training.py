@@ -173,10 +173,9 @@ class TrainTask:
             outs[FILE_NUMBER] = np.full(len(ins["X"]), next(numbers), np.uint32)
 
         with Callbacks() as callbacks:
-            numbered = [callbacks.filter(number, {FILE_NUMBER: "uint32_t"})]
-            pipeline = Pipeline(
-                [*readers, *(numbered if stage.groups == FILE_NUMBER else []), *map(dict, heights)], own
-            )
+            grouped = stage.groups == FILE_NUMBER
+            numbered = [callbacks.filter(number, {FILE_NUMBER: "uint32_t"})] if grouped else []
+            pipeline = Pipeline([*readers, *numbered, *map(dict, heights)], own)
             pipeline.execute()
         if not any(map(len, pipeline.arrays)):
             raise StageError("there are no points to train on", where=", ".join(self.files[:3]))
