@@ -49,15 +49,8 @@ def example(stage: type[Stage]) -> dict[str, Any]:
 
 
 def _row(stage: type[Stage], option) -> str:
-    if option.required:
-        default = "required"
-    elif option.default in (None, "", ()):
-        default = ""
-    elif isinstance(option.default, tuple):
-        default = f"`{','.join(map(str, option.default))}`"
-    else:
-        shown = json.dumps(option.default).strip('"')
-        default = f"`{shown}`{' ' + option.unit if option.unit else ''}"
+    value, _, unit = option.shown_default.partition(" ")
+    default = "required" if option.required else f"`{value}` {unit}".strip() if value else ""
     text = f"{stage.where_help}" if option.name == "where" and stage.where_help else f"{option.help}."
     if option.name == "where":
         text = (

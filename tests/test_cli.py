@@ -139,6 +139,15 @@ def test_help_fits_a_screen(command, capsys, monkeypatch):
     assert bool(flags) == ("--help-all" in lines[-1])
 
 
+@pytest.mark.parametrize(
+    ("command", "told"), [("train", "Number of trees (default: 50)"), ("objects", "up to 4 (default: 0.5 m)")]
+)
+def test_help_tells_the_defaults_of_options_of_stages(command, told, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help-all"])
+    assert told in " ".join(capsys.readouterr().out.split())
+
+
 def test_no_command_shows_the_help(capsys):
     shown = []
     for words in ([], ["--help"]):

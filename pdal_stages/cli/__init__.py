@@ -224,13 +224,14 @@ class Parser(argparse.ArgumentParser):
 
 
 def takes_options(takes: Callable, stage: str, *names: str) -> None:
-    """Add flags for options of a stage, with their declared help."""
+    """Add flags for options of a stage, with their declared help and defaults."""
     from ..stages.base import stage_type
 
     kinds = {"integer": int, "number": float}
     for option in stage_type(stage).all_options():
         if option.name in names:
-            what, choices = option.help.replace("%", "%%"), option.choices or None
+            default, choices = option.shown_default.replace(",", ", "), option.choices or None
+            what = (option.help + f" (default: {default})" * bool(default)).replace("%", "%%")
             value = None if choices else option.name.split("_")[-1].upper()
             how = {"type": kinds.get(option.kind), "choices": choices, "help": what, "metavar": value}
             takes(f"--{option.name.replace('_', '-')}", **how)

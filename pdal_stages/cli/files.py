@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 import re
 
-from . import Parser
+from . import Parser, takes_options
+
+#: Options of ``writers.objects`` that ``objects`` has flags for.
+_OF_OBJECTS = ("outlines", "cell")
 
 
 def add_commands(parser: Parser) -> None:
@@ -14,10 +17,7 @@ def add_commands(parser: Parser) -> None:
     takes = parser.command("objects", _objects, what, overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    straight = "Outlines along walls, or along the grid's cells (default: straight)"
-    takes("--outlines", choices=("straight", "cells"), help=straight)
-    wide = "Side of the grid's cells (default: by density, 0.5 to 4 m)"
-    takes("--cell", type=float, metavar="METERS", help=wide)
+    takes_options(takes, "writers.objects", *_OF_OBJECTS)
     takes("--workers", type=int, default=1, metavar="N", help="Files to read at the same time (default: 1)")
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
@@ -47,7 +47,7 @@ def add_commands(parser: Parser) -> None:
 def _objects(options: argparse.Namespace) -> None:
     from ..tiling.objects import objects_of_files, writer
 
-    given = {name: value for name in ("outlines", "cell") if (value := getattr(options, name)) is not None}
+    given = {name: value for name in _OF_OBJECTS if (value := getattr(options, name)) is not None}
     stage = writer(options.output, options.overrides, **given)
     objects_of_files(options.inputs, stage, options.workers, options.metadata)
 

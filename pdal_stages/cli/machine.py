@@ -101,17 +101,12 @@ def _options(options: argparse.Namespace) -> None:
     if stage.source:
         print(f"  Source: {stage.source}\n")
     for option in stage.all_options():
-        default = ",".join(map(str, option.default)) if isinstance(option.default, tuple) else option.default
-        shown = f"{str(default).lower() if isinstance(default, bool) else default} {option.unit}".strip()
-        text = option.help
+        text, default = option.help, option.shown_default
         if option.name == "where" and stage.where_help:
             text = f"A condition on points (PDAL's own filters do not see the others). {stage.where_help}"
         if option.choices:
             text += f" (one of: {', '.join(map(str, option.choices))})"
-        print(
-            f"  {option.name}"
-            + ("  (required)" if option.required else f" [{shown}]" * bool(default not in (None, "")))
-        )
+        print(f"  {option.name}" + ("  (required)" if option.required else f" [{default}]" * bool(default)))
         print(textwrap.indent(textwrap.fill(text, 74), " " * 6) + "\n")
 
 

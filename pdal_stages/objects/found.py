@@ -26,8 +26,8 @@ class ObjectSettings(Settings):
 
     cell: float = _setting(
         0.5,
-        "Side of the grid's cells: about 1.4 times the spacing of points, so that few cells of a roof are empty; 1 for 2 "
-        "points/m2",
+        "Side of the grid's cells, about 1.4 times the spacing of points (1 for 2 points/m2), so that few cells of a roof "
+        "are empty; where points are few the command objects enlarges the default, up to 4",
         0.05,
         100,
     )

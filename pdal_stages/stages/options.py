@@ -66,6 +66,15 @@ class Option:
     def __get__(self, stage: Any, owner: type) -> Any:
         return self if stage is None else stage.options[self.name]
 
+    @property
+    def shown_default(self) -> str:
+        """The default as a user would type it, with its unit; empty where the stage decides."""
+        if self.default in (None, "", ()):
+            return ""
+        given = self.default if isinstance(self.default, tuple) else (self.default,)
+        words = ",".join(str(one).lower() if isinstance(one, bool) else str(one) for one in given)
+        return f"{words} {self.unit}".strip()
+
     def schema(self) -> dict:
         """The option's JSON Schema."""
         out: dict[str, Any] = {"description": self.help, "type": _KINDS[self.kind][0]}
