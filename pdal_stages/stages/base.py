@@ -94,8 +94,10 @@ class Stage(ABC):
         "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
     )
 
-    #: In tiles: a dimension below zero for points whose results are used; only they are counted in reports.
+    #: In tiles: a dimension, how many meters outside a point lies, below zero for the tile's own, which reports count alone;
+    #: and how far outside results of this stage are still used.
     own_points: str = ""
+    used_m: float = 0.0
     #: Whether stages before it in the pipeline make what it makes too.
     makes_again: bool = False
     #: Set where a pipeline's writer cannot hold codes above 31: what to say of them, and the cure.
@@ -174,7 +176,13 @@ class Stage(ABC):
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
         own = arrays.get(self.own_points)
-        return Points(arrays, wkt, self._condition, units, legacy_flags, own, self.code_limit)
+        used = self.used(arrays) if self.where_chooses and own is not None else None
+        return Points(arrays, wkt, self._condition, units, legacy_flags, own, used, self.code_limit)
+
+    def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_]:
+        """In tiles: the points whose results are used."""
+        outside = arrays[self.own_points]
+        return outside <= self.used_m if self.used_m > 0 else outside < 0
 
     @abstractmethod
     def run(self, points: Points) -> dict[str, NDArray]:

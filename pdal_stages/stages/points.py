@@ -55,6 +55,7 @@ class Points:
     legacy_flags: bool = False  #: whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`
     #: Below zero for the points whose results are used: :meth:`counted` counts those alone.
     own: NDArray | None = None
+    used: NDArray[np.bool_] | None = None  #: in tiles: those for which anything is to be computed
     #: Where they will be written with codes up to 31 alone: what to say of others, and the cure.
     code_limit: tuple[str, str] | None = None
     #: Which of the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
@@ -63,12 +64,14 @@ class Points:
     def __post_init__(self) -> None:
         self.count = len(self.arrays["X"]) if "X" in self.arrays else 0
         self.report = Report({"points": self.count})
-        self.mask: NDArray[np.bool_] | None = None
+        self.mask = self.used
         if self.where is not None:
             freed = self.arrays
             if self.legacy_flags:
                 freed = ChainMap({"Classification": self.class_codes}, cast(dict, freed))
             self.mask = self.where.evaluate(freed)
+            if self.used is not None:
+                self.mask &= self.used
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             if self.count and not self.report.figures["where"]:
                 self.report.warnings.append(f"{HOLDS_NOWHERE} {self.where.text}")

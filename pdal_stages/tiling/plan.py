@@ -125,14 +125,13 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     reaches = [step.reach(buffer) for step in head]
     sees_m = sum(reaches)  # before _first_round reduces some
     first = _first_round(readers, head, reaches)
-    later = [sum(reaches[n + 1 :]) for n in range(len(head))]
     stages = [step.ours for step in head if step.ours is not None]
     makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
     return TilePlan(
         readers=[step.given for step in readers],
-        head=[_narrowed(step, reach) for step, reach in zip(head, later, strict=True)],
-        later=later,
+        head=[_for_workers(step) for step in head],
+        later=[sum(reaches[n + 1 :]) for n in range(len(head))],
         tail=[step.given for step in [*tail, *writers]],
         halo_m=sum(reaches),
         sees_m=sees_m,
@@ -268,8 +267,8 @@ def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
         )
 
 
-def _narrowed(step: _Step, later: float) -> dict[str, Any]:
-    """A stage of the head for a tile: with absolute paths, and limited to points whose results are used.
+def _for_workers(step: _Step) -> dict[str, Any]:
+    """A stage of the head with absolute paths, which every worker finds.
 
     A shipped model keeps its name, as its path differs between hosts.
     """
@@ -279,9 +278,6 @@ def _narrowed(step: _Step, later: float) -> dict[str, Any]:
             name = stage.get(option.name)
             if name and (option.kind == "filename" or (option.kind == "model" and name not in shipped())):
                 stage[option.name] = str(Path(stage[option.name]).absolute())
-        if ours.where_chooses:
-            seen = f"{OUTSIDE} <= {later!r}" if later > 0 else f"{OUTSIDE} < 0"
-            stage["where"] = f"({ours.where}) && ({seen})" if ours.where else seen
     return stage
 
 

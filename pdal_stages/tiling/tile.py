@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -32,8 +31,6 @@ from .store import save_arrays, written
 #: How many times a tile is read again with a wider halo.
 _WIDENINGS = 3
 _MARKS = (ROW, INPUT, OUTSIDE)
-#: The warning of `Points` in a tile, about the user's `where` combined with the tile's own condition, or that alone.
-_NOWHERE = re.compile(rf"{HOLDS_NOWHERE} (?:\((.*)\) && \()?{OUTSIDE} <", re.DOTALL)
 
 Changed = dict[str, tuple[NDArray[np.int64] | None, NDArray]]
 
@@ -87,13 +84,11 @@ def run_head(
     needs = [0.0]
     views: list[dict[str, NDArray]] = []  # of the tile's own points only, to save memory
 
-    def reach(
-        number: int, used_m: float, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
-    ) -> None:
-        points = points_of(ours[number].stage, module, ins)
-        wanted = ins[OUTSIDE] <= used_m if used_m > 0 else ins[OUTSIDE] < 0
+    def reach(number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        stage = ours[number].stage
+        points = points_of(stage, module, ins)
         box = [side * points.units.horizontal for side in context.grid.box(tile)]
-        needs.append(ours[number].stage.reach_of(points, wanted, box))
+        needs.append(stage.reach_of(points, stage.used(ins), box))
 
     def take(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         wanted = ins if plan.creates is None else plan.creates
@@ -104,19 +99,20 @@ def run_head(
     with Callbacks() as callbacks:
         readers = [{**piece.reader, "filename": piece.path} for piece in cuts]
         stages, inputs = read_with(callbacks, readers, new, flags if len(set(flags)) > 1 else [])
-        begins = len(stages)
-        for number in range(begin, len(plan.head)):
-            stages.append(_with_threads(plan.head[number], context.threads))
-            kind = stage_types().get(stages[-1]["type"])
+        begins, used = len(stages), {}
+        for given, used_m in zip(plan.head[begin:], plan.later[begin:], strict=False):
+            used[len(stages)] = used_m
+            stages.append(_with_threads(given, context.threads))
+            kind = stage_types().get(given["type"])
             if kind is not None and kind.open_ended and not everything:
-                stages.append(callbacks.filter(partial(reach, len(stages) - 1, plan.later[number])))
+                stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
         stages += [callbacks.filter(function) for function in (take, last) if function is not None]
         stages[begins]["inputs"] = inputs
         pipeline = Pipeline(stages, whole=False)
         ours = {one.number: one for one in pipeline.expanded.ours}
         check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
         for one in ours.values():
-            one.stage.own_points = OUTSIDE
+            one.stage.own_points, one.stage.used_m = OUTSIDE, used[one.number]
         if before is not None:  # of the first one alone
             far = next(one.stage for one in ours.values() if isinstance(one.stage, HagMorphological))
             far.from_blocks = before.blocks
@@ -135,13 +131,8 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     for text in pipeline.messages:
         if text.startswith(scratch) or NO_REFERENCE in text:  # about a piece; the input has its own message
             continue
-        if TOUCH_NONE in text:
-            text = text[text.index(TOUCH_NONE) :]
-        elif nowhere := _NOWHERE.search(text):
-            if nowhere[1] is None:  # only the tile's own condition: not the user's
-                continue
-            text = f"{HOLDS_NOWHERE} {nowhere[1]}"
-        lines.append(text)
+        known = next((words for words in (TOUCH_NONE, HOLDS_NOWHERE) if words in text), "")
+        lines.append(text[text.index(known) :])  # without its stage
     return lines
 
 
