@@ -267,8 +267,8 @@ def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Expa
         arguments["tag"] = given["tag"]
     plain = python_filter(label, TRAMPOLINE, arguments, stage.creates())
     plain |= {key: given[key] for key in PDAL_OWN if key in given}
-    made[label] = stage
-    return ExpandedStage(stage, named, label, number, index, given, plain)
+    made[label] = expanded = ExpandedStage(stage, named, number, index, given, plain)
+    return expanded
 
 
 def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -283,7 +283,8 @@ def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         wired = (before.keys() - {"inputs"} | stage.keys()).intersection(PDAL_OWN)
         if not wired and all(str(one.get("module")) in made for one in (before, stage)):
             several = before["pdalargs"].get("stages", [before["pdalargs"]])
-            if not getattr(made.get(several[-1]["label"]), "forgets", False):
+            last = made.get(several[-1]["label"])
+            if not (isinstance(last, ExpandedStage) and last.stage.forgets):
                 adds = [*dict.fromkeys(before["add_dimension"] + stage["add_dimension"])]
                 joined = {"pdalargs": {"stages": [*several, stage["pdalargs"]]}, "add_dimension": adds}
                 out[-1] = {**before, **joined}

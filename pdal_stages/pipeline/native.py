@@ -43,7 +43,7 @@ class _Family:
             runtime.remember_stdout()
             stages = [*([{"type": "filters.merge", **wired}] if merge else []), expanded.plain]
             shown = f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
-            joined = _joined(stages, shown, expanded.stage)
+            joined = _joined(stages, shown, expanded)
             joined.type, joined.tag = kind.type, options.get("tag")
             joined.options = {"type": kind.type, **options}
             return joined
@@ -77,7 +77,7 @@ def _help(kind: type[Stage]) -> str:
     return "\n".join(lines)
 
 
-def _joined(stages: list[dict[str, Any]], shown: str, made_from: Stage):
+def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.ExpandedStage):
     """The filters that PDAL runs as one object, which joins others by ``|``; `made_from` is kept as long as they are."""
     pdal = pdal_env.bindings()
 

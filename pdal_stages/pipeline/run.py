@@ -79,8 +79,12 @@ class Pipeline:
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
         self.log_lines: list[str] = []
-        self.reports: list[tuple[str, list[Report]]] = []
         self.warnings: list[str] = []
+
+    @property
+    def reports(self) -> list[tuple[str, list[Report]]]:
+        """Of the last run: each of our stages by name, with a report for each view of points."""
+        return [(ours.place, ours.reports) for ours in self.expanded.ours]
 
     @property
     def left_alone(self) -> dict[str, int]:
@@ -178,30 +182,26 @@ class Pipeline:
             supersede_copc(made)
 
         runtime.remember_stdout()
-        failure: StageError | None = None
+        for ours in self.expanded.ours:
+            ours.reports, ours.failure = [], None
+        callbacks = runtime.Callbacks()
+        run = callbacks.check_ground(stages)
         try:
-            with runtime.Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
-                run = with_outputs(stages, list(partials))
+            with whole_files(*outputs, check=finish) as partials:
+                run = with_outputs(run, list(partials))
                 for number, stage in enumerate(run):
                     if is_writer(stage):
                         run[number] = las_output.uncompressed_writer(stage, run[:number])
-                try:
-                    with pdal_env.gentle():
-                        run = merge_filters(callbacks.check_ground(run))
-                        result = pdal_env.execute(run, arrays=arrays, loglevel=loglevel)
-                        pdal_env.check_interrupt()
-                    compressed = las_output.compress(partials)
-                finally:
-                    self.reports = []
-                    for ours in self.expanded.ours:
-                        reports, failed = runtime.collect(ours.label)
-                        failure = failure or failed
-                        self.reports.append((ours.place, reports))
-                for ours, (_, reports) in zip(self.expanded.ours, self.reports, strict=True):
-                    if not reports:  # newer PDAL leaves filters out where there are no points
-                        reports.append(runtime.run_on_nothing(ours.stage, ours.place))
+                with pdal_env.gentle():
+                    result = pdal_env.execute(merge_filters(run), arrays=arrays, loglevel=loglevel)
+                    pdal_env.check_interrupt()
+                compressed = las_output.compress(partials)
+                for ours in self.expanded.ours:
+                    if not ours.reports:  # newer PDAL leaves filters out where there are no points
+                        ours.reports.append(runtime.run_on_nothing(ours.stage, ours.place))
         except StageError as error:
-            failure = failure or callbacks.failure
+            called = [runtime.made.get(str(stage.get("module"))) for stage in run]
+            failure = next((one.failure for one in called if one and one.failure), None)
             if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
             raise failure or self._located(error) from None

@@ -15,8 +15,7 @@ import sys
 import uuid
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, cast
 from weakref import WeakValueDictionary
@@ -31,17 +30,30 @@ from ..stages.preparation import NEEDS_GROUND
 from . import pdal as pdal_env
 
 
-@dataclass
+@dataclass(eq=False)
 class ExpandedStage:
-    """One of our stages after expanding."""
+    """One of our stages after expanding, and what came of its last run in this process."""
 
     stage: Stage
     place: str  #: its type and tag, for messages
-    label: str  #: the unique `module` label, under which the runtime knows it
     number: int  #: its index in the given list
     index: int  #: its index in the expanded list
     given: dict[str, Any]  #: the stage as it was written
     plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
+    reports: list[Report] = field(default_factory=list)  #: one per point view
+    failure: StageError | None = None
+
+
+#: Gets the script's globals, the dimensions, and a dict for those to write back.
+Function = Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None]
+
+
+@dataclass(eq=False)
+class Callback:
+    """A function of this process that a filter calls, and how it failed, if it did."""
+
+    function: Function
+    failure: StageError | None = None
 
 
 #: What ``source`` of an expanded stage holds. PDAL sets the globals before each call.
@@ -58,12 +70,9 @@ def stage(ins, outs):
 #: Around a stage's message in the name of the array that PDAL refuses.
 _OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 
-_reports: dict[str, list[Report]] = {}
-_failures: dict[str, StageError] = {}
 _usual_stdout: Any = sys.__stdout__
-#: Stages made in this process, and its functions, by label, as long as someone holds them; in another process options
-#: are parsed again.
-made: WeakValueDictionary[str, Any] = WeakValueDictionary()
+#: Stages and callbacks of this process by label, as long as someone holds them; in another process options are parsed again.
+made: WeakValueDictionary[str, ExpandedStage | Callback] = WeakValueDictionary()
 
 
 def place(type_name: str, tag: str | None) -> str:
@@ -108,7 +117,9 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
             _run_one(arguments, label, module, seen, outs)
         except BaseException as error:
             where = place(arguments.get("stage", "filters.python"), arguments.get("tag"))
-            failure = _failures[label] = as_stage_error(error, where)
+            failure = as_stage_error(error, where)
+            if held := made.get(label):
+                held.failure = failure
             outs.clear()
             outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
             if _redirected():  # PDAL puts it back only after a run that succeeds, and its log is gone by now
@@ -128,13 +139,14 @@ def _run_one(
 ) -> None:
     """Run a stage or a function on one view. What it raises may be anything, Ctrl-C too."""
     pdal_env.check_interrupt()
-    stage = made.get(label) or _made_again(arguments)
-    if not isinstance(stage, Stage):
-        stage(module, ins, outs)
+    held = made.get(label)
+    if isinstance(held, Callback):
+        held.function(module, ins, outs)
         return
-    report = run_on_view(stage, module, ins, outs)
+    report = run_on_view(held.stage if held else _made_again(arguments), module, ins, outs)
     module["out_metadata"] = node(arguments["stage"], leaves(report))
-    _reports.setdefault(label, []).append(report)
+    if held:
+        held.reports.append(report)
 
 
 def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -> Points:
@@ -264,42 +276,23 @@ def _redirected() -> bool:
     return type(sys.stdout).__module__ == "redirector"  # PDAL's own type
 
 
-def collect(label: str) -> tuple[list[Report], StageError | None]:
-    """Reports (one per point view) and the failure of an expanded stage, which are then forgotten."""
-    return _reports.pop(label, []), _failures.pop(label, None)
-
-
 remember_stdout()
 
 
 # ---- functions of this process as filters, which PDAL calls between stages ---------------------------
 
-#: Gets the script's globals, the dimensions, and a dict for those to write back.
-Function = Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None]
 
-
-class Callbacks(AbstractContextManager):
-    """Filters that call functions of this process, which are forgotten when the ``with`` block ends.
-
-    Attributes
-    ----------
-    failure : StageError or None
-        After the block: what the first function that failed raised.
-    """
+class Callbacks:
+    """Filters that call functions of this process, as long as this object is held."""
 
     def __init__(self) -> None:
-        self._functions: dict[str, Function] = {}
-        self.failure: StageError | None = None
-
-    def __exit__(self, *exc: object) -> None:
-        for label in self._functions:
-            self.failure = self.failure or collect(label)[1]
-        self._functions.clear()
+        self._held: list[Callback] = []
 
     def filter(self, function: Function, adds: Mapping[str, str] | None = None, **own: Any) -> dict[str, Any]:
         """A ``filters.python`` that calls a function and adds dimensions (name -> PDAL type); `own`: its tag, inputs."""
         label = f"pdal_stages_callback_{uuid.uuid4().hex}"
-        self._functions[label] = made[label] = function
+        self._held.append(callback := Callback(function))
+        made[label] = callback
         return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **own}
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

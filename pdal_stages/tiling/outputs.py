@@ -155,7 +155,8 @@ def run_tail(
         las.supersede_copc(made)
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
-    with Callbacks() as callbacks, whole_files(*outputs, check=finish) as partials:
+    callbacks = Callbacks()
+    with whole_files(*outputs, check=finish) as partials:
         stages, inputs = read_with(callbacks, readers, new, flags)
         stages.append({"type": "filters.merge", "inputs": inputs})
         waiting = iter(partials)

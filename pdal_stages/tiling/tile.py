@@ -96,27 +96,27 @@ def run_head(
         mine = np.flatnonzero(ins[OUTSIDE] < 0)
         views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
 
-    with Callbacks() as callbacks:
-        readers = [{**piece.reader, "filename": piece.path} for piece in cuts]
-        stages, inputs = read_with(callbacks, readers, new, flags if len(set(flags)) > 1 else [])
-        begins, used = len(stages), {}
-        for given, used_m in zip(plan.head[begin:], plan.later[begin:], strict=False):
-            used[len(stages)] = used_m
-            stages.append(_with_threads(given, context.threads))
-            kind = stage_types().get(given["type"])
-            if kind is not None and kind.open_ended and not everything:
-                stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
-        stages += [callbacks.filter(function) for function in (take, last) if function is not None]
-        stages[begins]["inputs"] = inputs
-        pipeline = Pipeline(stages, whole=False)
-        ours = {one.number: one for one in pipeline.expanded.ours}
-        check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
-        for one in ours.values():
-            one.stage.own_points, one.stage.used_m = OUTSIDE, used[one.number]
-        if before is not None:  # of the first one alone
-            far = next(one.stage for one in ours.values() if isinstance(one.stage, HagMorphological))
-            far.from_blocks = before.blocks
-        pipeline.execute(arrays=False)
+    callbacks = Callbacks()
+    readers = [{**piece.reader, "filename": piece.path} for piece in cuts]
+    stages, inputs = read_with(callbacks, readers, new, flags if len(set(flags)) > 1 else [])
+    begins, used = len(stages), {}
+    for given, used_m in zip(plan.head[begin:], plan.later[begin:], strict=False):
+        used[len(stages)] = used_m
+        stages.append(_with_threads(given, context.threads))
+        kind = stage_types().get(given["type"])
+        if kind is not None and kind.open_ended and not everything:
+            stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
+    stages += [callbacks.filter(function) for function in (take, last) if function is not None]
+    stages[begins]["inputs"] = inputs
+    pipeline = Pipeline(stages, whole=False)
+    ours = {one.number: one for one in pipeline.expanded.ours}
+    check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
+    for one in ours.values():
+        one.stage.own_points, one.stage.used_m = OUTSIDE, used[one.number]
+    if before is not None:  # of the first one alone
+        far = next(one.stage for one in ours.values() if isinstance(one.stage, HagMorphological))
+        far.from_blocks = before.blocks
+    pipeline.execute(arrays=False)
     reports = [report for _, reports in pipeline.reports for report in reports if report.beyond_halo]
     if reports and not everything:
         needs += [plan.halo_m + report.reach for report in reports]

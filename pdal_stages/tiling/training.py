@@ -172,11 +172,11 @@ class TrainTask:
             """PDAL calls it for the points of one reader after the other."""
             outs[FILE_NUMBER] = np.full(len(ins["X"]), next(numbers), np.uint32)
 
-        with Callbacks() as callbacks:
-            grouped = stage.groups == FILE_NUMBER
-            numbered = [callbacks.filter(number, {FILE_NUMBER: "uint32_t"})] if grouped else []
-            pipeline = Pipeline([*readers, *numbered, *map(dict, heights)], own)
-            pipeline.execute()
+        callbacks = Callbacks()
+        grouped = stage.groups == FILE_NUMBER
+        numbered = [callbacks.filter(number, {FILE_NUMBER: "uint32_t"})] if grouped else []
+        pipeline = Pipeline([*readers, *numbered, *map(dict, heights)], own)
+        pipeline.execute()
         if not any(map(len, pipeline.arrays)):
             raise StageError("there are no points to train on", where=", ".join(self.files[:3]))
         points = points_of_views(pipeline.arrays, pipeline.metadata, stage.points)
@@ -311,10 +311,10 @@ def take_points(
             numbered = (None, np.full(len(result.piece.index), number, np.uint32))
             found = NewValues(found.kept, {**found.values, FILE_NUMBER: numbered})
         new.append(found)
-    with Callbacks() as callbacks:
-        flags = las_output.files_with_flags_to_split(readers)
-        stages, inputs = read_with(callbacks, readers, new, flags)
-        run = pdal_env.execute([*stages, {"type": "filters.merge", "inputs": inputs}])
+    callbacks = Callbacks()
+    flags = las_output.files_with_flags_to_split(readers)
+    stages, inputs = read_with(callbacks, readers, new, flags)
+    run = pdal_env.execute([*stages, {"type": "filters.merge", "inputs": inputs}])
     if not run.count:
         return {"outputs": []}
     points = points_of_views(run.arrays, run.metadata, stage.points)
