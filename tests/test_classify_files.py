@@ -82,6 +82,16 @@ def test_the_output_folder_is_made(folder, classify, tmp_path, given, output):
     assert set(files_in(tmp_path / output)) <= {"t0.laz", "t1.laz", "t2.laz"}
 
 
+@pytest.mark.parametrize("words", [["--filters.modelclassifier.no=1"], ["--where", "No > 1"]])
+@pytest.mark.parametrize("how", [[], ["--tile", 5]])
+def test_what_is_refused_leaves_no_folder(folder, classify, tmp_path, words, how):
+    code, _, err = classify(
+        folder / "in/t0.laz", f"{tmp_path}/a/b", "--objects", f"{tmp_path}/a/b/o.gpkg", *words, *how
+    )
+    assert code == 1 and ("no option 'no'" in err or "dimension 'No'" in err)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_file_where_the_folder_should_be(folder, classify, tmp_path):
     (tmp_path / "a").write_text("a file")
     for output in ("a/b", "a/"):

@@ -105,14 +105,13 @@ def _classify(options: argparse.Namespace) -> int:
         options_of(options),
         tuple(extra_files(options)),
     )
+    names = {code: one_line(name) for code, name in request.loaded.classes}
     then = None
     if options.objects and not options.dry_run:
-        if Path(options.objects).absolute().parent == Path(options.output).absolute():
-            task.make_folders()
-        stage = writer(options.objects, own)
-        refuse_tiles(task, options.objects)
+        with task.folders():
+            stage = writer(options.objects, own)
+            refuse_tiles(task, options.objects)
         then = partial(objects_of_files, task.outputs, stage, max(1, task.options.local_workers))
-    names = {code: one_line(name) for code, name in request.loaded.classes}
     if not task.in_one_piece:
         return _classify_tiles(task, options, names, then)
     if options.dry_run:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -70,24 +71,33 @@ class ClassifyTask:
         target = str(Path(self.output) / "#") if is_folder(self.output) else self.output
         return outputs_of(self.files, target, copc=self.in_one_piece)
 
-    def make_folders(self) -> None:
-        """Create the output folder, and the folders in it."""
-        if not is_folder(self.output):
-            return
-        for folder in sorted({Path(self.output), *(Path(name).parent for name in self.outputs)}):
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                found = f"{folder}: {error.strerror}"
-                raise StageError("the output folder cannot be created", found=found) from None
+    @contextmanager
+    def folders(self) -> Iterator[None]:
+        """Create the output folder, and the folders in it; those that are still empty at the end are removed."""
+        made: list[Path] = []
+        names = [f"{self.output}/#", *self.outputs] if is_folder(self.output) else []
+        try:
+            for folder in sorted({folder for name in names for folder in Path(name).parents}):
+                if not folder.is_dir():
+                    try:
+                        folder.mkdir(exist_ok=True)
+                    except OSError as error:
+                        found = f"{folder}: {error.strerror}"
+                        raise StageError("the output folder cannot be created", found=found) from None
+                    made.append(folder)
+            yield
+        finally:
+            for folder in reversed(made):
+                with suppress(OSError):
+                    folder.rmdir()
 
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
         (source,), (target,) = self.files, self.outputs
-        self.make_folders()
-        pipeline = self.request.pipeline(source, target)
-        pipeline.check_outputs(*self.extra_files)
-        count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
+        with self.folders():
+            pipeline = self.request.pipeline(source, target)
+            pipeline.check_outputs(*self.extra_files)
+            count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
         reports = [each[-1] for _, each in pipeline.reports if each]
         codes = [report.codes for report in reports if report.codes is not None]
         messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
@@ -133,8 +143,7 @@ class ClassifyTask:
             extra_dims=extra_dims,
             name=self.request.model,
         )
-        if not dry_run:
-            self.make_folders()
-        outputs = [Output(name) for name in self.outputs if Path(name).parent.is_dir()]
-        check_outputs([*outputs, *self.extra_files], self.files)
-        return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)
+        with nullcontext() if dry_run else self.folders():
+            outputs = [Output(name) for name in self.outputs if Path(name).parent.is_dir()]
+            check_outputs([*outputs, *self.extra_files], self.files)
+            return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)

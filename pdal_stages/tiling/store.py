@@ -40,6 +40,7 @@ class Store:
         self.scratch = self.folder / "scratch" / secrets.token_hex(4)
 
     def __enter__(self) -> Store:
+        self._new = not self.folder.exists()
         try:
             for folder in (self.folder, self.kept, self.scratch.parent):
                 with contextlib.suppress(FileExistsError):
@@ -80,8 +81,10 @@ class Store:
             ) from None
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        shutil.rmtree(self.scratch.parent, ignore_errors=True)
+    def __exit__(self, kind: type | None, *exc: object) -> None:
+        # After an error of a first run there is nothing to resume. Whoever locks the deleted file now finds no folder.
+        useless = self._new and kind is not None and issubclass(kind, StageError)
+        shutil.rmtree(self.folder if useless else self.scratch.parent, ignore_errors=True)
         self._lock.close()  # the file stays, so that nobody locks a deleted one
 
     def clear(self) -> None:
