@@ -55,7 +55,7 @@ def add_commands(parser: Parser) -> None:
     for flag, default, help in (
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
         ("--bridges", True, "Find bridge decks, class 17 (default: on)"),
-        ("--wires", False, "Find wires, class 14"),
+        ("--wires", False, "Find wires, class 14; without it they become building"),
         ("--towers", False, "Find wires, and towers and poles, class 15"),
         ("--consistency", True, "Correct classes that contradict their surroundings (default: on)"),
     ):
