@@ -101,7 +101,7 @@ class Patches:
     area: NDArray[np.float64]  #: square meters of its cells
     points: NDArray[np.int64]
     file: NDArray[np.int64]
-    box: NDArray[np.float64]  #: (n, 4) west, south, east, north of its cells, meters
+    at: NDArray[np.float64]  #: (n, 2) x and y of the middle of the cell with most errors expected, meters
     #: of which class most of the expected errors are, and how sure the model is of its points
     reason: list[str]
 
@@ -128,10 +128,10 @@ def find_patches(cells: ReviewCells) -> Patches:
     points, wrong = summed(cells.points), summed(cells.errors)
     errors, area = wrong.sum(axis=1), np.bincount(of_cell, minlength=n) * np.float64(cells.side**2)
     minutes = (GETTING_THERE + LOOKING * area / 100.0) / 60.0
-    box = np.tile([np.inf, np.inf, -np.inf, -np.inf], (n, 1))
-    for k, how in enumerate((np.minimum, np.minimum, np.maximum, np.maximum)):
-        how.at(box[:, k], of_cell, cells.corners[:, k])
-    order = np.lexsort((box[:, 0], box[:, 1], -np.round(errors / np.maximum(minutes, 1e-12), 6)))
+    rising = np.lexsort((total, of_cell))
+    worst_cell = rising[np.searchsorted(of_cell[rising], np.arange(n), side="right") - 1]
+    at = np.stack([column, row], axis=1)[worst_cell] * cells.side + 0.5 * cells.side
+    order = np.lexsort((*at.T, -np.round(errors / np.maximum(minutes, 1e-12), 6)))
     rank = np.argsort(order)
     worst = wrong.argmax(axis=1)
     sure = 1.0 - wrong[np.arange(n), worst] / np.maximum(points[np.arange(n), worst], 1.0)
@@ -142,6 +142,6 @@ def find_patches(cells: ReviewCells) -> Patches:
         area[order],
         points.sum(axis=1).astype(np.int64)[order],
         blocks[order, 0],
-        box[order],
+        at[order],
         [f"{GROUPS[worst[k]]}, reliability {sure[k]:.2f}" for k in order],
     )

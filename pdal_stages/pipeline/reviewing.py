@@ -88,7 +88,7 @@ class Review:
                 "seconds": round(60.0 * float(p.minutes[k]), 1),
                 "per_minute": round(float(p.errors[k] / p.minutes[k]), 1),
                 "reason": p.reason[k],
-                "box": [round(float(v) / self.across, 3) for v in p.box[k]],
+                "at": [round(float(v) / self.across, 3) for v in p.at[k]],
             }
             for k in range(self.listed)
         ]
@@ -242,7 +242,7 @@ def review_layers(found: Review) -> dict[str, Layer]:
 
 def _fields(rows: Sequence[dict[str, Any]]) -> dict[str, NDArray]:
     """Columns of a layer."""
-    names = [name for name in (rows[0] if rows else {}) if name not in ("box", "file")]
+    names = [name for name in (rows[0] if rows else {}) if name not in ("at", "file")]
     kinds_of = {name: object if isinstance(rows[0][name], str) else None for name in names}
     return {name: np.array([row[name] for row in rows], kinds_of[name]) for name in names}
 
@@ -292,10 +292,9 @@ def lines(found: Mapping[str, Any]) -> list[str]:
         out.append(f"... and {len(found['tiles']) - _WORST:,} more")
     out += ["", f"{'patch':>5}{'expected':>10}{'m2':>8}  why, where"]
     for row in found["worst"][:_WORST]:
-        x, y = (0.5 * (row["box"][k] + row["box"][k + 2]) for k in (0, 1))
         out.append(
             f"{row['rank']:>5}{row['expected']:>10,.0f}{row['area']:>8,.0f}  {row['reason']}; "
-            f"{one_line(row['tile'])} at {x:.0f}, {y:.0f}"
+            f"{one_line(row['tile'])} at {row['at'][0]:.1f}, {row['at'][1]:.1f}"
         )
     return out
 
