@@ -15,11 +15,7 @@ from .inputs_outputs import reader_of
 
 #: Points read at a time.
 PART = 1_000_000
-_LASPY = {
-    "PointSourceId": "point_source_id",
-    "ReturnNumber": "return_number",
-    "NumberOfReturns": "number_of_returns",
-}
+_LASPY = {"ReturnNumber": "return_number", "NumberOfReturns": "number_of_returns"}
 
 
 def reads_in_parts(path: str) -> bool:

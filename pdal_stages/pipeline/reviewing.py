@@ -25,14 +25,13 @@ from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, qml, write_layers
 from ..reports.page import render
 from ..stages.points import Points
-from ..stages.preparation import PREPARATION, made_of_coordinates
 from .inputs_outputs import input_files
 from .parts import arrays_in_parts, reads_in_parts
 from .references import check_one_reference, reference_of_file
 from .workers import each_file
 
 #: Dimensions that are read where they are there.
-WANTED = ("Reliability", "HeightAboveGround", "PointSourceId", "ReturnNumber", "NumberOfReturns")
+WANTED = ("Reliability", "ReturnNumber", "NumberOfReturns")
 #: What is written, in this order.
 LAYERS = ("patches", "tiles")
 #: Rows in the page's tables, and in text.
@@ -189,11 +188,8 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
 def reliability_of(points: Mapping[str, NDArray], model: str) -> NDArray[np.float32]:
     """The probability that a model gives to the class of each point; 1 for classes that it does not know."""
     loaded = loaded_model(model)
-    made = {}
-    if list(loaded.info.get("preparation") or []) == list(PREPARATION):  # else it says what it needs
-        made = dict(made_of_coordinates(PREPARATION, points["xyz"]))
     given = {name: points[name] for name in loaded.optional_dimensions if name in points}
-    found: Any = loaded.predict(points["xyz"], {**made, **given}, probabilities=True).probabilities
+    found: Any = loaded.predict(points["xyz"], given, probabilities=True).probabilities
     place = np.full(256, -1)
     place[loaded.codes] = np.arange(len(loaded.codes))
     lower = [code for code in (3, 4) if place[code] < 0]
