@@ -17,7 +17,7 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, whole_files
 from ..base.las import NOISE, read_header
-from ..base.messages import Progress, counted, duration, one_line, print_messages
+from ..base.messages import counted, duration, one_line, print_messages
 from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
@@ -123,12 +123,8 @@ def review_files(
     side = cell or side_for(*_extent(files, references))
     found: list[ReviewCells] = []
     work = [(path, references[path].wkt, model, side, number) for number, path in enumerate(files)]
-    with Progress(len(work), "reading", "files") as line:
-        for _, answer in each_file(cells_of, work, workers):
-            if answer.reason:
-                raise StageError(answer.reason)
-            found += answer.result
-            line.update(1)
+    for cells_of_file in each_file(cells_of, work, workers):
+        found += cells_of_file
     if not any(map(len, found)):
         raise StageError(
             "no point is ground, vegetation or a building",

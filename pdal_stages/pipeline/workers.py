@@ -21,7 +21,7 @@ from typing import Any
 from ..base import checks
 from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
-from ..base.messages import LoggedStream, PlainStream
+from ..base.messages import LoggedStream, PlainStream, Progress
 from ..base.resources import CORES, available_threads
 from .pdal import check_interrupt, gentle
 
@@ -247,16 +247,24 @@ def _answer(future: Any) -> TaskResult:
     return TaskResult(reason=f"{type(error).__name__}: {error}")
 
 
-def each_file(
-    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
-) -> Iterator[tuple[tuple, TaskResult]]:
-    """Each item of work, the function's arguments, with its result, as they finish; failures do not stop the rest.
+def each_file(function: Callable[..., Any], work: Sequence[tuple], workers: int = 1) -> Iterator[Any]:
+    """The result for each item of work, the function's arguments, as they finish.
 
-    The function must be importable by other processes. They share the cores. A single worker is this process.
+    The function must be importable by other processes. They share the cores. A single worker is this process. At the end
+    a StageError names the first files that failed.
     """
     count = min(checks.whole("--workers", workers, 1, 1024), len(work))
-    if count == 1:
-        yield from ((item, perform(partial(function, *item))) for item in work)
-        return
-    with WorkerProcesses(count, max(1, available_threads() // count)) as pool:
-        yield from run_tasks(pool, deque(work), lambda item: partial(function, *item))
+    threads = max(1, available_threads() // count)
+    failed = []
+    with (
+        Progress(len(work), "reading", "files") as line,
+        WorkerProcesses(count, threads) if count > 1 else ThisProcess(threads) as pool,
+    ):
+        for _, answer in run_tasks(pool, deque(work), lambda item: partial(function, *item)):
+            line.update()
+            if answer.reason:
+                failed.append(answer.reason)
+            else:
+                yield answer.result
+    if failed:
+        raise StageError(f"{len(failed)} of {len(work)} inputs cannot be read", found="; ".join(failed[:3]))

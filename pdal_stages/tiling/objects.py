@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError, StageError
+from ..base.errors import OptionError
 from ..base.files import JSON, Output, check_outputs, write_json
-from ..base.messages import Progress, print_messages
+from ..base.messages import print_messages
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
@@ -118,19 +118,11 @@ def _find_in_files(inputs: Sequence[str], stage: ObjectsWriter, workers: int) ->
 
 def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
     """The cells of all files."""
-    failed = []
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
-    with Progress(len(inputs), "reading", "files") as line:
-        for _, answer in each_file(_cells_of, [(path, stage, wkt) for path in inputs], workers):
-            line.update()
-            if answer.reason:
-                failed.append(answer.reason)
-                continue
-            cells = Cells.join([cells, answer.result[0]])
-            seen += answer.result[1]
-    if failed:
-        raise StageError(f"{len(failed)} of {len(inputs)} inputs cannot be read", found="; ".join(failed[:3]))
+    for found, codes in each_file(_cells_of, [(path, stage, wkt) for path in inputs], workers):
+        cells = Cells.join([cells, found])
+        seen += codes
     refuse_unclassified(cells, np.flatnonzero(seen).astype(np.uint8))
     return cells
 
