@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -67,10 +66,7 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     header = header_of(path)
     dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    tiles: Counter[tuple[int, int]] = Counter()
-    places: Counter[tuple[int, int]] = Counter()
-    wide = math.ceil(_PLACE / cells.size)
-    found = []
+    found = [np.empty((0, 4), np.int64)]
     total = 0
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
         for points in las_chunks(path, most=_PART):
@@ -87,16 +83,21 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
             rows["record"] = records[order]
             out.write(rows.tobytes())
             counts = np.diff([*starts, len(order)])
-            made = np.column_stack([column[starts], line[starts], total + starts, counts]).tolist()
-            for i, j, _, number in made:  # cells divide tiles exactly: powers of two do in floats
-                tiles[i // _CELLS, j // _CELLS] += number
-                places[i // wide, j // wide] += number
-            check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
-            found += made
+            found.append(np.column_stack([column[starts], line[starts], total + starts, counts]))
             total += len(records)
-    refuse_scattered(places.values())
+        held = np.concatenate(found)
+        tiles = _squares(held, _CELLS)  # which cells divide exactly: powers of two do in floats
+        check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
+    refuse_scattered(_squares(held, math.ceil(_PLACE / cells.size))[:, 2].tolist())
     box = [*low.tolist(), *high.tolist()]
-    return {"count": total, "box": box, "tiles": [(*t, n) for t, n in sorted(tiles.items())], "cells": found}
+    return {"count": total, "box": box, "tiles": tiles.tolist(), "cells": held.tolist()}
+
+
+def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
+    """(m, 3) squares of `side` cells that hold points, in ascending order: column, row, number of points."""
+    squares, of = np.unique(cells[:, :2] // side, axis=0, return_inverse=True)
+    points = np.bincount(of.reshape(-1), cells[:, 3], len(squares))
+    return np.column_stack([squares, points.astype(np.int64)])
 
 
 def coordinates(records: NDArray, header: laspy.LasHeader) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
