@@ -10,24 +10,27 @@ points that the later stages need, applies the saved changes, and takes the rast
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from tempfile import TemporaryDirectory
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import places_among
-from ..pipeline.runtime import points_of
 from ..stages.hag_morphological import HagMorphological, inside_block
 from .grid import Box, TileGrid
-from .inputs import IndexedSource
-from .outputs import arrays_of
-from .pieces import Piece, cut_all
-from .plan import OUTSIDE, TilePlan
+from .pieces import Piece
+from .plan import RunContext, TilePlan
 from .store import load_arrays, save_arrays, written
-from .tile import Changed, FromBefore, HeadRun, RunContext, run_head
+
+Changed = dict[str, tuple[NDArray[np.int64] | None, NDArray]]
+
+
+class FromBefore(NamedTuple):
+    """Results of the first round for a tile."""
+
+    blocks: Any  #: for the far-reaching stage
+    changed: list[Changed]  #: for each piece: rows and new values of dimensions, from the stages before it
 
 
 def left_name(tile: str) -> str:
@@ -46,38 +49,6 @@ def stage_of(plan: TilePlan) -> HagMorphological:
     given = plan.head[plan.first.at]
     options = {name: value for name, value in given.items() if name not in ("type", "tag", "inputs")}
     return HagMorphological(options)
-
-
-def run_first_round(
-    context: RunContext, tile: tuple[int, int], sources: Sequence[IndexedSource], target: str
-) -> dict[str, Any]:
-    """Save what the raster needs of a tile's own points, and the changes by earlier stages; returns a record.
-
-    `sources` may have points in the tile or its halo.
-    """
-    plan, first = context.plan, context.plan.first
-    assert first is not None
-    stage, left = stage_of(plan), [{"around": np.empty((0, 4))}]
-
-    def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        mine = ins[OUTSIDE] < 0
-        if mine.any():
-            left.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
-
-    before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
-    head = HeadRun([])
-    with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
-        cuts = cut_all(context.grid, tile, sources, first.halo_m / context.unit, folder)
-        if cuts:
-            head = run_head(replace(context, plan=before), tile, cuts, True, last=leave)
-    arrays = {
-        name: np.concatenate([one[name] for one in left if name in one])
-        for name in {name for one in left for name in one}
-    }
-    if first.kept:
-        arrays |= arrays_of(head.results)
-    save_arrays(target, arrays)
-    return {"outputs": written([target]), "messages": head.messages}
 
 
 def make_block(plan: TilePlan, block: tuple[int, int], tiles: Sequence[str], target: str) -> dict[str, Any]:
@@ -107,10 +78,8 @@ def _box_m(context: RunContext, tile: tuple[int, int], around_m: float) -> Box:
     return (x0 - around_m, y0 - around_m, x1 + around_m, y1 + around_m)
 
 
-def from_before(
-    folder: str, context: RunContext, tile: tuple[int, int], read_m: float, cuts: list[Piece]
-) -> FromBefore:
-    """The results of the earlier rounds in `folder` for a tile that is read with so many meters around it."""
+def from_before(context: RunContext, tile: tuple[int, int], read_m: float, cuts: list[Piece]) -> FromBefore:
+    """The results of the earlier rounds for a tile that is read with so many meters around it."""
     first = context.plan.first
     assert first is not None
     around = read_m + first.blocks.around + first.blocks.spill
@@ -118,9 +87,9 @@ def from_before(
     blocks = map(block_name, blocks_around(context, tile, around))
     stage = stage_of(context.plan)
     needed = stage.needed_of_blocks(box)
-    found = (load_arrays(path, needed) for path in _there(folder, blocks))  # others have no points
+    found = (load_arrays(path, needed) for path in _there(context.rasters, blocks))  # others have no points
     tiles = context.grid.covering(context.grid.box(tile, read_m / context.unit))
-    left = _there(folder, [left_name(context.grid.name(each)) for each in tiles])
+    left = _there(context.rasters, [left_name(context.grid.name(each)) for each in tiles])
     changed = [_changed(first.kept or (), left, piece) for piece in cuts]
     return FromBefore(stage.made_of_blocks(found), changed)
 

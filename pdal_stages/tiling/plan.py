@@ -18,6 +18,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.stagefiles import writes_las
 from ..stages.base import Stage
 from ..stages.hag_morphological import Blocks, HagMorphological
+from .grid import Box, TileGrid
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
@@ -73,6 +74,20 @@ class TilePlan:
     @property
     def writers(self) -> list[dict[str, Any]]:
         return [s for s in self.tail if s["type"].startswith("writers.")]
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What all tiles of a run have in common."""
+
+    plan: TilePlan
+    grid: TileGrid
+    unit: float  #: meters per unit of the coordinates
+    bounds: Box  #: of all inputs
+    threads: int
+    most_points: int  #: a tile is not read with a wider halo that holds more
+    scratch: str  #: folder for temporary files
+    rasters: str = ""  #: folder with the results of the first round; empty where tiles do without
 
 
 @dataclass(frozen=True)

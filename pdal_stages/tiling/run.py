@@ -23,15 +23,15 @@ from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
-from .ground import block_name, blocks_around, from_before, left_name, make_block, run_first_round
+from .ground import block_name, blocks_around, left_name, make_block
 from .inputs import CloudIndex, IndexedSource, Survey
 from .outputs import write_file
 from .pieces import TEMPORARY, sort_points
-from .plan import TilePlan, make_plan, outputs_for
+from .plan import RunContext, TilePlan, make_plan, outputs_for
 from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .settings import TilingOptions, worker_bytes
 from .store import Store, fingerprint
-from .tile import RunContext, run_tile
+from .tile import run_first_round, run_tile
 
 #: A run stops when this many tiles failed for the same reason and none succeeded.
 _HOPELESS = 10
@@ -327,8 +327,8 @@ class _Run:
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
         """Run all waiting tiles, and outputs as soon as their last tile is done. `finished` is called with outputs."""
         survey, store, context = self.survey, self.store, self._context()
-        many = self.plan.first is not None and len(self.tiles) > 1
-        before = partial(from_before, str(store.kept)) if many else None
+        if self.plan.first is not None and len(self.tiles) > 1:
+            context = replace(context, rasters=str(store.kept))
         waiting = deque(job for job in self.tiles if job.state == "waiting")
         users: dict[str, list[Job]] = {}
         for out in self.outputs:
@@ -346,7 +346,7 @@ class _Run:
             complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
             given = survey.readable(sources)
             result = store.path(job.name)
-            return partial(run_tile, context, job.tile, given, complete, result, job.outputs, before)
+            return partial(run_tile, context, job.tile, given, complete, result, job.outputs)
 
         for job in self._do("tiles", waiting, task_of):
             if finished is not None and job.state == "done" and job.outputs and job.record["outputs"]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -21,31 +21,17 @@ from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages.base import stage_types
 from ..stages.hag_morphological import HagMorphological
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
-from .grid import Box, TileGrid, inside
+from .grid import inside
+from .ground import Changed, FromBefore, from_before, stage_of
 from .inputs import IndexedSource
 from .outputs import NewValues, PieceResults, arrays_of, flags_in_classes, read_with, write_tile
 from .pieces import Piece, cut_all
-from .plan import INPUT, OUTSIDE, ROW, TilePlan
+from .plan import INPUT, OUTSIDE, ROW, RunContext
 from .store import save_arrays, written
 
 #: How many times a tile is read again with a wider halo.
 _WIDENINGS = 3
 _MARKS = (ROW, INPUT, OUTSIDE)
-
-Changed = dict[str, tuple[NDArray[np.int64] | None, NDArray]]
-
-
-@dataclass(frozen=True)
-class RunContext:
-    """What all tiles of a run have in common."""
-
-    plan: TilePlan
-    grid: TileGrid
-    unit: float  #: meters per unit of the coordinates
-    bounds: Box  #: of all inputs
-    threads: int
-    most_points: int  #: a tile is not read with a wider halo that holds more
-    scratch: str  #: folder for temporary files
 
 
 class HeadRun(NamedTuple):
@@ -55,13 +41,6 @@ class HeadRun(NamedTuple):
     need: float = 0.0  #: the halo that was needed, meters
     messages: Sequence[str] = ()  #: warnings and notes
     left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.report`
-
-
-class FromBefore(NamedTuple):
-    """Results of the first round for a tile."""
-
-    blocks: Any  #: for the far-reaching stage
-    changed: list[Changed]  #: for each piece: rows and new values of dimensions, from the stages before it
 
 
 def run_head(
@@ -178,8 +157,36 @@ def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceRe
 # ---- a tile ---------------------------------------------------------------------------------------------------
 
 
-#: Gives the first round's results for a tile that is read with so many meters around it.
-Before = Callable[[RunContext, tuple[int, int], float, list[Piece]], FromBefore]
+def run_first_round(
+    context: RunContext, tile: tuple[int, int], sources: Sequence[IndexedSource], target: str
+) -> dict[str, Any]:
+    """Save what the raster needs of a tile's own points, and the changes by earlier stages; returns a record.
+
+    `sources` may have points in the tile or its halo.
+    """
+    plan, first = context.plan, context.plan.first
+    assert first is not None
+    stage, left = stage_of(plan), [{"around": np.empty((0, 4))}]
+
+    def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        mine = ins[OUTSIDE] < 0
+        if mine.any():
+            left.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
+
+    before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
+    head = HeadRun([])
+    with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
+        cuts = cut_all(context.grid, tile, sources, first.halo_m / context.unit, folder)
+        if cuts:
+            head = run_head(replace(context, plan=before), tile, cuts, True, last=leave)
+    arrays = {
+        name: np.concatenate([one[name] for one in left if name in one])
+        for name in {name for one in left for name in one}
+    }
+    if first.kept:
+        arrays |= arrays_of(head.results)
+    save_arrays(target, arrays)
+    return {"outputs": written([target]), "messages": head.messages}
 
 
 def run_tile(
@@ -189,14 +196,13 @@ def run_tile(
     complete: float,
     result: str,
     outputs: list[str] | None,
-    before: Before | None,
 ) -> dict[str, Any]:
     """Run the head on a tile; save the results in the file `result`, or write the `outputs`; returns a record.
 
     `sources` may have points in the tile or its halo; they are all inputs within `complete` meters around it.
     """
     with TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
-        results, record = _settled(context, tile, sources, complete, before, folder)
+        results, record = _settled(context, tile, sources, complete, folder)
         if outputs is not None:
             wrote = write_tile(results, context.plan, outputs, context.scratch)
             return record | wrote | {"messages": [*record["messages"], *wrote.get("messages", [])]}
@@ -209,7 +215,6 @@ def _settled(
     tile: tuple[int, int],
     sources: Sequence[IndexedSource],
     complete: float,
-    before: Before | None,
     folder: str,
 ) -> tuple[list[PieceResults], dict[str, Any]]:
     """Run the head with a sufficient halo; returns results and a record.
@@ -228,7 +233,7 @@ def _settled(
             head = HeadRun([PieceResults(piece, np.empty(0, np.int64), {}) for piece in cuts])
             break
         everything = inside(context.bounds, grid.box(tile, halo_m / context.unit))
-        given = before(context, tile, halo_m, cuts) if before else None
+        given = from_before(context, tile, halo_m, cuts) if context.rasters else None
         try:
             head = run_head(context, tile, cuts, everything, given)
             need = head.need
