@@ -109,7 +109,7 @@ def _find_in_files(inputs: Sequence[str], stage: ObjectsWriter, workers: int) ->
     if thin:
         too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
         print_messages(
-            f"{too_few}, so cells of {cells.size:g} m are used; --cell {size:g} keeps the smaller ones"
+            f"{too_few}, so cells of {cells.size:g} m are used, where roofs look rougher; --cell {size:g} keeps smaller ones"
             if stage.widens
             else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
         )
