@@ -49,21 +49,14 @@ def _options(kind: type[Stage]) -> str:
     for option in kind.all_options():
         if option.name == "where" and kind.type.startswith("filters."):
             continue  # PDAL's filters have it by themselves, writers of older PDAL not
-        default, given = option.default, option.default not in (None, "", ())
-        as_number = given and option.kind in ("number", "integer", "boolean")
-        text = (
-            ""
-            if as_number or not given
-            else ",".join(map(str, default))
-            if isinstance(default, tuple)
-            else str(default)
-        )
+        text = option.typed_default
+        as_number = text and option.kind in ("number", "integer", "boolean")
         fields = [
             json.dumps(option.name),
             f"Kind::{_KINDS.get(option.kind, 'Text')}",
-            str(bool(given)).lower(),
-            repr(float(default) if as_number else 0.0),
-            json.dumps(text),
+            str(bool(text)).lower(),
+            repr(float(option.default) if as_number else 0.0),
+            json.dumps("" if as_number else text),
             json.dumps(_help(kind, option)),
         ]
         lines.append(f"    {{ {', '.join(fields)} }},")

@@ -14,7 +14,7 @@ from ..base import checks
 from ..base.arrays import places_among
 from ..base.errors import StageError
 from ..objects.cells import CLASSES, ENOUGH, Cells, Kind, kind_of_code, refuse_unclassified
-from ..objects.find import FOUND, find_objects
+from ..objects.find import find_objects
 from ..objects.found import Objects, ObjectSettings
 from ..objects.measure import CHECK, REASONS
 from ..objects.view import MARGIN
@@ -183,24 +183,25 @@ class ObjectsFilter(ObjectOptions, Stage):
         found = self._found(points)
         ids = self._ids(found, points)
         out: dict[str, NDArray] = {"ObjectID": ids}
-        at = {kind: _places(ids, found.tables[kind].ids) for kind in FOUND}
         if self.judged:
             for name in ("ObjectVerdict", "ObjectHeight", "ObjectExtent"):
                 out[name] = np.array(points.arrays[name])
                 out[name][points.inside] = 0
         points.report.figures |= {name: one for name, one in found.summary().items() if one["objects"]}
         refused = np.zeros(points.count, bool)
-        for kind, (which, rows) in at.items():
-            columns = found.tables[kind].columns
-            if not rows.size:
+        for kind, table in found.tables.items():
+            if not len(table):
                 continue
+            place, there = places_among(table.ids, ids)
+            rows = np.flatnonzero(there)
+            which, columns = place[rows], table.columns
             if self.judged:
                 out["ObjectVerdict"][rows] = np.where(columns["verdict"][which] == CHECK, 2, 1)
                 out["ObjectHeight"][rows] = (
                     np.nan_to_num(columns[_HEIGHT[kind]][which]) / points.units.vertical
                 )
                 out["ObjectExtent"][rows] = columns[_EXTENT[kind]][which]
-            refused[rows] = found.tables[kind].having(self.refuse)[which]
+            refused[rows] = table.having(self.refuse)[which]
         if self.refuse:
             codes = points.class_codes.copy()
             codes[refused] = self.refused_class
@@ -211,12 +212,3 @@ class ObjectsFilter(ObjectOptions, Stage):
         if points.mask is not None:
             out["ObjectID"] = np.where(points.mask, out["ObjectID"], points.arrays["ObjectID"])
         return out
-
-
-def _places(ids: NDArray[np.int64], known: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which of the sorted known ids points have, and the rows of those points."""
-    if known.size == 0:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    at, there = places_among(known, ids)
-    rows = np.flatnonzero(there & (ids != 0))
-    return at[rows], rows

@@ -67,13 +67,17 @@ class Option:
         return self if stage is None else stage.options[self.name]
 
     @property
-    def shown_default(self) -> str:
-        """The default as a user would type it, with its unit; empty where the stage decides."""
-        if self.default in (None, "", ()):
+    def typed_default(self) -> str:
+        """The default as a user would type it; empty where the stage decides."""
+        if self.default in (None, ""):
             return ""
         given = self.default if isinstance(self.default, tuple) else (self.default,)
-        words = ",".join(str(one).lower() if isinstance(one, bool) else str(one) for one in given)
-        return f"{words} {self.unit}".strip()
+        return ",".join(str(one).lower() if isinstance(one, bool) else str(one) for one in given)
+
+    @property
+    def shown_default(self) -> str:
+        """The same with its unit."""
+        return f"{self.typed_default} {self.unit}".strip() if self.typed_default else ""
 
     def schema(self) -> dict:
         """The option's JSON Schema."""
