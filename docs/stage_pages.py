@@ -36,7 +36,7 @@ def page(stage: type[Stage]) -> str:
             "",
         ]
     lines += ["## Options", "", "| option | default | meaning |", "|---|---|---|"]
-    lines += [_row(stage, option) for option in stage.all_options()]
+    lines += [_row(option) for option in stage.all_options()]
     lines += ["| `tag`, `inputs` | | As in every PDAL stage |", ""]
     return "\n".join(lines)
 
@@ -48,14 +48,10 @@ def example(stage: type[Stage]) -> dict[str, Any]:
     return next(one for one in pipeline if isinstance(one, dict) and one.get("type") == stage.type)
 
 
-def _row(stage: type[Stage], option) -> str:
+def _row(option) -> str:
     value, _, unit = option.shown_default.partition(" ")
     default = "required" if option.required else f"`{value}` {unit}".strip() if value else ""
-    text = f"{stage.where_help}" if option.name == "where" and stage.where_help else f"{option.help}."
-    if option.name == "where":
-        text = (
-            f"A condition on points, as PDAL has it, whose own filters do not see the points outside. {text}"
-        )
+    text = f"{option.help}."
     if option.choices:
         text += f" One of {', '.join(f'`{c}`' for c in option.choices)}."
     bounds = []

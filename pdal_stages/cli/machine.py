@@ -102,8 +102,6 @@ def _options(options: argparse.Namespace) -> None:
         print(f"  Source: {stage.source}\n")
     for option in stage.all_options():
         text, default = option.help, option.shown_default
-        if option.name == "where" and stage.where_help:
-            text = f"A condition on points (PDAL's own filters do not see the others). {stage.where_help}"
         if option.choices:
             text += f" (one of: {', '.join(map(str, option.choices))})"
         print(f"  {option.name}" + ("  (required)" if option.required else f" [{default}]" * bool(default)))
@@ -147,7 +145,14 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
             for name, parser in commands.items()
         },
         "stages": {
-            name: {"help": stage.summary, "options": [_option(stage, one) for one in stage.all_options()]}
+            name: {
+                "help": stage.summary,
+                "options": [
+                    asdict(one)
+                    | {"default": one.typed_default if isinstance(one.default, tuple) else one.default}
+                    for one in stage.all_options()
+                ],
+            }
             for name, stage in stage_types().items()
         },
     }
@@ -170,15 +175,6 @@ def _argument(action: argparse.Action) -> dict[str, Any]:
         "required": bool(action.required),
         "many": action.nargs in ("+", "*") or isinstance(action, argparse._AppendAction),
         "value": action.metavar if isinstance(action.metavar, str) else "",
-    }
-
-
-def _option(stage: Any, option: Any) -> dict[str, Any]:
-    default = option.default
-    return {
-        **asdict(option),
-        "help": stage.where_help or option.help if option.name == "where" else option.help,
-        "default": ",".join(map(str, default)) if isinstance(default, tuple) else default,
     }
 
 

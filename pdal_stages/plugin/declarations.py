@@ -57,14 +57,14 @@ def _options(kind: type[Stage]) -> str:
             str(bool(text)).lower(),
             repr(float(option.default) if as_number else 0.0),
             json.dumps("" if as_number else text),
-            json.dumps(_help(kind, option)),
+            json.dumps(_help(option)),
         ]
         lines.append(f"    {{ {', '.join(fields)} }},")
     return "\n".join([*lines, ""])
 
 
-def _help(kind: type[Stage], option: Option) -> str:
-    text = kind.where_help or option.help if option.name == "where" else option.help
+def _help(option: Option) -> str:
+    text = option.help
     if option.choices:
         text += f" (one of: {', '.join(map(str, option.choices))})"
     if option.unit:

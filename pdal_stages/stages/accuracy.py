@@ -47,7 +47,7 @@ class AccuracyStage(Stage):
     instead_of_tiles = (
         "Write the files first, then compare them: pdal-stages accuracy FILE --reference-dimension Reference"
     )
-    where_help = "Only points inside are compared."
+    where_help = "Only points inside are compared"
     needs_points = "compare"
     dimension: str = option("string", "Classification", "The classes to judge")
     reference: str = option("string", "Reference", "The true classes, e.g. kept with filters.ferry")

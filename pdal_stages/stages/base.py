@@ -9,6 +9,7 @@ import importlib
 from abc import ABC, abstractmethod
 from collections import UserDict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from .selection import Expression
 #: What `where` means to stages of heights.
 HEIGHTS_OUTSIDE = (
     "Points outside do not form the ground; they receive a height above it, unless they have one already or a stage "
-    "before made it."
+    "before made it"
 )
 
 
@@ -62,7 +63,7 @@ class Stage(ABC):
     type: ClassVar[str]
     summary: ClassVar[str]
     source: ClassVar[str] = ""
-    #: What `where` means here.
+    #: What becomes of the points outside `where`.
     where_help: ClassVar[str] = ""
     #: Whether `where` only chooses what to compute, so that tiles may narrow it down to what is seen.
     where_chooses: ClassVar[bool] = False
@@ -80,9 +81,7 @@ class Stage(ABC):
     open_ended: ClassVar[bool] = False
 
     where: str | None = option(
-        "expression",
-        None,
-        "Points the stage acts on; the others are not changed but still serve as neighbors (unlike in PDAL's own filters)",
+        "expression", None, "A condition on points (PDAL's own filters do not see the others)"
     )
     threads: int = option(
         "integer", 0, "Threads to use; 0 takes every available core", minimum=0, maximum=1024
@@ -119,9 +118,10 @@ class Stage(ABC):
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:
         """The stage's own options, then those all stages share."""
-        return tuple(
-            value for kind in cls.__mro__ for value in vars(kind).values() if isinstance(value, Option)
-        )
+        every = [one for kind in cls.__mro__ for one in vars(kind).values() if isinstance(one, Option)]
+        where = every.index(vars(Stage)["where"])
+        every[where] = replace(every[where], help=f"{every[where].help}. {cls.where_help}")
+        return tuple(every)
 
     def check(self) -> None:
         """Refuse options that contradict each other; read the files they name."""

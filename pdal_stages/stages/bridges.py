@@ -19,7 +19,7 @@ _MISTAKEN = (2, 6)
 class Bridges(ClassStage):
     type = "filters.bridges"
     summary = "Classify bridge decks, which are then no longer ground or building"
-    where_help = "Points outside keep their class."
+    where_help = "Points outside keep their class"
     code: int = code_option(BRIDGE, "Class code of bridge decks")
     ignore: Selection = ignore_option("Points that keep their class")
     keep: Selection = keep_option("Further points that keep their class")

@@ -14,7 +14,7 @@ from .selection import Selection
 class Consistency(ClassStage):
     type = "filters.consistency"
     summary = "Mend classes that contradict their surroundings, by named rules that count what they change"
-    where_help = "Points outside keep their class but still serve as neighbors."
+    where_help = "Points outside keep their class but still serve as neighbors"
     forgets = True
     ground: bool = option(
         "boolean",

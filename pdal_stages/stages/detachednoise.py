@@ -16,7 +16,7 @@ from .selection import Selection
 class DetachedNoise(ClassStage):
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
-    where_help = "Points outside are not marked but still serve as neighbors."
+    where_help = "Points outside are not marked but still serve as neighbors"
     cluster: int = option(
         "integer",
         60,

@@ -31,7 +31,7 @@ class ModelClassifier(Stage):
     summary = "Apply a model file: compute what the model needs block by block, and write classes"
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
     where_chooses = True
-    where_help = "Points outside keep their class but still serve as neighbors."
+    where_help = "Points outside keep their class but still serve as neighbors"
     forgets = True
     model_file: str = option(
         "model",

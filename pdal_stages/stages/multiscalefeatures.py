@@ -30,7 +30,7 @@ class MultiscaleFeatures(Stage):
     summary = "Covariance, geometric and shape-distribution features of many neighborhoods"
     source = "[B16] sections 3.1-3.2, [W18] section 3.2, [H17] equations 1-3"
     where_chooses = True
-    where_help = "Features are computed for the points inside; all points are neighbors."
+    where_help = "Features are computed for the points inside; all points are neighbors"
     neighborhoods: list = option(
         "list",
         DEFAULT_NEIGHBORHOODS,

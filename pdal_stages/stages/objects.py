@@ -124,7 +124,7 @@ class ObjectsFilter(ObjectOptions, Stage):
         "Gong, Kelly 2006 (Photogrammetric Engineering and Remote Sensing 72, 923-932); diameters of stems after Jucker and "
         "others 2017 (Global Change Biology 23, 177-190)"
     )
-    where_help = "Points outside form no object, and keep what they have."
+    where_help = "Points outside form no object, and keep what they have"
     open_ended = True  # a building may be larger than the surroundings of a tile
     judged: bool = option(
         "boolean",

@@ -20,7 +20,7 @@ class ObjectsWriter(ObjectOptions, Stage):
     type = "writers.objects"
     summary = "Write buildings, trees, spans of wires and bridge decks to a vector file"
     instead_of_tiles = "Write the points first, then: pdal-stages objects FILES town.gpkg"
-    where_help = "Points outside form no object."
+    where_help = "Points outside form no object"
     needs_points = "find objects in"
     filename: str = option(
         "filename",

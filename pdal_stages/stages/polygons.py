@@ -16,7 +16,7 @@ from .selection import Selection
 class Polygons(ClassStage):
     type = "filters.polygons"
     summary = "Set the class of points inside the polygons of any OGR file, such as water inside lakes"
-    where_help = "Points outside keep their class."
+    where_help = "Points outside keep their class"
     polygons: list = option(
         "list",
         None,

@@ -18,7 +18,7 @@ from .selection import Selection
 class Wires(ClassStage):
     type = "filters.wires"
     summary = "Classify wires, long thin lines in the air, and the towers that carry them"
-    where_help = "Points outside keep their class but still serve as neighbors."
+    where_help = "Points outside keep their class but still serve as neighbors"
     code: int = code_option(WIRE, "Class code of wires")
     towers: bool = option(
         "boolean", False, "Also give towers and poles their class, where wires end and meet"
