@@ -25,7 +25,7 @@ from ..pipeline.parts import arrays_in_parts, reads_in_parts
 from ..pipeline.read import Override
 from ..pipeline.references import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
-from ..reports.objectlayers import check_target, target_files, write_objects
+from ..reports.objectlayers import write_objects
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ LARGEST = 4.0
 
 def refuse_tiles(task: ClassifyTask, output: str) -> None:
     """Refuse, before any work, what ``classify --objects`` cannot do."""
-    check_target(output)
     if task.options.per == "tile" or not all(map(reads_in_parts, task.files)):
         raise OptionError(
             "classify --objects needs an output for each LAS or LAZ input",
@@ -54,11 +53,9 @@ def objects_of_files(
     names: Sequence[str], stage: ObjectsWriter, workers: int = 1, metadata: str | None = None
 ) -> dict[str, Any]:
     """Find objects in classified files, write and summarize them; returns the files, and counts by kind."""
-    check_target(stage.filename)
     inputs = input_files(names)
     more = [Output(metadata, "metadata", JSON)] if metadata else []
-    wanted = [Output(str(file), "objects") for file in target_files(stage.filename)]
-    check_outputs([*wanted, *more], [*inputs, *names])
+    check_outputs([*stage.outputs(), *more], [*inputs, *names])
     found, units, wkt = _find_in_files(inputs, stage, workers)
     found, refused = found.without(stage.refuse)
     files = write_objects(stage.filename, found, stage.outlines == STRAIGHT, units, wkt)["files"]

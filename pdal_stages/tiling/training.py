@@ -153,7 +153,6 @@ class TrainTask:
         heights = [overridden(one, self.overrides) for one in made_by]
         told = [follows] if (follows := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
-        stage.check()
         check_outputs(stage.outputs(), list(self.files))
         report = Report()
         made = (self._whole if self.in_one_piece() else self._tiled)(heights, report)
