@@ -31,11 +31,6 @@ if TYPE_CHECKING:
 
 #: Failures printed, and tiles of a dry run.
 _MOST_FAILURES, _MOST_TILES = 20, 50
-#: Flags of tiles and their defaults.
-_DEFAULTS: dict[str, Any] = {
-    "memory": None, "workers": None, "scheduler": "", "per": "auto", "buffer": None, "resume": False, "dry_run": False,
-    "report": [],
-}  # fmt: skip
 
 
 def add_commands(parser: Parser) -> None:
@@ -213,7 +208,8 @@ def options_of(options: argparse.Namespace) -> TilingOptions:
 def wants_tiles(options: argparse.Namespace) -> bool:
     """Whether ``pipeline`` is to run in tiles; other flags of tiles are refused without it."""
     if options.tile is None:
-        for name, default in _DEFAULTS.items():
+        add_arguments(usual := argparse.ArgumentParser())
+        for name, default in vars(usual.parse_args([])).items():
             if getattr(options, name) != default:
                 raise OptionError(
                     f"--{name.replace('_', '-')} needs --tile",
