@@ -185,7 +185,7 @@ def _follow_preparations(expanded: Expanded) -> None:
             plain["pdalargs"]["preparation"] = makers
         if warning is not None:
             expanded.warnings.append(warning)
-        before.append(({"type": ours.stage.type, **ours.given}, ours.stage.creates()))
+        before.append((ours.given, ours.stage.creates()))
 
 
 #: Prefixes of dimensions that come only from a stage or from extra bytes.

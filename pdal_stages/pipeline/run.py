@@ -207,7 +207,7 @@ class Pipeline:
             raise failure or self._located(error) from None
         names = {str(made): final for made, final in zip(partials, outputs, strict=True)}
         names |= {made: names.get(target, target) for made, target in compressed.items()}
-        self.metadata = _renamed(_named_metadata(result.metadata, self.reports), names)
+        self.metadata = _renamed(_named_metadata(result.metadata, self.expanded), names)
         self.arrays, self.log_lines = result.arrays, pdal_env.log_lines(result.log)
         return result.count
 
@@ -265,14 +265,14 @@ _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
 _NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")
 
 
-def _named_metadata(metadata: dict[str, Any], reports: list[tuple[str, list[Report]]]) -> dict[str, Any]:
+def _named_metadata(metadata: dict[str, Any], expanded: Expanded) -> dict[str, Any]:
     """PDAL's metadata, with our stages under their own names instead of filters.python."""
     inner = metadata.get("metadata")
     if not isinstance(inner, dict):
         return metadata
     scripts = filter(None, _several(inner.pop("filters.python", None)))
     theirs = [s for s in scripts if not (isinstance(s, dict) and any(name in stage_types() for name in s))]
-    named = [(name.partition(" ")[0], report.to_dict()) for name, views in reports for report in views]
+    named = [(ours.stage.type, report.to_dict()) for ours in expanded.ours for report in ours.reports]
     for kind, node in [*(("filters.python", node) for node in theirs), *named]:
         inner[kind] = [*_several(inner[kind]), node] if kind in inner else node
     return metadata
