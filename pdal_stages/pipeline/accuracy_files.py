@@ -14,9 +14,9 @@ from ..base.errors import DimensionError, StageError, suggest
 from ..base.files import check_outputs
 from ..base.messages import Progress, Report
 from ..stages.accuracy import AccuracyStage
+from ..stages.base import stage_from
 from ..stages.points import Points
 from .classify_request import ClassifyRequest
-from .expansion import expand_stage
 from .inputs_outputs import in_folders, input_files, reader_of, stage_files
 from .read import Override, apply_overrides
 from .run import Pipeline
@@ -53,7 +53,7 @@ def compare_files(
         wanted["model"] = model
     (given,) = apply_overrides([wanted], own)
     renamed = {"dimension": "Classification", "reference": "Reference"}
-    stage = cast(AccuracyStage, expand_stage({**given, **renamed}).stage)
+    stage = cast(AccuracyStage, stage_from({**given, **renamed}))
     check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
     others = tuple(one for one in overrides if one not in own)
     parts = []

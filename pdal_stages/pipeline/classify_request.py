@@ -12,8 +12,7 @@ from ..base.las import BRIDGE
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation
-from ..stages.base import stage_types
-from .expansion import expand_stage
+from ..stages.base import stage_from, stage_types
 from .inputs_outputs import overridden, reader_of, writer_of
 from .las_output import extra_dims_option
 from .read import Override
@@ -69,7 +68,7 @@ class ClassifyRequest:
         given = overridden(self._classifier, self.overrides)
         if given.get("keep_sure") is None:
             return []
-        stage: Any = expand_stage(given).stage
+        stage: Any = stage_from(given)
         return stage.cost()
 
     @cached_property
@@ -150,7 +149,7 @@ class ClassifyRequest:
             if stage["type"] in preparation.OF_PDAL:
                 made["HeightAboveGround"] = "double"
             elif stage["type"] in stage_types():
-                made |= expand_stage(overridden(stage, self.overrides)).stage.creates()
+                made |= stage_from(overridden(stage, self.overrides)).creates()
         made.pop("Classification", None)
         for name in self.dimensions:
             if name not in ("all", "none", *made) and self.dimensions != WRITTEN:

@@ -17,16 +17,14 @@ from typing import Any
 from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.las import extra_dimensions, read_header
 from ..stages import preparation
-from ..stages.base import Stage, stage_type, stage_types
+from ..stages.base import PDAL_OWN, Stage, stage_from, stage_type, stage_types
 from ..stages.points import MAKERS
 from . import pdal as pdal_env
 from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
 from .read import PipelineSource
-from .runtime import TRAMPOLINE, ExpandedStage, made, place, python_filter
+from .runtime import TRAMPOLINE, ExpandedStage, made, python_filter
 from .stagefiles import is_reader, reader_files
 
-#: Options of every PDAL stage that an expanded stage passes on.
-PDAL_OWN = ("tag", "inputs", "user_data", "log")
 #: Stages after which several views are what the user asked for.
 SPLITS = {
     f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns", "separatescanline")
@@ -207,7 +205,7 @@ def check_dimensions(expanded: Expanded) -> None:
         if moved and _DEGREES.search(str(moved[-1])):
             raise PipelineError(
                 "the points are in degrees here; neighborhoods and grids need meters",
-                where=ours.place,
+                where=ours.stage.place,
                 found=f"filters.reprojection to {moved[-1]}",
                 cure="Put the reprojection after the stages of pdal_stages, or reproject to a projected reference",
             )
@@ -218,7 +216,7 @@ def check_dimensions(expanded: Expanded) -> None:
             ):
                 raise DimensionError(
                     f"the dimension '{name}' is missing: no stage before creates it, and no input has it",
-                    where=ours.place,
+                    where=ours.stage.place,
                     cure=ours.stage.hint or MAKERS.get(name),
                 )
 
@@ -257,17 +255,15 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
 
 def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> ExpandedStage:
     """One stage of ours, checked, and the ``filters.python`` that stands for it."""
-    kind = stage_type(given["type"])
-    named = place(kind.type, given.get("tag"))
+    stage = stage_from(given)
     options = {k: v for k, v in given.items() if k not in ("type", *PDAL_OWN)}
-    stage = kind(options, named)
-    label = f"pdal_stages_{kind.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"
-    arguments = {"stage": kind.type, "label": label, "options": options}
+    label = f"pdal_stages_{stage.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"
+    arguments = {"stage": stage.type, "label": label, "options": options}
     if given.get("tag"):
         arguments["tag"] = given["tag"]
     plain = python_filter(label, TRAMPOLINE, arguments, stage.creates())
     plain |= {key: given[key] for key in PDAL_OWN if key in given}
-    made[label] = expanded = ExpandedStage(stage, named, number, index, given, plain)
+    made[label] = expanded = ExpandedStage(stage, number, index, given, plain)
     return expanded
 
 

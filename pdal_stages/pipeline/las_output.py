@@ -81,11 +81,11 @@ def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage])
             if (limit := _code_limit(writer, stages[: one.index])) is not None:
                 stage.code_limit = limit if stage in last else None
                 if (largest := stage.largest_class()) > LEGACY_LIMIT:
-                    raise OptionError(limit[0], where=one.place, found=f"code {largest}", cure=limit[1])
+                    raise OptionError(limit[0], where=stage.place, found=f"code {largest}", cure=limit[1])
             if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
                     f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
-                    where=one.place,
+                    where=stage.place,
                     found=f"{extra} features",
                     cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
                     "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no "

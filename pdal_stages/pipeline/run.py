@@ -84,7 +84,7 @@ class Pipeline:
     @property
     def reports(self) -> list[tuple[str, list[Report]]]:
         """Of the last run: each of our stages by name, with a report for each view of points."""
-        return [(ours.place, ours.reports) for ours in self.expanded.ours]
+        return [(ours.stage.place, ours.reports) for ours in self.expanded.ours]
 
     @property
     def left_alone(self) -> dict[str, int]:
@@ -198,7 +198,7 @@ class Pipeline:
                 compressed = las_output.compress(partials)
                 for ours in self.expanded.ours:
                     if not ours.reports:  # newer PDAL leaves filters out where there are no points
-                        ours.reports.append(runtime.run_on_nothing(ours.stage, ours.place))
+                        ours.reports.append(runtime.run_on_nothing(ours.stage))
         except StageError as error:
             called = [runtime.made.get(str(stage.get("module"))) for stage in run]
             failure = next((one.failure for one in called if one and one.failure), None)

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
 from ..base.messages import Report
-from ..stages.base import Stage, stage_type
+from ..stages.base import Stage, place, stage_from
 from ..stages.points import Points
 from ..stages.preparation import NEEDS_GROUND
 from . import pdal as pdal_env
@@ -35,7 +35,6 @@ class ExpandedStage:
     """One of our stages after expanding, and what came of its last run in this process."""
 
     stage: Stage
-    place: str  #: its type and tag, for messages
     number: int  #: its index in the given list
     index: int  #: its index in the expanded list
     given: dict[str, Any]  #: the stage as it was written
@@ -73,11 +72,6 @@ _OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 _usual_stdout: Any = sys.__stdout__
 #: Stages and callbacks of this process by label, as long as someone holds them; in another process options are parsed again.
 made: WeakValueDictionary[str, ExpandedStage | Callback] = WeakValueDictionary()
-
-
-def place(type_name: str, tag: str | None) -> str:
-    """How errors name a stage: its type, and its tag where it has one."""
-    return f"{type_name} (tag '{tag}')" if tag else type_name
 
 
 def python_filter(
@@ -173,8 +167,8 @@ def points_of_views(
 
 def _made_again(arguments: Mapping[str, Any]) -> Stage:
     """The stage of an expanded pipeline, in another process than the one that expanded it."""
-    kind = stage_type(arguments["stage"])
-    stage = kind(arguments.get("options", {}), place(kind.type, arguments.get("tag")))
+    named = {"type": arguments["stage"], "tag": arguments.get("tag")}
+    stage = stage_from({**arguments.get("options", {}), **named})
     stage.makes_again = arguments.get("makes_again", False)
     stage.follows(arguments.get("preparation", []))
     return stage
@@ -201,12 +195,12 @@ def run_on_view(
     return points.report
 
 
-def run_on_nothing(stage: Stage, where: str | None = None) -> Report:
+def run_on_nothing(stage: Stage) -> Report:
     """A stage's report on no points at all."""
     if stage.needs_points:
         raise StageError(
             f"there are no points to {stage.needs_points}",
-            where=where,
+            where=stage.place,
             cure="Check the reader's file and the filters before this stage",
         )
     return Report({"points": 0})

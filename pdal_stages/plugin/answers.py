@@ -17,7 +17,7 @@ from typing import Any
 from ..base.errors import StageError
 from ..base.version import __version__
 from ..pipeline import expansion, runtime
-from ..stages.base import Stage, stage_type, stage_types
+from ..stages.base import Stage, place, stage_from, stage_type, stage_types
 from . import declarations
 
 
@@ -33,7 +33,7 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
         PDAL's dimensions, and the ones to write back.
     """
     question = module["pdalargs"]
-    where = runtime.place(question["stage"], question.get("tag"))
+    where = place(question["stage"], question.get("tag"))
     _end_on_interrupt()
     # PDAL's module object stays alive; the register need not grow.
     sys.modules.pop(question["label"], None)
@@ -67,9 +67,8 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     for name, value in question["options"]:  # lists come as several values
         given[name] = f"{given[name]},{value}" if name in given else value
     before = _stages(question["pipeline"])[:-1]
-    options = {**kind.from_pipeline(given, before), **given}
-    where = runtime.place(kind.type, question.get("tag"))
-    stage = kind(_own(options), where)
+    named = {"type": kind.type, "tag": question.get("tag")}
+    stage = stage_from({**kind.from_pipeline(given, before), **given, **named})
     return stage, expansion.settle_upstream(stage, [(one, _creates(one)) for one in before])[1]
 
 
@@ -82,16 +81,12 @@ def _stages(text: str) -> list[dict[str, Any]]:
     return found if isinstance(found, list) else [found]
 
 
-def _own(stage: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in stage.items() if name not in ("type", *expansion.PDAL_OWN)}
-
-
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
     """The dimensions that an earlier stage creates; of PDAL's stages, only heights."""
     if stage.get("type") not in stage_types():
         return expansion.heights_of(stage)
     try:
-        return stage_type(stage["type"])(_own(stage)).creates()
+        return stage_from(stage).creates()
     except StageError:  # reported by its own preparation
         return {}
 

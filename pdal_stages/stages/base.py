@@ -103,6 +103,7 @@ class Stage(ABC):
     code_limit: tuple[str, str] | None = None
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
+        self.place = place or self.type
         try:
             self.options = parse_options(self.all_options(), given)
             for name in ("horizontal_unit", "vertical_unit"):
@@ -113,7 +114,7 @@ class Stage(ABC):
             for output in self.outputs():
                 check_writable(output.path, output.what, output.kind)
         except StageError as error:
-            raise error.within(place or self.type) from None
+            raise error.within(self.place) from None
 
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:
@@ -247,3 +248,18 @@ def stage_type(name: str) -> type[Stage]:
             cure=f"{suggest(name, _TYPES)}Stages: {', '.join(_TYPES)}",
         )
     return _TYPES[name]
+
+
+#: Options of every PDAL stage that are not the stage's own.
+PDAL_OWN = ("tag", "inputs", "user_data", "log")
+
+
+def place(type_name: str, tag: str | None) -> str:
+    """How errors name a stage: its type, and its tag where it has one."""
+    return f"{type_name} (tag '{tag}')" if tag else type_name
+
+
+def stage_from(given: Mapping[str, Any]) -> Stage:
+    """A stage of ours, from its object in a pipeline."""
+    own = {name: value for name, value in given.items() if name not in ("type", *PDAL_OWN)}
+    return stage_type(given["type"])(own, place(given["type"], given.get("tag")))

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import places_among
+from ..stages.base import stage_from
 from ..stages.hag_morphological import HagMorphological, inside_block
 from .grid import Box, TileGrid
 from .pieces import Piece
@@ -46,9 +47,7 @@ def block_name(block: tuple[int, int]) -> str:
 def stage_of(plan: TilePlan) -> HagMorphological:
     """The stage that the rounds before the tiles are for."""
     assert plan.first is not None
-    given = plan.head[plan.first.at]
-    options = {name: value for name, value in given.items() if name not in ("type", "tag", "inputs")}
-    return HagMorphological(options)
+    return cast(HagMorphological, stage_from(plan.head[plan.first.at]))
 
 
 def make_block(plan: TilePlan, block: tuple[int, int], tiles: Sequence[str], target: str) -> dict[str, Any]:

@@ -23,12 +23,12 @@ from ..classifier.training import reach, train
 from ..classifier.trainoptions import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.expansion import expand_stage
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden, reader_of
 from ..pipeline.read import Override
 from ..pipeline.references import check_readers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views
+from ..stages.base import stage_from
 from ..stages.checked import CheckedChoice, CheckedPoints
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
@@ -50,7 +50,7 @@ _NAMED = 3
 
 def _training_stage(given: Mapping[str, Any]) -> ClassifierModel:
     """The stage that trains."""
-    return cast(ClassifierModel, expand_stage(dict(given)).stage)
+    return cast(ClassifierModel, stage_from(given))
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
