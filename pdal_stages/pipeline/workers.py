@@ -266,5 +266,7 @@ def each_file(function: Callable[..., Any], work: Sequence[tuple], workers: int 
                 failed.append(answer.reason)
             else:
                 yield answer.result
+    if failed and len(work) == 1:
+        raise StageError(failed[0])
     if failed:
         raise StageError(f"{len(failed)} of {len(work)} inputs cannot be read", found="; ".join(failed[:3]))
