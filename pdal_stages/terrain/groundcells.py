@@ -22,7 +22,16 @@ from .cells import HOLE, CellWindow, cell_numbers, lowest_points
 from .decks import BESIDE, CELL
 from .decks import REACH as DECKS_REACH
 from .hillside import roofs_of_hillsides
-from .openings import JUMP, LINK, WALL, objects_of, opening_radius, plateau_reach, remove_plateaus
+from .openings import (
+    JUMP,
+    LINK,
+    WALL,
+    objects_of,
+    opening_radius,
+    plateau_reach,
+    remove_plateaus,
+    wide_radius,
+)
 from .planes import GroundRaster, from_parents, planes_of_blocks
 from .planes import reach as planes_reach
 
@@ -95,11 +104,12 @@ class FilterOptions:
     def reach(self) -> int:
         """How far away, in cells, lowest points can change which cells are ground, and how high.
 
-        An opening looks twice its radius away, a plateau as far as it is wide; low outliers are judged before, and surfaces
-        fitted through ground between.
+        An opening looks twice its radius away, and how steep land is as far again; a plateau looks as far as it is wide; low
+        outliers are judged before, and surfaces fitted through ground between.
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
-        found = pits_reach(self.cell) + 2 * self.largest_radius + plateau_reach(self.cell) + surfaces + 2
+        looked = 2 * max(self.largest_radius, 2 * wide_radius(self.radius, self.cell))
+        found = pits_reach(self.cell) + looked + plateau_reach(self.cell) + surfaces + 2
         return max(found, self.reach_of_decks) if self.decks else found
 
     @property
@@ -176,7 +186,7 @@ def ground_raster(
     bad = pits(raster, highest.reshape(shape), cell)
     pit_points = lowest[bad]
     raster[bad] = HOLE
-    objects, floor, opened, wide = objects_of(
+    objects, floor, opened, steep = objects_of(
         raster, cell, options.slope, options.radius, options.opening_radii
     )
     step = planes_reach(options.levels(NEAR))
@@ -184,8 +194,8 @@ def ground_raster(
     wanted = wanted or window
     kept = wanted.grown(plateaus + ROUNDS * step).within(window)
     part = kept.on(window)
-    cut_out: list = [np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor, wide)]
-    lowest, raster, objects, floor, wide = cut_out
+    cut_out: list = [np.ascontiguousarray(a[part]) for a in (lowest, raster, objects, floor, steep)]
+    lowest, raster, objects, floor, steep = cut_out
     del cut_out
     opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
     held = lowest >= 0
@@ -198,28 +208,15 @@ def ground_raster(
     ground = np.isfinite(raster) & ~objects
     told = GroundRaster(kept, raster, place, ground, floor, opened)
 
-    def near(cells: NDArray[np.int64], block: float) -> NDArray[np.bool_]:
-        """Which of the cells lie near the surface that is made from such blocks of the ground found so far."""
-        blocks = planes_of_blocks(told, options.levels(block), STEEP * cell)
-        rest = np.isfinite(raster) & ~ground
-        return _near(cells, place, rest, *blocks, *kept[:2], cell, options.threshold, options.scalar)
-
-    def within(cells: NDArray[np.int64], by: int) -> NDArray[np.int64]:
-        """Those of the cells that are wanted, or so many away."""
-        seen = np.zeros(raster.shape, bool)
-        seen[wanted.grown(by).within(kept).on(kept)] = True
-        return cells[seen.ravel()[cells]]
-
     for number in range(1, ROUNDS + 1):
-        asked = np.flatnonzero(np.isfinite(raster) & ~ground)
-        asked = within(asked, plateaus + (ROUNDS - number) * step)
-        ground.ravel()[asked[near(asked, NEAR)]] = True
-    # What lies above a scarp may be cut off uphill by the rim of the cloud. It looks no farther than plateaus do.
-    cut = within(np.flatnonzero(wide & ~ground), 0)
-    if cut.size:
-        cut = cut[near(cut, FAR)]
+        blocks = planes_of_blocks(told, options.levels(NEAR), STEEP * cell)
+        rest, seen = np.isfinite(raster) & ~ground, np.zeros(raster.shape, bool)
+        seen[wanted.grown(plateaus + (ROUNDS - number) * step).within(kept).on(kept)] = True
+        asked = np.flatnonzero(rest & seen)
+        near = _near(asked, place, rest, *blocks, *kept[:2], cell, options.threshold, options.scalar)
+        ground.ravel()[asked[near]] = True
     below = roofs_of_hillsides(ground, raster, cell)
-    remove_plateaus(ground, floor, raster, cell, cut)
+    remove_plateaus(ground, floor, raster, steep, cell)
     roofs = ground & (below != HOLE)
     ground[roofs], floor[roofs] = False, below[roofs]
     # The terrain runs below: no level of a deck stands for it either.

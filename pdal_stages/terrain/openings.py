@@ -24,8 +24,8 @@ from .cells import HOLE, linked_cells
 
 #: Drops beyond this, in meters, are objects however large the window: halls are not higher for being wider.
 LARGEST_DROP = 3.5
-#: What only windows of a larger radius show, in meters, is a hall, or it is land that the rim of the cloud cuts off uphill.
-WIDE = 24.0
+#: Windows from this radius on, in meters, show halls. How steep the land is, is seen in the first of them.
+WIDE = 20.0
 
 
 def opening_radius(window: float, cell: float) -> int:
@@ -83,15 +83,38 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
     return np.ascontiguousarray(rows)
 
 
+def wide_radius(window: int, cell: float) -> int:
+    """The first radius, in cells, from `WIDE` on; 0 where the largest `window` is smaller."""
+    return next((radius for radius in opening_radii(window) if radius * cell >= WIDE), 0)
+
+
+def _steepness(
+    heights: NDArray[np.float32], opened: NDArray[Any], measured: NDArray[np.bool_], radius: int
+) -> NDArray[np.float32]:
+    """How steep the land is round each cell (h, w), in meters per cell.
+
+    That is how far it goes both up and down within `radius` cells of one of those as near: a hall goes only up or down.
+    `opened` (h, w) are the ranks of its `heights`.
+    """
+    steps, last = _steps(min(radius, sum(opened.shape))), len(heights) - 1
+    level = heights[opened[measured]]
+    up = heights[highest_around(opened * measured, *steps)[measured]] - level
+    down = level - heights[last - highest_around((last - opened) * measured, *steps)[measured]]
+    steep = np.zeros(opened.shape, np.float32)
+    steep[measured] = np.minimum(up, down) / np.float32(radius)
+    return highest_around(steep, *steps)
+
+
 def objects_of(
     raster: NDArray[np.float32], cell: float, slope: float, window: int, keep: Collection[int] = ()
-) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]], NDArray[np.float32]]:
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
-    `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in meters. `window` is the
-    largest radius and `keep` lists radii whose openings are wanted, in cells. Returned are the objects (h, w), what the
-    opening that showed an object left there (elsewhere the cell's own height), the openings of `keep`, and which objects
-    only windows beyond `WIDE` show.
+    Wide windows lower steep land that the rim of the cloud cuts off uphill, too: what they show is lowered by more than
+    such land falls within their radius. `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's
+    side, are in meters. `window` is the largest radius and `keep` lists radii whose openings are wanted, in cells. Returned
+    are the objects (h, w), what the opening that showed an object left there (elsewhere the cell's own height), the
+    openings of `keep`, and how steep the land is (h, w), in meters per cell.
     """
     measured = raster != HOLE
     # Heights by their rank: that takes half the bytes, and order is all that openings look at.
@@ -101,27 +124,30 @@ def objects_of(
     most = measured * np.min_scalar_type(last).type(last)
     upended = np.zeros_like(most)
     upended[measured] = last - 1 - rank
-    objects, wide = np.zeros((2, *raster.shape), bool)
+    objects, steep = np.zeros(raster.shape, bool), np.zeros(raster.shape, np.float32)
     floor, openings = raster.copy(), {}
     rest, before, taken = np.flatnonzero(measured), raster[measured], (0, 0)
     # An opening lowers nothing by more than all heights differ.
     drops = {r: np.float32(min(slope * r * cell, LARGEST_DROP)) for r in opening_radii(window)}
     drops = {radius: drop for radius, drop in drops.items() if drop < heights[-2] - heights[1]}
-    for radius in sorted({*drops, *keep}):
+    wide = wide_radius(window, cell)
+    for radius in sorted({*drops, *keep, wide} - {0}):
         squares, diamonds = _steps(min(radius, sum(raster.shape)))
         upended = highest_around(upended, squares - taken[0], diamonds - taken[1])
         taken = squares, diamonds
         opened = highest_around(np.minimum(last - upended, most), squares, diamonds)
         if radius in keep:
             openings[radius] = heights[opened]
+        if radius == wide:
+            steep = _steepness(heights, opened, measured, radius)
         if radius in drops:
             after = heights[opened.ravel()[rest]]
-            lowered = before - after > drops[radius]
+            lowered = before - after > np.maximum(drops[radius], np.float32(radius) * steep.ravel()[rest])
             found = rest[lowered]
-            objects.ravel()[found], wide.ravel()[found] = True, radius * cell > WIDE
+            objects.ravel()[found] = True
             floor.ravel()[found] = after[lowered]
             rest, before = rest[~lowered], after[~lowered]
-    return objects, floor, openings, wide
+    return objects, floor, openings, steep
 
 
 def opening_names(windows: Sequence[float]) -> list[str]:
@@ -157,8 +183,8 @@ WIDEST = 200.0
 STEP, GRADE = 0.75, 0.3
 #: How far apart cells are linked, and how far beyond an edge ground is looked for, in cells.
 LINK, BEYOND = 4, 8
-#: A jump down has more than so many meters, and more than so much per meter of distance.
-JUMP, WALL = 1.5, 0.75
+#: A jump down has more than so many meters, more than so much per meter of distance, and so often what steep land falls.
+JUMP, WALL, STEEPER = 1.5, 0.75, 2.0
 #: The share of a set's cells that must have been taken for ground: a few are more likely ground among treetops.
 FOOTING = 0.05
 #: Lower ground must lie in so many of 16 directions from the middle, and be such a share of the ground that is lower or
@@ -189,7 +215,7 @@ def direction(sums, j, i):
 
 
 @njit
-def _look_around(number, asked, ground, raster, cell, sums, sectors, around, level, uphill):
+def _look_around(number, asked, ground, raster, wall, sums, sectors, around, level, uphill):
     """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level.
 
     And of the set's own ground, twice how often other ground lies a jump higher, less how often it lies a jump lower.
@@ -205,7 +231,7 @@ def _look_around(number, asked, ground, raster, cell, sums, sectors, around, lev
                     if not ground[y, x] or number[y, x] == k:
                         continue
                     drop = raster[j, i] - raster[y, x]
-                    jump = max(JUMP, WALL * cell * np.sqrt(float((y - j) ** 2 + (x - i) ** 2)))
+                    jump = max(JUMP, wall[j, i] * np.sqrt(float((y - j) ** 2 + (x - i) ** 2)))
                     if ground[j, i]:
                         uphill[k] += 2 * (drop < -jump) - (drop > jump)
                     if drop > jump:
@@ -217,12 +243,12 @@ def _look_around(number, asked, ground, raster, cell, sums, sectors, around, lev
 
 
 def remove_plateaus(
-    ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, cell: float, more: np.ndarray
+    ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, steep: np.ndarray, cell: float
 ) -> None:
     """Take plateaus from the `ground` (h, w) of a minimum grid; what lies around them becomes their `floor`.
 
-    `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere. `more` cells,
-    numbered row by row, become ground where they are of no plateau, and show none.
+    `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere. `steep` (h, w)
+    is how steep the land is, in meters per cell.
     """
     number, size, side = linked_cells(raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away))
     count, sums = len(size), sums_of_sets(number, size)
@@ -230,11 +256,11 @@ def remove_plateaus(
     asked = (grounds > FOOTING * size) & (side < int(WIDEST / cell))
     sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
     uphill = np.zeros(count, np.int64)
-    _look_around(number, asked, ground, raster, cell, sums, sectors, around, level, uphill)
+    wall = np.maximum(WALL * cell, STEEPER * steep)
+    _look_around(number, asked, ground, raster, wall, sums, sectors, around, level, uphill)
     lower = around[:, 0]
     plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
     level[plateau] /= lower[plateau]
-    ground.ravel()[more] = True
     taken = ground & np.append(plateau, False)[number]
     ground[taken] = False
     floor[taken] = level[number[taken]]
