@@ -66,26 +66,41 @@ def raster_with_holes(seed, shape, holes=0.3):
     return raster
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38)])
-def test_openings_and_objects_equal_the_slow_reference(shape):
-    raster = raster_with_holes(1, shape)
-    window = 21
-    objects, floor, opened, wide = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
+def slow_steepness(opened, measured, radius):
+    def around(heights, how, rest):
+        return how(np.where(measured, heights, rest), footprint=octagon(radius), mode="constant", cval=rest)
+
+    highest = around(opened, ndimage.grey_dilation, np.float32(-np.inf))
+    lowest = around(opened, ndimage.grey_erosion, np.float32(np.inf))
+    with np.errstate(invalid="ignore"):
+        both = np.minimum(highest - opened, opened - lowest) / np.float32(radius)
+    return around(both, ndimage.grey_dilation, np.float32(0.0))
+
+
+@pytest.mark.parametrize(
+    ("shape", "rise"),
+    [((1, 1), 0), ((1, 40), 1), ((33, 2), 0), ((45, 38), 0), ((45, 38), 0.8), ((60, 50), 1.7)],
+)
+def test_openings_and_objects_equal_the_slow_reference(shape, rise):
+    raster = raster_with_holes(1, shape) + np.arange(shape[1], dtype=np.float32) * np.float32(rise)
+    window, measured = 21, np.isfinite(raster)
+    objects, floor, opened, steep = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
     for radius in range(1, 25):
         assert np.array_equal(opened[radius], slow_opening(raster, radius)), radius
-    want, want_wide, want_floor, before = np.zeros(shape, bool), np.zeros(shape, bool), raster.copy(), raster
+    want, want_floor, before, want_steep = np.zeros(shape, bool), raster.copy(), raster, np.zeros(shape)
     for radius in opening_radii(window):
         after = slow_opening(raster, radius)
+        if radius == min(r for r in opening_radii(window) if 1.5 * r >= 20):
+            want_steep = slow_steepness(after, measured, radius)
         with np.errstate(invalid="ignore"):
-            drop = before - after > np.float32(min(0.1 * radius * 1.5, LARGEST_DROP))
-        new = drop & ~want & np.isfinite(raster)
+            drop = before - after > np.maximum(min(0.1 * radius * 1.5, LARGEST_DROP), radius * want_steep)
+        new = drop & ~want & measured
         want_floor[new] = after[new]
         want |= new
-        if 1.5 * radius > 24:
-            want_wide |= new
         before = after
-    assert np.array_equal(objects, want) and np.array_equal(wide, want_wide)
+    assert np.array_equal(objects, want) and np.array_equal(steep, want_steep)
     assert np.array_equal(floor, want_floor)
+    assert (steep.max() > 0.5) == (shape[1] > 2 and rise > 0.5)
 
 
 def slow_planes(cells, level, floor, at):
@@ -190,7 +205,7 @@ def turn_of(place, middle):
     return int(np.floor(16 * (np.arctan2(*np.subtract(place, middle)) / (2 * np.pi) + 1))) % 16
 
 
-def slow_plateaus(ground, raster, cell):
+def slow_plateaus(ground, raster, steep, cell):
     """Ground cells of plateaus, and the level around them, by walking."""
     cells, taken = heights_of(raster), {}
     for members in walked(cells, cell, 4):
@@ -206,7 +221,7 @@ def slow_plateaus(ground, raster, cell):
                     jump = max(1.5, 0.75 * cell * far)
                     if ground[here]:
                         uphill += 1.0 if drop < -jump else -0.5 if drop > jump else 0.0
-                    if drop > jump:
+                    if drop > max(jump, 2 * steep[here] * far):
                         lower.append(cells[other])
                         directions.add(turn_of(other, middle))
                     elif abs(drop) < 0.75:
@@ -230,8 +245,9 @@ def test_plateaus_equal_the_slow_reference(seed):
     raster[rng.random((h, w)) < (0.2 + 0.1 * seed)] = np.inf
     ground = np.isfinite(raster) & (rng.random((h, w)) < 0.7)
     left, floor = ground.copy(), raster.copy()
-    remove_plateaus(left, floor, raster, cell, np.empty(0, np.int64))
-    want = slow_plateaus(ground, raster, cell)
+    steep = np.where(i < w / 2, 0.0, rng.uniform(0, 2, (h, w))).astype(np.float32)
+    remove_plateaus(left, floor, raster, steep, cell)
+    want = slow_plateaus(ground, raster, steep, cell)
     assert {tuple(map(int, at)) for at in np.argwhere(ground & ~left)} == set(want)
     assert [floor[at] for at in want] == pytest.approx(list(want.values()), abs=1e-4)
     assert seed % 3 == 2 or want

@@ -215,7 +215,7 @@ def direction(sums, j, i):
 
 
 @njit
-def _look_around(number, asked, ground, raster, wall, sums, sectors, around, level, uphill):
+def _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill):
     """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level.
 
     And of the set's own ground, twice how often other ground lies a jump higher, less how often it lies a jump lower.
@@ -231,10 +231,11 @@ def _look_around(number, asked, ground, raster, wall, sums, sectors, around, lev
                     if not ground[y, x] or number[y, x] == k:
                         continue
                     drop = raster[j, i] - raster[y, x]
-                    jump = max(JUMP, wall[j, i] * np.sqrt(float((y - j) ** 2 + (x - i) ** 2)))
+                    far = np.sqrt(float((y - j) ** 2 + (x - i) ** 2))
+                    jump = max(JUMP, WALL * cell * far)
                     if ground[j, i]:
                         uphill[k] += 2 * (drop < -jump) - (drop > jump)
-                    if drop > jump:
+                    if drop > max(jump, STEEPER * steep[j, i] * far):
                         around[k, 0] += 1
                         level[k] += raster[y, x]
                         sectors[k, direction(sums[k], y, x)] = True
@@ -256,8 +257,7 @@ def remove_plateaus(
     asked = (grounds > FOOTING * size) & (side < int(WIDEST / cell))
     sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
     uphill = np.zeros(count, np.int64)
-    wall = np.maximum(WALL * cell, STEEPER * steep)
-    _look_around(number, asked, ground, raster, wall, sums, sectors, around, level, uphill)
+    _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill)
     lower = around[:, 0]
     plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
     level[plateau] /= lower[plateau]
