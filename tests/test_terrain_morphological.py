@@ -93,7 +93,9 @@ def test_openings_and_objects_equal_the_slow_reference(shape, rise):
         if radius == min(r for r in opening_radii(window) if 1.5 * r >= 20):
             want_steep = slow_steepness(after, measured, radius)
         with np.errstate(invalid="ignore"):
-            drop = before - after > np.maximum(min(0.1 * radius * 1.5, LARGEST_DROP), radius * want_steep)
+            drop = before - after > np.maximum(
+                min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * radius * want_steep
+            )
         new = drop & ~want & measured
         want_floor[new] = after[new]
         want |= new
@@ -382,14 +384,20 @@ def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground():
 
 
 def test_rock_steps_on_a_steep_slope_are_ground(monkeypatch):
-    """From level planes no ground is regained uphill of where openings took all of it."""
+    """Openings take it where nobody asks how steep the land is, and less is regained from level planes."""
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 200, (2, 40_000))
     steps = 4 * np.floor((x + 6 * np.sin(y / 15)) / 40)
     z = 1.2 * x + 2 * np.sin(x / 9) * np.cos(y / 13) + steps + rng.normal(0, 0.2, len(x))
-    assert (filtered_ground(x, y, z)["Ground"] == 0).mean() < 0.08
+
+    def missed():
+        return (filtered_ground(x, y, z)["Ground"] == 0).mean()
+
+    assert missed() < 0.02
+    monkeypatch.setattr(openings, "WIDE", np.inf)
+    assert 0.1 < missed() < 0.2
     monkeypatch.setattr(groundcells, "STEEP", np.inf)
-    assert (filtered_ground(x, y, z)["Ground"] == 0).mean() > 0.2
+    assert missed() > 0.2
 
 
 # ---- what must hold --------------------------------------------------------------------------------------

@@ -24,8 +24,9 @@ from .cells import HOLE, linked_cells
 
 #: Drops beyond this, in meters, are objects however large the window: halls are not higher for being wider.
 LARGEST_DROP = 3.5
-#: Windows from this radius on, in meters, show halls. How steep the land is, is seen in the first of them.
-WIDE = 20.0
+#: Windows from this radius on, in meters, show halls; how steep the land is, is seen in the first of them. A hall is also
+#: lowered by more than such a share of what the land falls within the radius.
+WIDE, FALLS = 20.0, 0.5
 
 
 def opening_radius(window: float, cell: float) -> int:
@@ -110,8 +111,8 @@ def objects_of(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]], NDArray[np.float32]]:
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
-    Wide windows lower steep land that the rim of the cloud cuts off uphill, too: what they show is lowered by more than
-    such land falls within their radius. `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's
+    Wide windows also lower steep land that the rim of the cloud cuts off uphill, so there they must lower by more (see
+    `WIDE`). `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's
     side, are in meters. `window` is the largest radius and `keep` lists radii whose openings are wanted, in cells. Returned
     are the objects (h, w), what the opening that showed an object left there (elsewhere the cell's own height), the
     openings of `keep`, and how steep the land is (h, w), in meters per cell.
@@ -142,7 +143,9 @@ def objects_of(
             steep = _steepness(heights, opened, measured, radius)
         if radius in drops:
             after = heights[opened.ravel()[rest]]
-            lowered = before - after > np.maximum(drops[radius], np.float32(radius) * steep.ravel()[rest])
+            lowered = before - after > np.maximum(
+                drops[radius], np.float32(FALLS * radius) * steep.ravel()[rest]
+            )
             found = rest[lowered]
             objects.ravel()[found] = True
             floor.ravel()[found] = after[lowered]
