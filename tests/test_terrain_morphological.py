@@ -96,7 +96,8 @@ def test_openings_and_objects_equal_the_slow_reference(shape, rise):
             drop = before - after > np.maximum(
                 min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * radius * want_steep
             )
-        new = drop & ~want & measured
+            again = before - after > np.maximum(LARGEST_DROP, 2 * radius * want_steep)
+        new = measured & np.where(want, again & (1.5 * radius >= 20), drop)
         want_floor[new] = after[new]
         want |= new
         before = after

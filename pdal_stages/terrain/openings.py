@@ -25,8 +25,8 @@ from .cells import HOLE, linked_cells
 #: Drops beyond this, in meters, are objects however large the window: halls are not higher for being wider.
 LARGEST_DROP = 3.5
 #: Windows from this radius on, in meters, show halls; how steep the land is, is seen in the first of them. A hall is also
-#: lowered by more than such a share of what the land falls within the radius.
-WIDE, FALLS = 20.0, 0.5
+#: lowered by more than such a share of what the land falls within the radius, and walls by so many times that.
+WIDE, FALLS, STEEPER = 20.0, 0.5, 2.0
 
 
 def opening_radius(window: float, cell: float) -> int:
@@ -106,16 +106,28 @@ def _steepness(
     return highest_around(steep, *steps)
 
 
+@njit
+def _lower(fall, land, drop, again, after, below, found):
+    """Find cells (n,) that an opening lowers by more than `drop`, or `again` by more than that; what is then `below` them.
+
+    `fall` is by how much they fall to what is there `after`, and `land` how far steep land falls.
+    """
+    for k in range(len(fall)):
+        if fall[k] > (max(again, STEEPER * land[k]) if found[k] else max(drop, FALLS * land[k])):
+            below[k], found[k] = after[k], True
+
+
 def objects_of(
     raster: NDArray[np.float32], cell: float, slope: float, window: int, keep: Collection[int] = ()
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]], NDArray[np.float32]]:
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
     Wide windows also lower steep land that the rim of the cloud cuts off uphill, so there they must lower by more (see
-    `WIDE`). `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's
-    side, are in meters. `window` is the largest radius and `keep` lists radii whose openings are wanted, in cells. Returned
-    are the objects (h, w), what the opening that showed an object left there (elsewhere the cell's own height), the
-    openings of `keep`, and how steep the land is (h, w), in meters per cell.
+    `WIDE`). What an opening leaves of an object may be a lower roof or treetop: wider ones take that as well, down a wall.
+    `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in meters. `window` is the
+    largest radius and `keep` lists radii whose openings are wanted, in cells. Returned are the objects (h, w), what openings
+    left there (elsewhere the cell's own height), the openings of `keep`, and how steep the land is (h, w), in meters per
+    cell.
     """
     measured = raster != HOLE
     # Heights by their rank: that takes half the bytes, and order is all that openings look at.
@@ -125,9 +137,9 @@ def objects_of(
     most = measured * np.min_scalar_type(last).type(last)
     upended = np.zeros_like(most)
     upended[measured] = last - 1 - rank
-    objects, steep = np.zeros(raster.shape, bool), np.zeros(raster.shape, np.float32)
-    floor, openings = raster.copy(), {}
-    rest, before, taken = np.flatnonzero(measured), raster[measured], (0, 0)
+    openings, taken, steep = {}, (0, 0), np.zeros(raster.shape, np.float32)
+    cells, before = np.flatnonzero(measured), raster[measured]
+    below, found, land = before.copy(), np.zeros(len(cells), bool), np.zeros(len(cells), np.float32)
     # An opening lowers nothing by more than all heights differ.
     drops = {r: np.float32(min(slope * r * cell, LARGEST_DROP)) for r in opening_radii(window)}
     drops = {radius: drop for radius, drop in drops.items() if drop < heights[-2] - heights[1]}
@@ -141,15 +153,14 @@ def objects_of(
             openings[radius] = heights[opened]
         if radius == wide:
             steep = _steepness(heights, opened, measured, radius)
+            land = steep[measured]
         if radius in drops:
-            after = heights[opened.ravel()[rest]]
-            lowered = before - after > np.maximum(
-                drops[radius], np.float32(FALLS * radius) * steep.ravel()[rest]
-            )
-            found = rest[lowered]
-            objects.ravel()[found] = True
-            floor.ravel()[found] = after[lowered]
-            rest, before = rest[~lowered], after[~lowered]
+            after = heights[opened.ravel()[cells]]
+            again = LARGEST_DROP if 0 < wide <= radius else np.inf
+            _lower(before - after, np.float32(radius) * land, drops[radius], again, after, below, found)
+            before = after
+    objects, floor = np.zeros(raster.shape, bool), raster.copy()
+    objects[measured], floor[measured] = found, below
     return objects, floor, openings, steep
 
 
@@ -186,8 +197,8 @@ WIDEST = 200.0
 STEP, GRADE = 0.75, 0.3
 #: How far apart cells are linked, and how far beyond an edge ground is looked for, in cells.
 LINK, BEYOND = 4, 8
-#: A jump down has more than so many meters, more than so much per meter of distance, and so often what steep land falls.
-JUMP, WALL, STEEPER = 1.5, 0.75, 2.0
+#: A jump down has more than so many meters, and more than so much per meter of distance.
+JUMP, WALL = 1.5, 0.75
 #: The share of a set's cells that must have been taken for ground: a few are more likely ground among treetops.
 FOOTING = 0.05
 #: Lower ground must lie in so many of 16 directions from the middle, and be such a share of the ground that is lower or
