@@ -59,30 +59,21 @@ def slow_opening(raster, radius):
     return ndimage.grey_dilation(centers, footprint=octagon(radius), mode="constant", cval=-np.inf)
 
 
-def raster_with_holes(seed, shape, holes=0.3):
-    rng = np.random.default_rng(seed)
-    raster = rng.normal(0, 3, shape).astype(np.float32)
-    raster[rng.random(shape) < holes] = np.inf
-    return raster
-
-
 def slow_steepness(opened, measured, radius):
-    def around(heights, how, rest):
-        return how(np.where(measured, heights, rest), footprint=octagon(radius), mode="constant", cval=rest)
-
-    highest = around(opened, ndimage.grey_dilation, np.float32(-np.inf))
-    lowest = around(opened, ndimage.grey_erosion, np.float32(np.inf))
-    with np.errstate(invalid="ignore"):
-        both = np.minimum(highest - opened, opened - lowest) / np.float32(radius)
-    return around(both, ndimage.grey_dilation, np.float32(0.0))
+    form = {"footprint": octagon(radius), "mode": "constant"}
+    highest = ndimage.grey_dilation(np.where(measured, opened, -np.inf), cval=-np.inf, **form)
+    lowest = ndimage.grey_erosion(np.where(measured, opened, np.inf), cval=np.inf, **form)
+    both = np.minimum(highest - opened, opened - lowest) / np.float32(radius)
+    return ndimage.grey_dilation(np.where(measured, both, 0), cval=0, **form)
 
 
-@pytest.mark.parametrize(
-    ("shape", "rise"),
-    [((1, 1), 0), ((1, 40), 1), ((33, 2), 0), ((45, 38), 0), ((45, 38), 0.8), ((60, 50), 1.7)],
-)
-def test_openings_and_objects_equal_the_slow_reference(shape, rise):
-    raster = raster_with_holes(1, shape) + np.arange(shape[1], dtype=np.float32) * np.float32(rise)
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38), (60, 50)])
+@np.errstate(invalid="ignore")
+def test_openings_and_objects_equal_the_slow_reference(shape):
+    """The last of them is as steep as mountains."""
+    rng = np.random.default_rng(1)
+    raster = (rng.normal(0, 3, shape) + np.arange(shape[1]) * 1.7 * (shape[0] == 60)).astype(np.float32)
+    raster[rng.random(shape) < 0.3] = np.inf
     window, measured = 21, np.isfinite(raster)
     objects, floor, opened, steep = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
     for radius in range(1, 25):
@@ -90,20 +81,16 @@ def test_openings_and_objects_equal_the_slow_reference(shape, rise):
     want, want_floor, before, want_steep = np.zeros(shape, bool), raster.copy(), raster, np.zeros(shape)
     for radius in opening_radii(window):
         after = slow_opening(raster, radius)
-        if radius == min(r for r in opening_radii(window) if 1.5 * r >= 20):
+        if radius == 14:  # the first of 20 m
             want_steep = slow_steepness(after, measured, radius)
-        with np.errstate(invalid="ignore"):
-            drop = before - after > np.maximum(
-                min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * radius * want_steep
-            )
-            again = before - after > np.maximum(LARGEST_DROP, 2 * radius * want_steep)
-        new = measured & np.where(want, again & (1.5 * radius >= 20), drop)
+        drop = before - after > np.maximum(min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * radius * want_steep)
+        again = before - after > np.maximum(LARGEST_DROP, 2 * radius * want_steep)
+        new = measured & np.where(want, again & (radius >= 14), drop)
         want_floor[new] = after[new]
         want |= new
         before = after
-    assert np.array_equal(objects, want) and np.array_equal(steep, want_steep)
-    assert np.array_equal(floor, want_floor)
-    assert (steep.max() > 0.5) == (shape[1] > 2 and rise > 0.5)
+    for one, other in ((objects, want), (steep, want_steep), (floor, want_floor)):
+        assert np.array_equal(one, other)
 
 
 def slow_planes(cells, level, floor, at):
@@ -390,15 +377,10 @@ def test_rock_steps_on_a_steep_slope_are_ground(monkeypatch):
     x, y = rng.uniform(0, 200, (2, 40_000))
     steps = 4 * np.floor((x + 6 * np.sin(y / 15)) / 40)
     z = 1.2 * x + 2 * np.sin(x / 9) * np.cos(y / 13) + steps + rng.normal(0, 0.2, len(x))
-
-    def missed():
-        return (filtered_ground(x, y, z)["Ground"] == 0).mean()
-
-    assert missed() < 0.02
-    monkeypatch.setattr(openings, "WIDE", np.inf)
-    assert 0.1 < missed() < 0.2
-    monkeypatch.setattr(groundcells, "STEEP", np.inf)
-    assert missed() > 0.2
+    for wide, steep, missed in ((20.0, 0.5, 0.0), (np.inf, 0.5, 0.1), (np.inf, np.inf, 0.2)):
+        monkeypatch.setattr(openings, "WIDE", wide)
+        monkeypatch.setattr(groundcells, "STEEP", steep)
+        assert missed <= (filtered_ground(x, y, z)["Ground"] == 0).mean() < missed + 0.1
 
 
 # ---- what must hold --------------------------------------------------------------------------------------
