@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from test_detached_noise import closed_wood
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
@@ -203,7 +204,7 @@ def slow_plateaus(ground, raster, steep, cell):
         own = [c for c in members if ground[c]]
         if len(own) <= 0.05 * len(members) or np.ptp(at, axis=0).max() >= int(200 / cell):
             continue
-        middle, lower, level, directions, uphill = at.mean(axis=0), [], 0, set(), 0
+        middle, lower, level, directions, uphill, rim = at.mean(axis=0), [], 0, set(), 0, set()
         for here in members:
             for other in square(here, 8):
                 if other in cells and ground[other] and other not in members:
@@ -214,9 +215,15 @@ def slow_plateaus(ground, raster, steep, cell):
                     if drop > max(jump, 2 * steep[here] * far):
                         lower.append(cells[other])
                         directions.add(turn_of(other, middle))
+                        rim |= {here} if far < 3 else set()
                     elif abs(drop) < 0.75:
                         level += 1
-        if len(directions) >= 14 and len(lower) >= 0.8 * (len(lower) + level) and uphill <= 0:
+        if (
+            len(directions) >= 14
+            and len(lower) >= 0.8 * (len(lower) + level)
+            and uphill <= 0
+            and len(rim) <= 14 * len(members) ** 0.5
+        ):
             taken |= dict.fromkeys(own, np.mean(lower))
     return taken
 
@@ -340,35 +347,16 @@ def test_a_roof_is_no_ground_whatever_its_width_and_steps():
     assert (np.abs(ground_of(-0.6 * np.abs(x - y))[1]) < 1).mean() > 0.97
 
 
-def forest_on_a_slope(slope, turn=0.0, scarp=0.0, seed=0):
-    """6 points/m2 of 100 x 100 m, of which few reach the ground, in gaps: coordinates, and which are ground."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0, 100, (2, 60_000))
-    c, s = np.cos(turn), np.sin(turn)
-    up, across = c * (x - 50) + s * (y - 50), c * (y - 50) - s * (x - 50)
-    z = slope * up + np.sin(up / 9) * np.cos(across / 13) + rng.normal(0, 0.05, len(x))
-    z += scarp / (1 + np.exp((10 - up) / 1.8))
-    gaps, crowns = rng.beta(1.2, 1.2, (20, 20)), rng.uniform(12, 26, (20, 20))
-    at = (y / 6).astype(int), (x / 6).astype(int)
-    hit = rng.random(len(x)) > 0.1 * gaps[at]
-    share = np.where(rng.random(len(x)) < 0.85, rng.beta(5, 1.3, len(x)), rng.random(len(x)))
-    return x, y, z + np.where(hit, crowns[at] * share, 0.0), ~hit
-
-
-def test_a_steep_wooded_slope_is_no_plateau():
-    """From cells of ground that are not linked to the others it goes down in all directions, but up as well."""
-    x, y, z, ground = forest_on_a_slope(1.0)
-    found = filtered_ground(x, y, z)
-    assert found["Ground"][ground].mean() > 0.99
-    assert np.abs(found["HeightAboveGround"][ground]).mean() < 0.2
-
-
-def test_land_above_a_scarp_that_the_rim_cuts_off_is_ground():
-    """All windows round it reach below the scarp, as there is nothing uphill to center others on."""
-    x, y, z, ground = forest_on_a_slope(0.46, 0.5, 12.0)
-    found = filtered_ground(x, y, z)
-    assert (found["Ground"][ground] == 0).mean() < 0.006
-    assert np.abs(found["HeightAboveGround"][ground]).max() < 2  # no treetops stand for it
+@pytest.mark.parametrize(
+    ("slope", "scarp", "seen"), [(1.0, 0.0, 0.05), (0.46, 12.0, 0.05), (0.46, 12.0, 0.1)]
+)
+def test_wooded_land_that_the_rim_cuts_off_uphill_is_ground(slope, scarp, seen):
+    """All windows round it reach far down, and from its crowns it goes down in all directions: it is no hall."""
+    xyz, ground = closed_wood(slope, seen, 6.0, 100, 1)
+    xyz[:, 2] += scarp / (1 + np.exp((10 - (xyz[:, :2] - 50) @ (0.9, 0.4)) / 1.8))
+    found = filtered_ground(xyz)
+    assert found["Ground"][ground].all()
+    assert np.abs(found["HeightAboveGround"][ground]).max() < 1.5  # no treetops stand for it
 
 
 def test_rock_steps_on_a_steep_slope_are_ground(monkeypatch):

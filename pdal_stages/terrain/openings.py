@@ -205,6 +205,8 @@ FOOTING = 0.05
 #: less than a step away, where there may be a way up; a higher story does not count. Around ground on a steep slope as
 #: much lies a jump higher as lower: from a plateau's ground, the former is no more than half of the latter.
 DIRECTIONS, SHARE = 14, 0.8
+#: At most so many cells for the root of the number of all lie at the rim: crowns have ground below them everywhere.
+RIM = 14.0
 
 
 def plateau_reach(cell: float) -> int:
@@ -229,10 +231,11 @@ def direction(sums, j, i):
 
 
 @njit
-def _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill):
+def _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim):
     """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level.
 
-    And of the set's own ground, twice how often other ground lies a jump higher, less how often it lies a jump lower.
+    And of the set's own ground, twice how often other ground lies a jump higher, less how often it lies a jump lower; and
+    how many cells lie at the rim.
     """
     h, w = number.shape
     for j in range(h):
@@ -240,6 +243,7 @@ def _look_around(number, asked, ground, raster, steep, cell, sums, sectors, arou
             k = number[j, i]
             if k < 0 or not asked[k]:
                 continue
+            at_rim = False
             for y in range(max(j - BEYOND, 0), min(j + BEYOND + 1, h)):
                 for x in range(max(i - BEYOND, 0), min(i + BEYOND + 1, w)):
                     if not ground[y, x] or number[y, x] == k:
@@ -252,9 +256,11 @@ def _look_around(number, asked, ground, raster, steep, cell, sums, sectors, arou
                     if drop > max(jump, STEEPER * steep[j, i] * far):
                         around[k, 0] += 1
                         level[k] += raster[y, x]
+                        at_rim |= far < 3.0
                         sectors[k, direction(sums[k], y, x)] = True
                     elif abs(drop) < STEP:
                         around[k, 1] += 1
+            rim[k] += at_rim
 
 
 def remove_plateaus(
@@ -270,10 +276,11 @@ def remove_plateaus(
     grounds = np.bincount(number[ground], minlength=count)
     asked = (grounds > FOOTING * size) & (side < int(WIDEST / cell))
     sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
-    uphill = np.zeros(count, np.int64)
-    _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill)
+    uphill, rim = np.zeros((2, count), np.int64)
+    _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim)
     lower = around[:, 0]
     plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
+    plateau &= rim <= RIM * np.sqrt(size)
     level[plateau] /= lower[plateau]
     taken = ground & np.append(plateau, False)[number]
     ground[taken] = False
