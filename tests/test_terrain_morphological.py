@@ -79,14 +79,14 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
     objects, floor, opened, steep = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
     for radius in range(1, 25):
         assert np.array_equal(opened[radius], slow_opening(raster, radius)), radius
-    want, want_floor, before, want_steep = np.zeros(shape, bool), raster.copy(), raster, np.zeros(shape)
+    want, want_floor, before = np.zeros(shape, bool), raster.copy(), raster
+    want_steep = slow_steepness(slow_opening(raster, 14), measured, 14)  # the first radius of 20 m
     for radius in opening_radii(window):
         after = slow_opening(raster, radius)
-        if radius == 14:  # the first of 20 m
-            want_steep = slow_steepness(after, measured, radius)
-        drop = before - after > np.maximum(min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * radius * want_steep)
-        again = before - after > np.maximum(LARGEST_DROP, 2 * radius * want_steep)
-        new = measured & np.where(want, again & (radius >= 14), drop)
+        land = radius * want_steep
+        drop = before - after > np.maximum(min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * (radius >= 14) * land)
+        again = before - after > np.maximum(LARGEST_DROP, 3 * land)
+        new = measured & np.where(want, again, drop)
         want_floor[new] = after[new]
         want |= new
         before = after
@@ -212,7 +212,7 @@ def slow_plateaus(ground, raster, steep, cell):
                     jump = max(1.5, 0.75 * cell * far)
                     if ground[here]:
                         uphill += 1.0 if drop < -jump else -0.5 if drop > jump else 0.0
-                    if drop > max(jump, 2 * steep[here] * far):
+                    if drop > max(jump, 3 * steep[here] * far):
                         lower.append(cells[other])
                         directions.add(turn_of(other, middle))
                         rim |= {here} if far < 3 else set()

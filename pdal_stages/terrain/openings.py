@@ -25,8 +25,8 @@ from .cells import HOLE, linked_cells
 #: Drops beyond this, in meters, are objects however large the window: halls are not higher for being wider.
 LARGEST_DROP = 3.5
 #: Windows from this radius on, in meters, show halls; how steep the land is, is seen in the first of them. A hall is also
-#: lowered by more than such a share of what the land falls within the radius, and walls by so many times that.
-WIDE, FALLS, STEEPER = 20.0, 0.5, 2.0
+#: lowered by more than such a share of what the land falls within the radius, and a wall is so many times as steep.
+WIDE, FALLS, STEEPER = 20.0, 0.5, 3.0
 
 
 def opening_radius(window: float, cell: float) -> int:
@@ -107,13 +107,14 @@ def _steepness(
 
 
 @njit
-def _lower(fall, land, drop, again, after, below, found):
-    """Find cells (n,) that an opening lowers by more than `drop`, or `again` by more than that; what is then `below` them.
+def _lower(fall, land, drop, falls, again, after, below, found):
+    """Find cells (n,) that an opening lowers by more than `drop` and than `falls` times what steep land falls, or once more
+    by more than `again` and than walls on it; what is then `below` them.
 
     `fall` is by how much they fall to what is there `after`, and `land` how far steep land falls.
     """
     for k in range(len(fall)):
-        if fall[k] > (max(again, STEEPER * land[k]) if found[k] else max(drop, FALLS * land[k])):
+        if fall[k] > (max(again, STEEPER * land[k]) if found[k] else max(drop, falls * land[k])):
             below[k], found[k] = after[k], True
 
 
@@ -123,7 +124,7 @@ def objects_of(
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
     Wide windows also lower steep land that the rim of the cloud cuts off uphill, so there they must lower by more (see
-    `WIDE`). What an opening leaves of an object may be a lower roof or treetop: wider ones take that as well, down a wall.
+    `WIDE`). What an opening leaves of an object may be a lower roof or treetop: wider ones take that, too, down a wall.
     `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in meters. `window` is the
     largest radius and `keep` lists radii whose openings are wanted, in cells. Returned are the objects (h, w), what openings
     left there (elsewhere the cell's own height), the openings of `keep`, and how steep the land is (h, w), in meters per
@@ -137,27 +138,30 @@ def objects_of(
     most = measured * np.min_scalar_type(last).type(last)
     upended = np.zeros_like(most)
     upended[measured] = last - 1 - rank
-    openings, taken, steep = {}, (0, 0), np.zeros(raster.shape, np.float32)
+    openings, taken = {}, (0, 0)
     cells, before = np.flatnonzero(measured), raster[measured]
-    below, found, land = before.copy(), np.zeros(len(cells), bool), np.zeros(len(cells), np.float32)
+    below, found = before.copy(), np.zeros(len(cells), bool)
     # An opening lowers nothing by more than all heights differ.
     drops = {r: np.float32(min(slope * r * cell, LARGEST_DROP)) for r in opening_radii(window)}
     drops = {radius: drop for radius, drop in drops.items() if drop < heights[-2] - heights[1]}
-    wide = wide_radius(window, cell)
-    for radius in sorted({*drops, *keep, wide} - {0}):
+    wide, again, steep = wide_radius(window, cell), np.inf, np.zeros(raster.shape, np.float32)
+    if wide:
+        steps, again = _steps(min(wide, sum(raster.shape))), LARGEST_DROP
+        opened = highest_around(np.minimum(last - highest_around(upended, *steps), most), *steps)
+        steep = _steepness(heights, opened, measured, wide)
+    land = steep[measured]
+    for radius in sorted({*drops, *keep}):
         squares, diamonds = _steps(min(radius, sum(raster.shape)))
         upended = highest_around(upended, squares - taken[0], diamonds - taken[1])
         taken = squares, diamonds
         opened = highest_around(np.minimum(last - upended, most), squares, diamonds)
         if radius in keep:
             openings[radius] = heights[opened]
-        if radius == wide:
-            steep = _steepness(heights, opened, measured, radius)
-            land = steep[measured]
         if radius in drops:
             after = heights[opened.ravel()[cells]]
-            again = LARGEST_DROP if 0 < wide <= radius else np.inf
-            _lower(before - after, np.float32(radius) * land, drops[radius], again, after, below, found)
+            falls = FALLS if 0 < wide <= radius else 0.0
+            fallen = np.float32(radius) * land
+            _lower(before - after, fallen, drops[radius], falls, again, after, below, found)
             before = after
     objects, floor = np.zeros(raster.shape, bool), raster.copy()
     objects[measured], floor[measured] = found, below
