@@ -6,7 +6,7 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 
 * the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile with its halo gets the
   bits of the whole cloud, and so does any order of the points;
-* windows grow to the size of large halls, and a drop of a few meters is enough there, but on steep land (:mod:`.openings`);
+* windows grow to the size of large halls, where a drop of a few meters is enough, except on steep land (:mod:`.openings`);
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
 * what is higher than all around it on every side is no ground (:mod:`.openings`), nor are roofs that a slope runs into
