@@ -110,6 +110,17 @@ def test_a_failure_of_every_tile_stops_the_run(tmp_path, folder):
     assert not list(tmp_path.iterdir())
 
 
+def test_what_took_a_round_is_kept_when_every_tile_fails(tmp_path, folder):
+    """The lowest points of all tiles, which --resume goes on from."""
+    fails = python_filter("if 'HeightAboveGround' in ins: raise ValueError('no')")
+    stages = pipeline(
+        folder, tmp_path / "o_#.laz", {"type": "filters.hag_morphological", "window": 12}, fails
+    )
+    with pytest.raises(StageError, match="all failed for the same reason"):
+        run_tiled(stages[:1] + stages[2:], 10, workers=0, buffer=0.0)
+    assert len(list((tmp_path / ".pdal-stages/kept").glob("*.npz"))) > 32
+
+
 # ---- disks -----------------------------------------------------------------------------------------------
 
 

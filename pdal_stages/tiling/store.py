@@ -82,8 +82,9 @@ class Store:
         return self
 
     def __exit__(self, kind: type | None, *exc: object) -> None:
-        # After an error of a first run there is nothing to resume. Whoever locks the deleted file now finds no folder.
-        useless = self._new and kind is not None and issubclass(kind, StageError)
+        # After an error of a first run there may be nothing to go on from. Whoever locks the deleted file finds no folder.
+        failed = self._new and kind is not None and issubclass(kind, StageError)
+        useless = failed and not any(self.kept.glob("*.npz"))
         shutil.rmtree(self.folder if useless else self.scratch.parent, ignore_errors=True)
         self._lock.close()  # the file stays, so that nobody locks a deleted one
 
