@@ -32,7 +32,8 @@ def cloud_of(paths: list[Path]) -> TrainingCloud:
         "NumberOfReturns": "number_of_returns",
     }
     dimensions = {
-        our: np.concatenate([np.asarray(tile[name]) for tile in tiles]) for our, name in names.items()
+        our: np.concatenate([np.asarray(tile[name]) for tile in tiles])
+        for our, name in names.items()
     }
     labels = np.concatenate([np.asarray(tile.classification) for tile in tiles])
     return TrainingCloud(xyz, labels, {**dimensions, "HeightAboveGround": hag_minima(*xyz.T)})
@@ -45,7 +46,9 @@ def main() -> None:
     parser.add_argument("--train", nargs="+", type=Path, required=True)
     parser.add_argument("--test", nargs="+", type=Path, required=True)
     parser.add_argument("--classes", type=json.loads, required=True)
-    parser.add_argument("--network", type=json.loads, default={}, help="options of the network, as JSON")
+    parser.add_argument(
+        "--network", type=json.loads, default={}, help="options of the network, as JSON"
+    )
     parser.add_argument("--dimensions", nargs="*", default=["HeightAboveGround"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=None)
@@ -57,7 +60,9 @@ def main() -> None:
     )  # fmt: skip
     started = time.process_time()
     model = train([cloud_of(args.train)], options, progress=True)
-    print(f"trained in {time.process_time() - started:.0f} s, epoch {model.info['training']['best_epoch']}")
+    print(
+        f"trained in {time.process_time() - started:.0f} s, epoch {model.info['training']['best_epoch']}"
+    )
     if args.save:
         model.save(args.save)
     test = cloud_of(args.test)

@@ -60,7 +60,9 @@ def row(
     )
 
 
-def decks(name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray) -> None:
+def decks(
+    name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray
+) -> None:
     begin = time.process_time()
     found = find_decks(*(np.ascontiguousarray(axis) for axis in xyz.T), use) > 0
     row(name, "deck", found, true, either, time.process_time() - begin)
@@ -82,7 +84,14 @@ def wires(
     if either.any() and wire.any():
         begin = time.process_time()
         tower = find_towers(xyz, height, wire, use)
-        row(name, "tower", tower, either if held is None else held, unknown, time.process_time() - begin)
+        row(
+            name,
+            "tower",
+            tower,
+            either if held is None else held,
+            unknown,
+            time.process_time() - begin,
+        )
 
 
 def main() -> None:

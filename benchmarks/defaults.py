@@ -53,8 +53,14 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "without s5": {**ONE, "neighborhoods": "k10,k20,k50"},
         "without k10": {**ONE, "neighborhoods": "s5,k20,k50"},
         "with c2": {**ONE, "neighborhoods": "c2,s5,k10,k20,k50"},
-        "without return numbers": {**ONE, "dimensions": (*DEFAULT_DIMENSIONS, *OPTIONAL_DIMENSIONS)},
-        "without heights above openings": {**ONE, "dimensions": (*DEFAULT_DIMENSIONS, "Ground", "returns")},
+        "without return numbers": {
+            **ONE,
+            "dimensions": (*DEFAULT_DIMENSIONS, *OPTIONAL_DIMENSIONS),
+        },
+        "without heights above openings": {
+            **ONE,
+            "dimensions": (*DEFAULT_DIMENSIONS, "Ground", "returns"),
+        },
         "heights above ground alone": {**ONE, "dimensions": DEFAULT_DIMENSIONS},
     },
     "surfaces": {
@@ -129,17 +135,29 @@ def held_out(data: Path) -> Iterator[tuple[str, TrainingCloud, TrainingCloud]]:
     whole = cloud(files, CODES["Montpellier"], "Montpellier")
     tile = np.repeat(np.arange(len(files)), [laspy.open(file).header.point_count for file in files])
     for number in range(len(files)):
-        yield "Montpellier", *(whole.part(np.flatnonzero(rows)) for rows in (tile != number, tile == number))
+        yield (
+            "Montpellier",
+            *(whole.part(np.flatnonzero(rows)) for rows in (tile != number, tile == number)),
+        )
     for scene, file in THIRDS.items():
         whole = cloud([data / file], CODES[scene], scene)
         third = np.searchsorted(np.quantile(whole.xyz[:, 1], [1 / 3, 2 / 3]), whole.xyz[:, 1])
         for number in range(3):
-            yield scene, *(whole.part(np.flatnonzero(rows)) for rows in (third != number, third == number))
+            yield (
+                scene,
+                *(whole.part(np.flatnonzero(rows)) for rows in (third != number, third == number)),
+            )
 
 
 def options(changes: dict[str, Any], codes: tuple[int, ...], count: int) -> TrainingOptions:
     """Today's defaults with changes."""
-    given = {"dimensions": DIMENSIONS, "classes": list(codes), "count": count, "threads": 1, "folds": 0}
+    given = {
+        "dimensions": DIMENSIONS,
+        "classes": list(codes),
+        "count": count,
+        "threads": 1,
+        "folds": 0,
+    }
     return TrainingOptions(**{**given, **changes})
 
 
@@ -148,7 +166,9 @@ def run(
 ) -> list[dict[str, Any]]:
     """A line for each row."""
     found = {
-        name: {scene: np.zeros((len(codes), len(codes)), np.int64) for scene, codes in CODES.items()}
+        name: {
+            scene: np.zeros((len(codes), len(codes)), np.int64) for scene, codes in CODES.items()
+        }
         for name in rows
     }
     seconds = {name: [0.0, 0.0, 0] for name in rows}
@@ -180,7 +200,10 @@ def run(
                 "f1": 100 * accuracy.mean_f1,
                 "classes": {str(code): 100 * value for code, value in accuracy.f1.items()},
             }
-        line["training"], line["classifying"] = (seconds[name][0], 1e6 * seconds[name][1] / seconds[name][2])
+        line["training"], line["classifying"] = (
+            seconds[name][0],
+            1e6 * seconds[name][1] / seconds[name][2],
+        )
         lines.append(line)
     return lines
 
@@ -198,7 +221,8 @@ def text(tables: dict[str, list[dict[str, Any]]]) -> str:
             cells = [_figures(one["oa"], one["f1"], one["classes"].get("3")) for one in found]
             low = [one["classes"]["3"] for one in found if "3" in one["classes"]]
             mean = _figures(
-                *(statistics.fmean(one[key] for one in found) for key in ("oa", "f1")), statistics.fmean(low)
+                *(statistics.fmean(one[key] for one in found) for key in ("oa", "f1")),
+                statistics.fmean(low),
             )
             out.append(
                 f"| {line['name']} | {line['features']} | {' | '.join([*cells, mean])} | {line['training']:.0f} | "

@@ -43,7 +43,9 @@ def load(name: str, points: int, density: float) -> np.ndarray:
     if name == "town":
         from pdal_stages.synthetic import make_town
 
-        return np.ascontiguousarray(make_town(size=max((points / density) ** 0.5, 20.0), density=density).xyz)
+        return np.ascontiguousarray(
+            make_town(size=max((points / density) ** 0.5, 20.0), density=density).xyz
+        )
     import laspy
 
     return np.ascontiguousarray(laspy.read(name).xyz)
@@ -76,9 +78,18 @@ def pgeof_spheres(xyz: np.ndarray) -> None:
     import pgeof
 
     ids = pgeof.EFeatureID
-    wanted = [ids.Linearity, ids.Planarity, ids.Scattering, ids.Verticality, ids.Curvature, ids.Eigentropy]
+    wanted = [
+        ids.Linearity,
+        ids.Planarity,
+        ids.Scattering,
+        ids.Verticality,
+        ids.Curvature,
+        ids.Eigentropy,
+    ]
     for radius in RADII:
-        pgeof.compute_features_selected(xyz, radius, 100_000 if len(xyz) > 100_000 else len(xyz), wanted)
+        pgeof.compute_features_selected(
+            xyz, radius, 100_000 if len(xyz) > 100_000 else len(xyz), wanted
+        )
 
 
 def jakteristics_spheres(threads: int) -> Work:
@@ -111,7 +122,8 @@ def cases(threads: int) -> dict[str, tuple[str, Work, dict[str, Work]]]:
     cylinders = ",".join(f"c{r:g}" for r in RADII)
     near = {"pgeof": pgeof_spheres, "jakteristics": jakteristics_spheres(threads)}
     pdal_spheres = [
-        {"type": "filters.covariancefeatures", "radius": r, "feature_set": PDAL_FEATURES} for r in RADII
+        {"type": "filters.covariancefeatures", "radius": r, "feature_set": PDAL_FEATURES}
+        for r in RADII
     ]
     pdal_optimal = [{"type": "filters.optimalneighborhood", "min_k": 10, "max_k": 100}]
     return {
@@ -167,7 +179,9 @@ def pdal(stages: list[dict]) -> Work:
                 wall = time.perf_counter() - wall
                 after = resource.getrusage(resource.RUSAGE_CHILDREN)
                 if done.returncode:
-                    raise RuntimeError(f"PDAL failed ({done.returncode}): {done.stderr.strip()[:200]}")
+                    raise RuntimeError(
+                        f"PDAL failed ({done.returncode}): {done.stderr.strip()[:200]}"
+                    )
                 return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, wall
 
             base = pipeline([])
@@ -177,7 +191,9 @@ def pdal(stages: list[dict]) -> Work:
     return run
 
 
-def measure(xyz: np.ndarray, only: Iterable[str], repeats: int, threads: int, peers: bool) -> list[dict]:
+def measure(
+    xyz: np.ndarray, only: Iterable[str], repeats: int, threads: int, peers: bool
+) -> list[dict]:
     """Time every case in turns; one entry per case."""
     results = []
     for name, (what, run, others) in cases(threads).items():
@@ -226,7 +242,9 @@ def table(cloud: str, xyz: np.ndarray, results: list[dict], threads: int) -> str
             cpu, wall = zip(*times, strict=True)
             own = [o[0] for o in entry["ours"]][: len(cpu)]
             ratio = (
-                "" if who == "pdal_stages" else spread((c / o for c, o in zip(cpu, own, strict=True)), ".1f")
+                ""
+                if who == "pdal_stages"
+                else spread((c / o for c, o in zip(cpu, own, strict=True)), ".1f")
             )
             # What so many quiet cores would do, from CPU time: wall time depends on what else runs.
             cores = 1 if who == "PDAL" else threads
@@ -242,7 +260,9 @@ def main() -> None:
     )
     parser.add_argument("--cloud", nargs="+", default=["town"], help="a generated town, or files")
     parser.add_argument("--points", type=int, default=500_000, help="of the town (default 500000)")
-    parser.add_argument("--density", type=float, default=7.0, help="of the town, points per m2 (default 7)")
+    parser.add_argument(
+        "--density", type=float, default=7.0, help="of the town, points per m2 (default 7)"
+    )
     parser.add_argument("--only", nargs="+", choices=list(cases(1)), default=list(cases(1)))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--threads", type=int, default=None, help="default: every core on offer")

@@ -38,7 +38,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     base = load_model(options.base)
-    rows = [row for name in options.survey for row in scores(options.data, name, base, options.labels)]
+    rows = [
+        row for name in options.survey for row in scores(options.data, name, base, options.labels)
+    ]
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n")
 
@@ -52,7 +54,9 @@ def scores(folder: Path, name: str, base, counts):
     table = np.zeros(256, np.int64)
     table[list(becomes)] = list(becomes.values())
     label = table[np.asarray(las.classification)[there]]
-    dimensions = dict(preparation_module().made_of_coordinates(base.info["preparation"], xyz, None, None))
+    dimensions = dict(
+        preparation_module().made_of_coordinates(base.info["preparation"], xyz, None, None)
+    )
     dimensions["ReturnNumber"] = np.asarray(las.return_number)[there]
     dimensions["NumberOfReturns"] = np.asarray(las.number_of_returns)[there]
     west = xyz[:, 0] < np.median(xyz[:, 0])
@@ -68,7 +72,13 @@ def scores(folder: Path, name: str, base, counts):
 
     alone = score(base)
     print(f"{name}: base {alone:.2f}", flush=True)
-    names = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns")
+    names = (
+        "HeightAboveGround",
+        "Ground",
+        "HeightAboveOpening_5",
+        "HeightAboveOpening_17",
+        "returns",
+    )
     how = TrainingOptions(dimensions=names, folds=0)
     for count in counts:
         random, few = np.random.default_rng(count), np.zeros(len(label), np.int64)
@@ -78,8 +88,16 @@ def scores(folder: Path, name: str, base, counts):
         cloud = TrainingCloud(xyz, few, dimensions, name)
         nothing = score(train([cloud], how, progress=False))
         on_top = score(train([cloud], replace(how, base=base), progress=False))
-        print(f"{name}, {count} a class: from nothing {nothing:.2f}, on top {on_top:.2f}", flush=True)
-        yield {"survey": name, "labels": count, "base": alone, "from_nothing": nothing, "on_top": on_top}
+        print(
+            f"{name}, {count} a class: from nothing {nothing:.2f}, on top {on_top:.2f}", flush=True
+        )
+        yield {
+            "survey": name,
+            "labels": count,
+            "base": alone,
+            "from_nothing": nothing,
+            "on_top": on_top,
+        }
 
 
 if __name__ == "__main__":

@@ -56,7 +56,9 @@ CLUSTERS = (
 )  # fmt: skip
 
 
-def injected(xyz: np.ndarray, codes: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def injected(
+    xyz: np.ndarray, codes: np.ndarray, share: float, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Noise of that share of a cloud's points: coordinates, and 7 or 18."""
     rng = np.random.default_rng(seed)
     ground = xyz[codes == 2]
@@ -72,14 +74,23 @@ def injected(xyz: np.ndarray, codes: np.ndarray, share: float, seed: int) -> tup
             top = min([level, *near]) - rng.uniform(1, 30)
             part += [*at, top - part[:, 2].max()]
         else:
-            part += [*at, near.max(initial=xyz[:, 2].min()) + rng.uniform(3, 300) - part[:, 2].min()]
+            part += [
+                *at,
+                near.max(initial=xyz[:, 2].min()) + rng.uniform(3, 300) - part[:, 2].min(),
+            ]
         parts.append(part)
         kinds += [7 if low else 18] * size
     return np.round(np.vstack(parts), 3), np.array(kinds)
 
 
 def planted(
-    xyz: np.ndarray, codes: np.ndarray, size: int, extent: float, depth: float, per_hectare: int, seed: int
+    xyz: np.ndarray,
+    codes: np.ndarray,
+    size: int,
+    extent: float,
+    depth: float,
+    per_hectare: int,
+    seed: int,
 ) -> np.ndarray:
     """Clusters of `size` points, `extent` meters across, `depth` below all near by, under land that holds points."""
     rng = np.random.default_rng(seed)
@@ -94,9 +105,16 @@ def planted(
             break
         at = xyz[around.query((np.array([i, j]) + rng.random(2)) * 10)[1], :2]
         part = rng.normal(0, 1, (size, 3))
-        part *= rng.random((size, 1)) ** (1 / 3) * extent / 2 / np.linalg.norm(part, axis=1, keepdims=True)
+        part *= (
+            rng.random((size, 1)) ** (1 / 3)
+            * extent
+            / 2
+            / np.linalg.norm(part, axis=1, keepdims=True)
+        )
         part[:, :2] += at
-        if (i, j) in taken or np.quantile(around.query(part[:, :2])[0], 0.8) > max(0.75, 1.2 * spacing):
+        if (i, j) in taken or np.quantile(around.query(part[:, :2])[0], 0.8) > max(
+            0.75, 1.2 * spacing
+        ):
             continue
         near = xyz[around.query_ball_point(at, extent / 2 + 1), 2]
         level = ground[nearest.query(at, 3)[1], 2].min()
@@ -106,13 +124,17 @@ def planted(
     return np.round(np.vstack([np.empty((0, 3)), *parts]), 3)
 
 
-def right(xyz: np.ndarray, truth: np.ndarray, returns: np.ndarray, noise: np.ndarray, word: str) -> float:
+def right(
+    xyz: np.ndarray, truth: np.ndarray, returns: np.ndarray, noise: np.ndarray, word: str
+) -> float:
     """Overall accuracy (2, 5, 6) of points, in %, by the shipped model, classified with noise among them."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales, header.offsets = [0.001] * 3, np.floor(xyz.min(axis=0))
     made = laspy.LasData(header)
     made.x, made.y, made.z = np.vstack([xyz, noise]).T
-    made.return_number, made.number_of_returns = np.vstack([returns, np.ones((len(noise), 2), int)]).T
+    made.return_number, made.number_of_returns = np.vstack(
+        [returns, np.ones((len(noise), 2), int)]
+    ).T
     with TemporaryDirectory() as scratch:
         source, target = str(Path(scratch) / "in.laz"), str(Path(scratch) / "out.laz")
         made.write(source)
@@ -134,7 +156,10 @@ def classified(folder: Path) -> None:
     for name in CLASSIFIED:
         las = laspy.read(folder / name)
         good = np.asarray(las.classification) != 7
-        xyz, codes = np.column_stack([las.x, las.y, las.z])[good], np.asarray(las.classification)[good]
+        xyz, codes = (
+            np.column_stack([las.x, las.y, las.z])[good],
+            np.asarray(las.classification)[good],
+        )
         returns = np.column_stack([las.return_number, las.number_of_returns])[good]
         truth = np.where(np.isin(codes, (3, 4, 5)), 5, codes)
         cloud = xyz, truth, returns
@@ -142,13 +167,17 @@ def classified(folder: Path) -> None:
         for number, (size, extent, depth) in enumerate(CLUSTERS):
             each = 5 if number % 2 else 1
             noise = planted(xyz, codes, size, extent, depth, each, number)
-            shown = " | ".join(f"{right(*cloud, noise, word):.2f}" for word in ("--noise", "--no-noise"))
+            shown = " | ".join(
+                f"{right(*cloud, noise, word):.2f}" for word in ("--noise", "--no-noise")
+            )
             print(f"| | {size} / {extent:g} / {depth:g}; {each} | {shown} |", flush=True)
 
 
 def terrain(folder: Path) -> None:
     """Print the RMSE of heights of labeled ground that clusters below it make, alone and after those found were left out."""
-    print("| cloud | clusters: points / across / below, m; per hectare | found, % | RMSE, m | alone |")
+    print(
+        "| cloud | clusters: points / across / below, m; per hectare | found, % | RMSE, m | alone |"
+    )
     print("|---|---|---:|---:|---:|")
     for name in UNDER:
         las = laspy.read(folder / name)
@@ -198,7 +227,9 @@ def places() -> None:
             shown = []
             for density in densities:
                 woods = [closed_wood(slope, density, seen, seed, 300) for seed in range(3)]
-                marked = [(detached_noise(xyz) == 7)[ground & wood].mean() for xyz, ground, wood in woods]
+                marked = [
+                    (detached_noise(xyz) == 7)[ground & wood].mean() for xyz, ground, wood in woods
+                ]
                 shown.append(f"{100 * np.mean(marked):.2f}")
             print(f"| wood, slope {slope:g}, {seen:.0%} ground | {' | '.join(shown)} |", flush=True)
     for what in ("cliff", "overhang", "tunnel mouth", "quarry", "gorge"):
@@ -228,7 +259,9 @@ def main() -> None:
         terrain(folder)
         return
     detached_noise(np.random.default_rng(0).uniform(0, 30, (500, 3)))
-    print("| cloud | million points/s | good points marked | found of 0.01 % | 0.1 % | 1 % (low / high) |")
+    print(
+        "| cloud | million points/s | good points marked | found of 0.01 % | 0.1 % | 1 % (low / high) |"
+    )
     print("|---|---:|---:|---:|---:|---:|")
     for name in CLOUDS:
         las = laspy.read(folder / name)

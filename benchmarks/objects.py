@@ -46,15 +46,21 @@ def true_buildings(houses, step):
         for one, other in ((a, b), (b, a)):
             edge = shapes[one].exterior
             places = shapely.line_interpolate_point(edge, np.arange(0, edge.length, 0.25))
-            places = shapely.get_coordinates(places[shapely.dwithin(shapes[other], places, TOUCHING)])
-            near.append(np.abs(houses[a].height(places) - houses[b].height(places)) <= (step or np.inf))
+            places = shapely.get_coordinates(
+                places[shapely.dwithin(shapes[other], places, TOUCHING)]
+            )
+            near.append(
+                np.abs(houses[a].height(places) - houses[b].height(places)) <= (step or np.inf)
+            )
         near = np.concatenate(near)
         if len(near) and near.mean() >= SHARE:
             parent[root(a)] = root(b)
     groups = {}
     for n, shape in enumerate(shapes):
         groups.setdefault(root(n), []).append(shape)
-    joined = [shapely.union_all(shapely.buffer(g, 0.3, join_style="mitre")) for g in groups.values()]
+    joined = [
+        shapely.union_all(shapely.buffer(g, 0.3, join_style="mitre")) for g in groups.values()
+    ]
     return [shape.buffer(-0.3, join_style="mitre") for shape in joined]
 
 
@@ -62,7 +68,11 @@ def true_spans(cables):
     """A line of each span: its middle conductor; of `cables` (n, 2, 3) those of a span follow each other."""
     middle = cables[:, :, :2].mean(axis=1)
     apart = np.flatnonzero(np.hypot(*np.diff(middle, axis=0).T) > 1.0) + 1
-    return [shapely.LineString(span[len(span) // 2, :, :2]) for span in np.split(cables, apart) if len(span)]
+    return [
+        shapely.LineString(span[len(span) // 2, :, :2])
+        for span in np.split(cables, apart)
+        if len(span)
+    ]
 
 
 def town(seed, codes=None, refuse=()):
@@ -88,7 +98,11 @@ def town(seed, codes=None, refuse=()):
             compare_buildings(shapes, [h for h in houses if h.area >= 4]),
             seconds,
         )
-    trees = [t for t in true.trees if t.height >= 3 and square.buffer(-2).contains(shapely.Point(t.x, t.y))]
+    trees = [
+        t
+        for t in true.trees
+        if t.height >= 3 and square.buffer(-2).contains(shapely.Point(t.x, t.y))
+    ]
     places, high = np.array([(t.x, t.y) for t in trees]), np.array([t.height for t in trees])
     radius = np.array([t.radius for t in trees])
     table = found.tables[Kind.TREE].columns
@@ -104,7 +118,10 @@ def town(seed, codes=None, refuse=()):
     hit = sum(alone[b] for _, b in pairs)
     paths = [shapely.LineString(path) for path in found.tables[Kind.SPAN].paths]
     true_paths = [line.intersection(square) for line in true_spans(true.cables)]
-    lines = [[shapely.buffer(line, 1.0, cap_style="flat") for line in many] for many in (paths, true_paths)]
+    lines = [
+        [shapely.buffer(line, 1.0, cap_style="flat") for line in many]
+        for many in (paths, true_paths)
+    ]
     lines[1] = [shape for shape in lines[1] if shape.area > 8]
     rows["spans"] = 2 * len(matched_by_overlap(*lines)) / sum(map(len, lines))
     rows["trees"] = 2 * len(pairs) / (len(at) + len(places)), 2 * hit / (hit + wrong + alone.sum())
@@ -144,7 +161,9 @@ def draw(path, colored, around, size=(170, 140), pixels=5, finer=3):
     image = Image.new("RGB", tuple(side * pixels * finer for side in size), "white")
     pen = ImageDraw.Draw(image)
     for color, shapes in colored.items():
-        for ring in (ring for part in shapely.get_parts(shapes) for ring in [part.exterior, *part.interiors]):
+        for ring in (
+            ring for part in shapely.get_parts(shapes) for ring in [part.exterior, *part.interiors]
+        ):
             at = (shapely.get_coordinates(ring) - corner) * (pixels * finer, -pixels * finer)
             pen.line([tuple(xy) for xy in at], color, 2 * finer, joint="curve")
     image.reduce(finer).quantize(64).save(path)
@@ -185,15 +204,21 @@ def row(model, seeds, refuse, flags):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", help="folder of the real clouds")
-    parser.add_argument("--picture", metavar="FILE", help="of the outlines in Delft over the official ones")
+    parser.add_argument(
+        "--picture", metavar="FILE", help="of the outlines in Delft over the official ones"
+    )
     parser.add_argument(
         "--classified",
         metavar="MODEL",
         nargs="+",
         help="classes by models instead of the true ones; 'true' for these",
     )
-    parser.add_argument("--refuse", default="", help="reasons of objects that are left out, parted by commas")
-    parser.add_argument("--flags", default="", help="more flags of classify, parted by commas: wires,towers")
+    parser.add_argument(
+        "--refuse", default="", help="reasons of objects that are left out, parted by commas"
+    )
+    parser.add_argument(
+        "--flags", default="", help="more flags of classify, parted by commas: wires,towers"
+    )
     parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2, 3])
     options = parser.parse_args()
     for model in options.classified or ():

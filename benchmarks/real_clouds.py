@@ -110,7 +110,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", default=os.environ.get("PDAL_STAGES_DATA"))
-    parser.add_argument("--work", default=".real-clouds", help="folder for models, clouds and reports")
+    parser.add_argument(
+        "--work", default=".real-clouds", help="folder for models, clouds and reports"
+    )
     parser.add_argument("--only", choices=list(CLOUDS))
     parser.add_argument("--json", help="write the figures here")
     parser.add_argument("--pictures", type=Path, help="folder for pictures")
@@ -121,7 +123,9 @@ def main() -> None:
     work = Path(options.work)
     work.mkdir(parents=True, exist_ok=True)
     results = {}
-    print(f"pdal_stages {__version__}, PDAL {'.'.join(map(str, pdal_env.version()))}, {platform.platform()}")
+    print(
+        f"pdal_stages {__version__}, PDAL {'.'.join(map(str, pdal_env.version()))}, {platform.platform()}"
+    )
     for name in [options.only] if options.only else CLOUDS:
         results[name] = r = job(name, options, work)
         oa, kappa, f1, joined = PEER[name]

@@ -72,8 +72,12 @@ def ordered(paths: list[Path]) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--data", type=Path, required=True, help="The folder with delft/ and montpellier/")
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument(
+        "--data", type=Path, required=True, help="The folder with delft/ and montpellier/"
+    )
     p.add_argument("--tile", type=float, default=40.0)
     o = p.parse_args()
     for path in [
@@ -85,9 +89,15 @@ def main() -> None:
             whole, parts = cut(path, folder)
             classify(whole, folder / "whole.laz")
             classify(*parts, folder / "tiles/", "--tile", o.tile)
-            one, other = ordered([folder / "whole.laz"]), ordered([folder / "tiles" / p.name for p in parts])
+            one, other = (
+                ordered([folder / "whole.laz"]),
+                ordered([folder / "tiles" / p.name for p in parts]),
+            )
             assert np.array_equal(one["xyz"], other["xyz"])
-            print("  " + ", ".join(f"{n} {np.count_nonzero(one[n] != other[n]):,}" for n in DIMENSIONS))
+            print(
+                "  "
+                + ", ".join(f"{n} {np.count_nonzero(one[n] != other[n]):,}" for n in DIMENSIONS)
+            )
 
 
 if __name__ == "__main__":

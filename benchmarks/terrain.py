@@ -165,7 +165,11 @@ def _errors(one: dict) -> str:
 
 def _mean(rows: list[dict]) -> dict:
     rows = [row for row in rows if "error" not in row]
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]} if rows else {"error": "none"}
+    return (
+        {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+        if rows
+        else {"error": "none"}
+    )
 
 
 def _roofs(one: dict) -> str:
@@ -181,7 +185,8 @@ def tables(results: dict) -> str:
         lines += ["| sample |" + "".join(f" {m} |" for m in names), "|---|" + "---:|" * len(names)]
         every = {**isprs, "mean": {m: _mean([row[m] for row in isprs.values()]) for m in names}}
         lines += [
-            f"| {name} |" + "".join(f" {_heights(row[m])} |" for m in names) for name, row in every.items()
+            f"| {name} |" + "".join(f" {_heights(row[m])} |" for m in names)
+            for name, row in every.items()
         ]
         lines += ["", f"| sample | {OURS}: I / II / total | kappa | smrf: I / II / total | kappa |"]
         lines += ["|---|---:|---:|---:|---:|"]
@@ -197,7 +202,10 @@ def tables(results: dict) -> str:
         ]
         lines += ["|---|" + "---:|" * 7]
         for name, row in tiles.items():
-            cells = [f" {_heights(row[m])} | {_errors(row[m])} | {_roofs(row[m])} |" for m in (OURS, SMRF_NN)]
+            cells = [
+                f" {_heights(row[m])} | {_errors(row[m])} | {_roofs(row[m])} |"
+                for m in (OURS, SMRF_NN)
+            ]
             lines += [f"| {name} | {row[OURS]['points']:,} |" + "".join(cells)]
     return "\n".join(lines)
 
@@ -288,7 +296,9 @@ def main() -> None:
     for name, cloud, left_out in clouds(Path(options.data), options.only):
         methods = METHODS if name.startswith("samp") else {m: METHODS[m] for m in (OURS, SMRF_NN)}
         results[name] = measure(cloud, left_out, methods)
-    print(f"PDAL {'.'.join(map(str, pdal_env.version()))}, {platform.machine()}\n\n{tables(results)}")
+    print(
+        f"PDAL {'.'.join(map(str, pdal_env.version()))}, {platform.machine()}\n\n{tables(results)}"
+    )
     if options.json:
         Path(options.json).write_text(json.dumps(results, indent=1) + "\n")
 

@@ -80,15 +80,22 @@ def labeled(path, density=None):
     true = true[true[:, 2] >= LEAST]
     kept = np.ones(len(xyz), bool)
     if density:
-        kept = np.random.default_rng(0).random(len(xyz)) < density * np.prod(np.ptp(xyz[:, :2], 0)) / len(xyz)
-    return Plot(xyz[kept], height[kept], true, shapely.MultiPoint(true[:, :2]).convex_hull.buffer(1.0))
+        kept = np.random.default_rng(0).random(len(xyz)) < density * np.prod(
+            np.ptp(xyz[:, :2], 0)
+        ) / len(xyz)
+    return Plot(
+        xyz[kept], height[kept], true, shapely.MultiPoint(true[:, :2]).convex_hull.buffer(1.0)
+    )
 
 
 def traunstein(path, south):
     import rdata
 
     data = rdata.read_rda(path)
-    points, stems = data["lid.dt"].to_numpy(float)[:, :3], data["inv.dt"][["X", "Y", "DBH"]].to_numpy(float)
+    points, stems = (
+        data["lid.dt"].to_numpy(float)[:, :3],
+        data["inv.dt"][["X", "Y", "DBH"]].to_numpy(float),
+    )
     dbh = 100 * stems[:, 2]
     true = np.column_stack([stems[:, :2], 1.3 + dbh**2 / (1.7 + 0.15 * dbh) ** 2, dbh])
     area = shapely.box(0, 0, 100, 50) if south else shapely.box(0, 50, 100, 100)
@@ -99,14 +106,20 @@ def traunstein(path, south):
 def package(plot):
     """x, y, height and estimated diameter of the trees that `pdal-stages objects` finds."""
     cells = plot.cells
-    columns = find_objects(cells, ObjectSettings(cell=cells.size), progress=False).tables[Kind.TREE].columns
+    columns = (
+        find_objects(cells, ObjectSettings(cell=cells.size), progress=False)
+        .tables[Kind.TREE]
+        .columns
+    )
     return np.column_stack([columns[name] for name in ("x", "y", "height", "dbh")])
 
 
 def windows(plot, base=0.8, slope=0.03):
     """Points that are the highest within a radius that grows with height (Popescu, Wynne 2004)."""
     points = plot.canopy()
-    near = scipy.spatial.cKDTree(points[:, :2]).query_ball_point(points[:, :2], base + slope * points[:, 2])
+    near = scipy.spatial.cKDTree(points[:, :2]).query_ball_point(
+        points[:, :2], base + slope * points[:, 2]
+    )
     return points[[points[n, 2] >= points[around, 2].max() for n, around in enumerate(near)]]
 
 
@@ -191,7 +204,9 @@ def layers(plot, size=0.5, sigma=0.4, radius=1.0, reach=0.6):
         free = np.ones(high.shape, bool)
         free[at[0][level == one], at[1][level == one]] = False
         stack += scipy.ndimage.distance_transform_edt(free) * size <= reach
-    return peaks(scipy.ndimage.gaussian_filter(stack, sigma / size), high, corner, size, radius / size)
+    return peaks(
+        scipy.ndimage.gaussian_filter(stack, sigma / size), high, corner, size, radius / size
+    )
 
 
 def curvature(plot, sigma=1.0, radius=1.5, least=0.1):
@@ -200,7 +215,8 @@ def curvature(plot, sigma=1.0, radius=1.5, least=0.1):
     high, corner, _ = raster(plot.canopy(0.0), size)
     high = canopy(high, np.zeros(high.shape))
     xx, yy, xy = (
-        scipy.ndimage.gaussian_filter(high, sigma / size, order) for order in ((2, 0), (0, 2), (1, 1))
+        scipy.ndimage.gaussian_filter(high, sigma / size, order)
+        for order in ((2, 0), (0, 2), (1, 1))
     )
     smallest = -((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)) * (sigma / size) ** 2
     return peaks(np.where(smallest > least, smallest, 0), high, corner, size, radius / size)
@@ -223,7 +239,10 @@ def main():
     options = parser.parse_args()
     plots = {}
     for name, density in PARTS[options.part].items():
-        demo, cloud = options.folder / "Demo_Data_1ha_Traunstein.rda", options.folder / f"{name}_als_veg.laz"
+        demo, cloud = (
+            options.folder / "Demo_Data_1ha_Traunstein.rda",
+            options.folder / f"{name}_als_veg.laz",
+        )
         if name.startswith("Traunstein") and demo.exists():
             plots[name] = traunstein(demo, name.endswith("south"))
         elif cloud.exists():
@@ -235,7 +254,8 @@ def main():
             found, true = method(plot), plot.true
             found = found[shapely.contains_xy(plot.area, *found[:, :2].T) & (found[:, 2] >= LEAST)]
             matched = [
-                matched_by_place(found[:, :2], found[:, 2], true[:, :2], true[:, 2], *by) for by in TOLERANCES
+                matched_by_place(found[:, :2], found[:, 2], true[:, :2], true[:, 2], *by)
+                for by in TOLERANCES
             ]
             rows.append([f1(len(pairs), len(found), len(true)) for pairs in matched])
             a, b = np.array(matched[0], int).reshape(-1, 2).T

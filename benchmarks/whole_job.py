@@ -66,7 +66,9 @@ def trained(folder: Path) -> Path:
     if not path.exists():
         cloud = town(folder, 0.5, 7.0, 1)
         subprocess.run(
-            command("train", cloud, "--model", path, f"--writers.classifiermodel.classes={CLASSES}"),
+            command(
+                "train", cloud, "--model", path, f"--writers.classifiermodel.classes={CLASSES}"
+            ),
             check=True,
             capture_output=True,
         )
@@ -77,7 +79,9 @@ def once(cloud: Path, model: str, out: Path) -> dict[str, float]:
     """Wall and CPU seconds of one run, and the most memory of it in MiB."""
     began = time.perf_counter()
     process = subprocess.Popen(
-        command("classify", cloud, out, "--model", model), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        command("classify", cloud, out, "--model", model),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
     )
     assert process.stderr is not None
     said = process.stderr.read()
@@ -132,7 +136,9 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
         return run
 
     def start() -> None:
-        subprocess.run([sys.executable, "-c", "import pdal_stages.cli, pdal_stages.classifier"], check=True)
+        subprocess.run(
+            [sys.executable, "-c", "import pdal_stages.cli, pdal_stages.classifier"], check=True
+        )
 
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     start()
@@ -151,8 +157,14 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
     dimensions["NumberOfReturns"] = np.asarray(las.number_of_returns)
     model = load_model(model_file)
     with tempfile.TemporaryDirectory() as folder:
-        model.predict(xyz[:2000], {k: v[:2000] for k, v in dimensions.items()}, threads=1)  # kernels
-        forest, around, compute = Forest.predict_proba, contexts.cell_means, feature_engine.Run.compute
+        model.predict(
+            xyz[:2000], {k: v[:2000] for k, v in dimensions.items()}, threads=1
+        )  # kernels
+        forest, around, compute = (
+            Forest.predict_proba,
+            contexts.cell_means,
+            feature_engine.Run.compute,
+        )
         Forest.predict_proba = timed("forests", forest)  # type: ignore[method-assign]
         contexts.cell_means = timed("context", around)
         feature_engine.Run.compute = timed("features", compute)  # type: ignore[method-assign]
@@ -167,7 +179,9 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
         )
         timed("writing", las.write)(Path(folder, "out.laz"))
     inside = ("features", "forests", "context")
-    spent["the rest of classification"] = spent.pop("classification") - sum(spent.get(k, 0.0) for k in inside)
+    spent["the rest of classification"] = spent.pop("classification") - sum(
+        spent.get(k, 0.0) for k in inside
+    )
     return spent
 
 
@@ -175,7 +189,9 @@ def main() -> None:
     options = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    options.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir(), "pdal-stages-whole-job"))
+    options.add_argument(
+        "--folder", type=Path, default=Path(tempfile.gettempdir(), "pdal-stages-whole-job")
+    )
     options.add_argument("--sizes", type=float, nargs="+", help="millions of points")
     options.add_argument("--densities", type=float, nargs="+", help="points per square meter")
     options.add_argument("--parts", action="store_true")

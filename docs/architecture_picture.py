@@ -30,7 +30,11 @@ COLUMNS = (
             ("Hand the points to the stage,", "in meters, class codes without flags", "pipeline/"),
             ("Heights above a terrain", "", "terrain/"),
             ("Features of many neighborhoods,", "block by block", "features/"),
-            ("Forest or network; a second pass", "reads what the first said all around", "classifier/"),
+            (
+                "Forest or network; a second pass",
+                "reads what the first said all around",
+                "classifier/",
+            ),
             ("Classes, reliability, margin", "", "classifier/"),
         ),
     ),
@@ -76,7 +80,9 @@ def picture() -> str:
                 f'<text class="room" x="{left + 14}" y="{top + (55 if second else 49)}">{escape(room)}</text>'
             )
             if row + 1 < len(steps):
-                parts.append(f'<path class="way" d="M{left + WIDE // 2} {top + BOX}V{top + STEP - 1}"/>')
+                parts.append(
+                    f'<path class="way" d="M{left + WIDE // 2} {top + BOX}V{top + STEP - 1}"/>'
+                )
             elif number + 1 < len(COLUMNS):
                 turn = left + WIDE + GAP // 2
                 way = f"M{left + WIDE} {top + BOX // 2}H{turn}V{TOP + BOX // 2}H{left + WIDE + GAP - 1}"

@@ -41,4 +41,6 @@ html_show_sourcelink = False
 html_static_path = ["static"]
 html_css_files = ["custom.css"]
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # docstrings say shapes and units; NumPy's own names of types fill ten lines
+autodoc_typehints = (
+    "none"  # docstrings say shapes and units; NumPy's own names of types fill ten lines
+)

@@ -27,7 +27,10 @@ DIALOGS = {
         "classify",
         {"INPUT": "/data/survey/raw.laz", "OUTPUT": "/data/survey/classified.laz"},
     ),
-    "qgis-terrain.png": ("terrainmodels", {"INPUT": "/data/survey/classified.laz", "GROUND_FROM": 1}),
+    "qgis-terrain.png": (
+        "terrainmodels",
+        {"INPUT": "/data/survey/classified.laz", "GROUND_FROM": 1},
+    ),
 }
 
 
@@ -52,7 +55,9 @@ def keep(widget, name):
     image = widget.grab().toImage().convertToFormat(QImage.Format_RGB32)
     pixels = memoryview(image.constBits().asstring(image.sizeInBytes())).cast("I")
     colors = [color for color, _ in Counter(pixels).most_common(256)]
-    image.convertToFormat(QImage.Format_Indexed8, colors).save(os.path.join(PICTURES, name), quality=0)
+    image.convertToFormat(QImage.Format_Indexed8, colors).save(
+        os.path.join(PICTURES, name), quality=0
+    )
 
 
 def dialogs():
@@ -76,7 +81,9 @@ def the_map(plugin, folder):
         os.path.join(folder, name)
         for name in ("classified.laz", "objects.gpkg", "classes.tif", "surface.tif")
     )
-    processing.run("pdalstages:classify", {"INPUT": TILE, "OUTPUT": cloud, "MAP": classes, "SHOW": False})
+    processing.run(
+        "pdalstages:classify", {"INPUT": TILE, "OUTPUT": cloud, "MAP": classes, "SHOW": False}
+    )
     asked = {"INPUT": cloud, "RESOLUTION": 0.5, "TERRAIN": None, "SURFACE": surface}
     processing.run("pdalstages:terrainmodels", asked)
     processing.run("pdalstages:objects", {"INPUTS": [cloud], "OUTPUT": objects, "SHOW": False})

@@ -56,7 +56,9 @@ def _row(option) -> str:
         text += f" One of {', '.join(f'`{c}`' for c in option.choices)}."
     bounds = []
     if option.minimum is not None:
-        bounds.append(f"more than {option.minimum:g}" if option.exclusive else f"at least {option.minimum:g}")
+        bounds.append(
+            f"more than {option.minimum:g}" if option.exclusive else f"at least {option.minimum:g}"
+        )
     if option.maximum is not None and option.maximum < 2**31 - 1:
         bounds.append(f"at most {option.maximum:g}")
     if bounds:

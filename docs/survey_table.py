@@ -25,8 +25,12 @@ def table() -> str:
     ]
     for density in ("4", "1"):
         thinned = [row["oa"] for row in rows if row["cloud"].endswith(f", {density} points per m2")]
-        lines.append(f"| mean of {len(thinned)} thinned to {density} points/m² | {mean(thinned):.1f} % |")
-    later = json.loads(MEASURED.with_name("surveys-unseen.json").read_text(encoding="utf-8"))["surveys"]
+        lines.append(
+            f"| mean of {len(thinned)} thinned to {density} points/m² | {mean(thinned):.1f} % |"
+        )
+    later = json.loads(MEASURED.with_name("surveys-unseen.json").read_text(encoding="utf-8"))[
+        "surveys"
+    ]
     flown = sorted((row["oa"], row["cloud"]) for row in later if "," not in row["cloud"])
     told = ", ".join(f"{name} {oa:.1f} %" for oa, name in flown)
     lines.append(f"| {len(flown)} surveys unlike all others | {told} |")

@@ -28,7 +28,12 @@ def double(ins, outs):
     outs["Z"] = np.ascontiguousarray(ins["Z"] * 2)
     return True
 """.replace("PREFIX", repr(sys.prefix))
-READER = {"type": "readers.faux", "mode": "constant", "count": 3, "bounds": "([1, 2], [1, 2], [21, 22])"}
+READER = {
+    "type": "readers.faux",
+    "mode": "constant",
+    "count": 3,
+    "bounds": "([1, 2], [1, 2], [21, 22])",
+}
 PIPELINE = [
     READER,
     {"type": "filters.python", "source": SOURCE, "function": "double", "module": "check_pdal"},
@@ -62,8 +67,14 @@ def by_bindings() -> str:
 def by_program(program: str) -> str:
     """Run the pipeline through the program; return what went wrong, if anything."""
     command = [program, "pipeline", "--stdin"]
-    done = subprocess.run(command, input=json.dumps(PIPELINE), text=True, capture_output=True, timeout=120)
-    return "" if done.returncode == 0 else f"{program}: exit status {done.returncode}: {done.stderr.strip()}"
+    done = subprocess.run(
+        command, input=json.dumps(PIPELINE), text=True, capture_output=True, timeout=120
+    )
+    return (
+        ""
+        if done.returncode == 0
+        else f"{program}: exit status {done.returncode}: {done.stderr.strip()}"
+    )
 
 
 def main() -> int:
@@ -71,7 +82,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Prove that PDAL's filters.python works.")
     parser.add_argument("--quiet", action="store_true", help="print no versions")
     parser.add_argument("--program", help="the pdal program, checked as well")
-    parser.add_argument("--driver-path", action="store_true", help="only print the folder of the plugins")
+    parser.add_argument(
+        "--driver-path", action="store_true", help="only print the folder of the plugins"
+    )
     options = parser.parse_args()
     folder = driver_path()
     if options.driver_path:
@@ -86,7 +99,9 @@ def main() -> int:
     if not options.quiet:
         import pdal
 
-        print(f"PDAL {pdal.info.version}, python-pdal {pdal.__version__}, Python {sys.version.split()[0]}")
+        print(
+            f"PDAL {pdal.info.version}, python-pdal {pdal.__version__}, Python {sys.version.split()[0]}"
+        )
     return 0
 
 

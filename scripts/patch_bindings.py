@@ -15,9 +15,13 @@ from pathlib import Path
 
 def substitute(file: Path, pattern: str, replacement: str, times: int) -> None:
     """Replace ``pattern`` in ``file``; stop unless it is found exactly ``times`` times."""
-    text, found = re.subn(pattern, replacement, file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    text, found = re.subn(
+        pattern, replacement, file.read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
     if found != times:
-        raise SystemExit(f"{file}: {pattern!r} found {found} times, not {times}: not the expected release")
+        raise SystemExit(
+            f"{file}: {pattern!r} found {found} times, not {times}: not the expected release"
+        )
     file.write_text(text, encoding="utf-8")
 
 
@@ -32,7 +36,9 @@ def numpy_2(bindings: Path, plugins: Path) -> None:
     reader = plugins / "pdal/io/NumpyReader.cpp"
     substitute(reader, r"\bm_dtype->fields\b", "PyDataType_FIELDS(m_dtype)", 3)
     substitute(reader, r"\bdt->elsize\b", "PyDataType_ELSIZE(dt)", 1)
-    substitute(plugins / "pdal/plang/Invocation.cpp", r"\bdtype->elsize\b", "PyDataType_ELSIZE(dtype)", 2)
+    substitute(
+        plugins / "pdal/plang/Invocation.cpp", r"\bdtype->elsize\b", "PyDataType_ELSIZE(dtype)", 2
+    )
 
 
 #: In the place of `class Stage` and of the names of stages that PDAL has.
@@ -87,7 +93,9 @@ def plugin_folder(bindings: Path, source: str, folder: str) -> None:
     Set, the variable replaces PDAL's own search, so the folder of PDAL's compiled plugins is added.
     """
     init = bindings / source / "__init__.py"
-    value = f"_os.path.dirname(__file__) + {':' + folder!r}" if folder else "_os.path.dirname(__file__)"
+    value = (
+        f"_os.path.dirname(__file__) + {':' + folder!r}" if folder else "_os.path.dirname(__file__)"
+    )
     text = f'import os as _os\n\n_os.environ.setdefault("PDAL_DRIVER_PATH", {value})\n'
     init.write_text(text + init.read_text(encoding="utf-8"), encoding="utf-8")
 

@@ -40,7 +40,13 @@ def random_net(inputs=("Z",), classes=3, configuration=TINY, spacing=3.0, seed=0
             array[:, -4:] = random.uniform(0.5, 1.5, (len(array), 4))
     weights["scores"] *= np.float32(0.1)  # so that probabilities are neither 0 nor 1
     return AlsNet(
-        weights, configuration, tuple(inputs), (0.0,) * len(inputs), (1.0,) * len(inputs), spacing, classes
+        weights,
+        configuration,
+        tuple(inputs),
+        (0.0,) * len(inputs),
+        (1.0,) * len(inputs),
+        spacing,
+        classes,
     )
 
 
@@ -53,10 +59,22 @@ def model_of(net, codes=(2, 5, 6)):
         "target": None,
         "background": None,
         "classes": [
-            {"code": c, "name": str(c), "labels": [c], "available": 9, "samples": 9, "duplicates": 0}
+            {
+                "code": c,
+                "name": str(c),
+                "labels": [c],
+                "available": 9,
+                "samples": 9,
+                "duplicates": 0,
+            }
             for c in codes
         ],
-        "training": {"clouds": [{"name": "a.laz", "points": 9}], "count": 9, "seed": 0, "samples": 27},
+        "training": {
+            "clouds": [{"name": "a.laz", "points": 9}],
+            "count": 9,
+            "seed": 0,
+            "samples": 27,
+        },
         "accuracy": {"cross_validation": None},
         "passes": [{"importances": None}],
         "created_by": {"pdal_stages": "0.1.0"},

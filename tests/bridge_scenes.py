@@ -35,7 +35,9 @@ class Slab:
 class Scene:
     terrain: Callable  # (s, t) -> height, class; NaN: no return
     slabs: list[Slab]
-    trees: list[tuple[float, float, float, float]] = field(default_factory=list)  # s, t, radius, height
+    trees: list[tuple[float, float, float, float]] = field(
+        default_factory=list
+    )  # s, t, radius, height
     turn: float = 0.4
     length: float = 300.0
     width: float = 160.0
@@ -62,7 +64,9 @@ def scan(scene: Scene, density: float = 16.0, seed: int = 0, angle: float = 20.0
         flight = np.array([np.cos(0.5), np.sin(0.5)])
         across = np.array([-flight[1], flight[0]])
         lean = np.clip(
-            (p @ across + strip * 120.0) / 500.0, -np.tan(np.radians(angle)), np.tan(np.radians(angle))
+            (p @ across + strip * 120.0) / 500.0,
+            -np.tan(np.radians(angle)),
+            np.tan(np.radians(angle)),
         )
         slope = lean[:, None] * across  # the beam lies so far out per meter further down
 
@@ -103,12 +107,16 @@ def scan(scene: Scene, density: float = 16.0, seed: int = 0, angle: float = 20.0
                 continue
             level = foot + tall * rng.uniform(0.35, 1.0, n)
             q = np.column_stack(scene.along(at(level)))
-            reach = radius * np.sqrt(np.clip(1 - ((level - foot) / tall - 0.65) ** 2 / 0.1225, 0, 1))
+            reach = radius * np.sqrt(
+                np.clip(1 - ((level - foot) / tall - 0.65) ** 2 / 0.1225, 0, 1)
+            )
             hit = (np.hypot(q[:, 0] - a, q[:, 1] - b) < reach) & (rng.random(n) < 0.7) & (level > z)
             z[hit], code[hit] = level[hit], LEAF
         seen = np.isfinite(z)
         q = at(np.where(seen, z, 0.0))[seen]
-        found.append(np.column_stack([q[:, 0] * c - q[:, 1] * s, q[:, 0] * s + q[:, 1] * c, z[seen]]))
+        found.append(
+            np.column_stack([q[:, 0] * c - q[:, 1] * s, q[:, 0] * s + q[:, 1] * c, z[seen]])
+        )
         codes.append(code[seen])
     xyz, code = np.concatenate(found), np.concatenate(codes)
     xyz += rng.normal(0, 0.02, xyz.shape) + np.array([85_000.0, 447_000.0, 0.0])
@@ -126,7 +134,9 @@ def _deck(scene_slabs, start, end, right, left, top, depth=1.2, parapet=1.0):
     scene_slabs.append(Slab(start, end, right, left, top, depth, DECK))
     if parapet:
         for low, high in ((right, right + 0.3), (left - 0.3, left)):
-            scene_slabs.append(Slab(start, end, low, high, lambda s: top(s) + parapet, parapet, DECK))
+            scene_slabs.append(
+                Slab(start, end, low, high, lambda s: top(s) + parapet, parapet, DECK)
+            )
 
 
 def _cars(slabs, rng, start, end, lanes, top, gap=18.0):
@@ -135,7 +145,9 @@ def _cars(slabs, rng, start, end, lanes, top, gap=18.0):
             s = s + rng.uniform(-6, 6)
             long, tall = (14.0, 3.8) if rng.random() < 0.15 else (4.4, 1.5)
             slabs.append(
-                Slab(s, s + long, lane - 0.95, lane + 0.95, lambda a, h=tall: top(a) + h, tall, OTHER)
+                Slab(
+                    s, s + long, lane - 0.95, lane + 0.95, lambda a, h=tall: top(a) + h, tall, OTHER
+                )
             )
 
 
@@ -161,7 +173,9 @@ def viaduct(seed=0, height=7.0, half=13.0, reach=110.0, gap=0.0, turn=0.4, lengt
         _cars(slabs, rng, -reach - 40, reach + 40, lanes, top, 30.0)
     for s in np.arange(-reach + 25, reach - 10, 30.0):  # piers
         for t in (-half + 2, 0.0, half - 2):
-            slabs.append(Slab(s - 0.6, s + 0.6, t - 0.6, t + 0.6, lambda a: top(a) - 1.2, height, OTHER))
+            slabs.append(
+                Slab(s - 0.6, s + 0.6, t - 0.6, t + 0.6, lambda a: top(a) - 1.2, height, OTHER)
+            )
     for s, t in ((-60.0, 45.0), (30.0, -50.0)):  # halls
         slabs.append(Slab(s, s + 35, t - 12, t + 12, lambda a: 6.5 + 0 * a, 6.5, BUILDING))
     trees = [
@@ -194,7 +208,12 @@ def river(seed=0, half=6.0, reach=75.0, clear=8.0, returns=0.02, turn=1.1, lengt
     for s in np.arange(-reach + 6, reach, 20.0):  # lamps
         slabs.append(Slab(s, s + 0.2, half - 0.5, half - 0.3, lambda a: top(a) + 8, 8.0, OTHER))
     trees = [
-        (side * (reach + rng.uniform(5, 60)), rng.uniform(-60, 60), rng.uniform(2, 4), rng.uniform(6, 14))
+        (
+            side * (reach + rng.uniform(5, 60)),
+            rng.uniform(-60, 60),
+            rng.uniform(2, 4),
+            rng.uniform(6, 14),
+        )
         for side in (-1, 1)
         for _ in range(30)
     ]

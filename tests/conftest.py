@@ -46,7 +46,10 @@ for _ignored, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", sign
 # A slow or busy machine is no failure. Continuous integration draws the same examples every time, so that a change is
 # judged by what it changed.
 settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize="CI" in os.environ
+    "any machine",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize="CI" in os.environ,
 )
 settings.load_profile("any machine")
 
@@ -54,13 +57,17 @@ settings.load_profile("any machine")
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="pdal-stages-cache-of-tests-")
 
 ROOT = Path(__file__).resolve().parent.parent
-REQUIRED = {word.strip() for word in os.environ.get("PDAL_STAGES_REQUIRE", "").split(",") if word.strip()}
+REQUIRED = {
+    word.strip() for word in os.environ.get("PDAL_STAGES_REQUIRE", "").split(",") if word.strip()
+}
 NO_DATA = "real clouds not found"
 NO_TORCH = "PyTorch is not installed"
 
 # A skip reason that names PDAL itself. "PDAL 2.5" or "PDAL >= 2.5" asks for a version, which is another
 # matter, and PDAL_STAGES_DATA is another word.
-WANT_OF_PDAL = re.compile(r"(\bpdal\b(?!\s*(>=|<=|>|<|\d))|filters\.python|readers\.numpy)", re.IGNORECASE)
+WANT_OF_PDAL = re.compile(
+    r"(\bpdal\b(?!\s*(>=|<=|>|<|\d))|filters\.python|readers\.numpy)", re.IGNORECASE
+)
 
 
 # ---- what is there ---------------------------------------------------------------------------------------
@@ -70,18 +77,28 @@ WANT_OF_PDAL = re.compile(r"(\bpdal\b(?!\s*(>=|<=|>|<|\d))|filters\.python|reade
 def find_pdal() -> tuple[Path | None, str]:
     """Find a ``pdal`` program with ``filters.python``: this environment's own first, then PATH's."""
     seen = []
-    names = [Path(sys.prefix) / "bin" / "pdal", Path(sys.executable).parent / "pdal", shutil.which("pdal")]
+    names = [
+        Path(sys.prefix) / "bin" / "pdal",
+        Path(sys.executable).parent / "pdal",
+        shutil.which("pdal"),
+    ]
     for program in dict.fromkeys(Path(name) for name in names if name):
         if not os.access(program, os.X_OK):
             continue
         answer = subprocess.run(
-            [program, "--drivers"], capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL
+            [program, "--drivers"],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            stdin=subprocess.DEVNULL,
         )
         if answer.returncode == 0 and "filters.python" in answer.stdout:
             return program, ""
         said = answer.stderr.strip().splitlines()[-1:] or ["no filters.python among its drivers"]
         seen.append(f"{program}: {said[0]}")
-    return None, "PDAL with filters.python not found (" + ("; ".join(seen) or "no pdal program on PATH") + ")"
+    return None, "PDAL with filters.python not found (" + (
+        "; ".join(seen) or "no pdal program on PATH"
+    ) + ")"
 
 
 @cache
@@ -123,7 +140,9 @@ def _fail(report) -> None:
     reason = _forbidden(report)
     if reason:
         report.outcome = "failed"
-        report.longrepr = f"PDAL_STAGES_REQUIRE={','.join(sorted(REQUIRED))} forbids this skip. {reason}"
+        report.longrepr = (
+            f"PDAL_STAGES_REQUIRE={','.join(sorted(REQUIRED))} forbids this skip. {reason}"
+        )
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -148,7 +167,11 @@ def pytest_report_header() -> list[str]:
     program, why = find_pdal()
     data, no = find_data()
     strict = ", ".join(sorted(REQUIRED)) or "nothing"
-    return [f"pdal: {program or why}", f"real clouds: {data or no}", f"must not skip for want of: {strict}"]
+    return [
+        f"pdal: {program or why}",
+        f"real clouds: {data or no}",
+        f"must not skip for want of: {strict}",
+    ]
 
 
 # ---- fixtures --------------------------------------------------------------------------------------------
@@ -244,7 +267,9 @@ def write_las():
             header.global_encoding.wkt = True
         standard = set(header.point_format.dimension_names)
         extra = {n: a for n, a in arrays.items() if n not in LASPY_NAMES and n != "ScanAngleRank"}
-        header.add_extra_dims([laspy.ExtraBytesParams(name=n, type=a.dtype) for n, a in extra.items()])
+        header.add_extra_dims(
+            [laspy.ExtraBytesParams(name=n, type=a.dtype) for n, a in extra.items()]
+        )
         las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header))
         las.x, las.y, las.z = xyz.T
         for name, values in arrays.items():
@@ -282,7 +307,9 @@ def run_job(tmp_path, run):
 
     def go(stages, *words, command="pipeline"):
         path = tmp_path / "job.json"
-        path.write_text(json.dumps([stage if isinstance(stage, dict) else str(stage) for stage in stages]))
+        path.write_text(
+            json.dumps([stage if isinstance(stage, dict) else str(stage) for stage in stages])
+        )
         return run(command, path, *words)
 
     return go
@@ -310,7 +337,11 @@ def wide_model(tmp_path_factory, write_las) -> Path:
 @pytest.fixture(scope="session")
 def quick() -> list[str]:
     """Words for those that train: a smaller model than the files say; the stages are the same."""
-    return ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=300", "--stage.model.trees=10"]
+    return [
+        "--stage.model.neighborhoods=c2,s2",
+        "--stage.model.count=300",
+        "--stage.model.trees=10",
+    ]
 
 
 @pytest.fixture(scope="session")
@@ -342,7 +373,11 @@ def ready_models(ready_town, quick, tmp_path_factory) -> Path:
     from pdal_stages.pipeline.run import Pipeline
 
     folder = tmp_path_factory.mktemp("models")
-    for name, file in (("train", "classes"), ("train-binary", "buildings"), ("train-on-smrf-ground", "smrf")):
+    for name, file in (
+        ("train", "classes"),
+        ("train-binary", "buildings"),
+        ("train-on-smrf-ground", "smrf"),
+    ):
         words = [
             f"--stage.input.filename={ready_town}",
             f"--stage.model.filename={folder / file}.model",

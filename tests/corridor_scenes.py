@@ -25,7 +25,15 @@ class Line:
     tall: float
 
 
-HIGH = ((-7.0, 22.0), (7.0, 22.0), (-9.0, 28.0), (9.0, 28.0), (-6.0, 34.0), (6.0, 34.0), (0.0, 40.0))
+HIGH = (
+    (-7.0, 22.0),
+    (7.0, 22.0),
+    (-9.0, 28.0),
+    (9.0, 28.0),
+    (-6.0, 34.0),
+    (6.0, 34.0),
+    (0.0, 40.0),
+)
 MEDIUM = ((-1.2, 10.2), (0.0, 10.6), (1.2, 10.2))
 HIGHEST = ((-15.0, 38.0), (0.0, 38.0), (15.0, 38.0))
 LOW = ((-0.4, 7.6), (0.0, 8.0), (0.4, 7.6))
@@ -52,7 +60,9 @@ def _lattice(rng, foot, turn, tall, wires, density):
             m = int(2 * reach * density * 0.9)
             t = rng.uniform(-reach, reach, m)
             parts.append(
-                np.column_stack([rng.uniform(-0.5, 0.5, m), t, level + 1.5 + rng.uniform(-0.4, 0.6, m)])
+                np.column_stack(
+                    [rng.uniform(-0.5, 0.5, m), t, level + 1.5 + rng.uniform(-0.4, 0.6, m)]
+                )
             )
     return _placed(np.vstack(parts), foot, turn)
 
@@ -70,11 +80,15 @@ def _wide(rng, foot, turn, tall, wires, density):
     reach, level = max(abs(t) for t, _ in wires), max(z for _, z in wires)
     m = int(2 * reach * density * 0.9)
     t = rng.uniform(-reach - 1, reach + 1, m)
-    parts.append(np.column_stack([rng.uniform(-1, 1, m), t, level + 7.0 + rng.uniform(-0.5, 1.0, m)]))
+    parts.append(
+        np.column_stack([rng.uniform(-1, 1, m), t, level + 7.0 + rng.uniform(-0.5, 1.0, m)])
+    )
     for aside, _ in wires:
         u = rng.uniform(0.1, 1, int(density))
         parts.append(
-            np.column_stack([np.zeros(len(u)), aside + rng.choice([-3, 3], len(u)) * u, level + 7 * u])
+            np.column_stack(
+                [np.zeros(len(u)), aside + rng.choice([-3, 3], len(u)) * u, level + 7 * u]
+            )
         )
     return _placed(np.vstack(parts), foot, turn)
 
@@ -84,7 +98,9 @@ def _pole(rng, foot, turn, tall, wires, density):
     stem = np.column_stack([rng.normal(0, 0.08, (2, n)).T, rng.uniform(0.3, tall, n)])
     reach = max(abs(t) for t, _ in wires)
     m = int(2 * reach * density * 0.25)
-    arm = np.column_stack([rng.normal(0, 0.08, m), rng.uniform(-reach, reach, m), np.full(m, tall - 0.4)])
+    arm = np.column_stack(
+        [rng.normal(0, 0.08, m), rng.uniform(-reach, reach, m), np.full(m, tall - 0.4)]
+    )
     return _placed(np.vstack([stem, arm]), foot, turn)
 
 
@@ -104,7 +120,9 @@ def _frame(rng, foot, turn, tall, wires, density):
 
 def _placed(q, foot, turn):
     c, s = np.cos(turn), np.sin(turn)
-    return np.column_stack([q[:, 0] * c - q[:, 1] * s, q[:, 0] * s + q[:, 1] * c, q[:, 2]]) + np.asarray(foot)
+    return np.column_stack(
+        [q[:, 0] * c - q[:, 1] * s, q[:, 0] * s + q[:, 1] * c, q[:, 2]]
+    ) + np.asarray(foot)
 
 
 _SUPPORTS = {"lattice": _lattice, "wide": _wide, "pole": _pole, "frame": _frame}
@@ -115,7 +133,9 @@ def _crown(rng, foot, radius, tall, density):
     p = rng.normal(0, 1, (n, 3))
     p *= (rng.random(n) ** 0.4 / np.linalg.norm(p, axis=1))[:, None]
     crown = p * (radius, radius, 0.36 * tall) + (0, 0, 0.64 * tall)
-    stem = np.column_stack([rng.normal(0, 0.15, (2, n // 20 + 1)).T, rng.uniform(0, 0.4 * tall, n // 20 + 1)])
+    stem = np.column_stack(
+        [rng.normal(0, 0.15, (2, n // 20 + 1)).T, rng.uniform(0, 0.4 * tall, n // 20 + 1)]
+    )
     return np.vstack([crown, stem]) + np.asarray(foot)
 
 
@@ -143,11 +163,16 @@ def corridor(
     s, t = rng.uniform(-length / 2, length / 2, n), rng.uniform(-width / 2, width / 2, n)
     z, code = land(s, t), np.full(n, GROUND)
     for _ in range(houses):
-        a, b = rng.uniform(-length / 2, length / 2), rng.choice([-1, 1]) * rng.uniform(0.22, 0.42) * width
+        a, b = (
+            rng.uniform(-length / 2, length / 2),
+            rng.choice([-1, 1]) * rng.uniform(0.22, 0.42) * width,
+        )
         half, deep, eave = rng.uniform(5, 16), rng.uniform(4, 7), rng.uniform(3, 8)
         inside = (np.abs(s - a) < half) & (np.abs(t - b) < deep)
         z = np.where(
-            inside, land(a, b) + eave + (0.7 * (deep - np.abs(t - b)) if rng.random() < 0.7 else 0.0), z
+            inside,
+            land(a, b) + eave + (0.7 * (deep - np.abs(t - b)) if rng.random() < 0.7 else 0.0),
+            z,
         )
         code[inside] = BUILDING
     parts, codes = [np.column_stack([s, t, z])], [code]
@@ -165,7 +190,9 @@ def corridor(
                 u = np.sort(rng.uniform(0, 1, m))
                 height = foot + (other - foot) * u + up - 4.0 * line.sag * span**2 * u * (1 - u)
                 add(
-                    np.column_stack([a + span * u, b + aside + (d - b) * u + rng.normal(0, 0.04, m), height]),
+                    np.column_stack(
+                        [a + span * u, b + aside + (d - b) * u + rng.normal(0, 0.04, m), height]
+                    ),
                     WIRE,
                 )
         for foot in feet:
@@ -193,7 +220,9 @@ def corridor(
     xyz, code = xyz[keep], code[keep]
     xyz[:, 2] += rng.normal(0, 0.03, len(xyz))
     c, r = np.cos(turn), np.sin(turn)
-    xyz = np.column_stack([xyz[:, 0] * c - xyz[:, 1] * r, xyz[:, 0] * r + xyz[:, 1] * c, xyz[:, 2] + 100.0])
+    xyz = np.column_stack(
+        [xyz[:, 0] * c - xyz[:, 1] * r, xyz[:, 0] * r + xyz[:, 1] * c, xyz[:, 2] + 100.0]
+    )
     return np.round(xyz + np.array([85_000.0 + offset, 447_000.0, 0.0]), 3), code.astype(np.uint8)
 
 
@@ -206,10 +235,18 @@ CORRIDORS = {
         [Line(0.0, _every(280.0, 840.0), HIGH, 1.1e-4, "lattice", 42.0)], d, seed
     ),
     "highest voltage": lambda d=8.0, seed=6: corridor(
-        [Line(0.0, _every(300.0, 900.0), HIGHEST, 1.0e-4, "wide", 48.0)], d, seed, clear=10.0, turn=0.5
+        [Line(0.0, _every(300.0, 900.0), HIGHEST, 1.0e-4, "wide", 48.0)],
+        d,
+        seed,
+        clear=10.0,
+        turn=0.5,
     ),
     "high voltage, uphill": lambda d=8.0, seed=1: corridor(
-        [Line(5.0, _every(240.0, 720.0, 30.0), DOUBLE, 1.2e-4, "lattice", 25.0)], d, seed, slope=0.2, turn=1.1
+        [Line(5.0, _every(240.0, 720.0, 30.0), DOUBLE, 1.2e-4, "lattice", 25.0)],
+        d,
+        seed,
+        slope=0.2,
+        turn=1.1,
     ),
     "medium voltage in woods": lambda d=8.0, seed=2: corridor(
         [Line(0.0, _every(80.0), MEDIUM, 2.0e-4, "pole", 10.8)],
@@ -231,7 +268,11 @@ CORRIDORS = {
         turn=2.0,
     ),
     "frames": lambda d=8.0, seed=4: corridor(
-        [Line(10.0, _every(150.0), ((-4.0, 13.0), (0.0, 13.0), (4.0, 13.0)), 1.5e-4, "frame", 13.8)],
+        [
+            Line(
+                10.0, _every(150.0), ((-4.0, 13.0), (0.0, 13.0), (4.0, 13.0)), 1.5e-4, "frame", 13.8
+            )
+        ],
         d,
         seed,
         turn=0.0,

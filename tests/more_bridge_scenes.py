@@ -8,12 +8,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from bridge_scenes import BUILDING, DECK, GROUND, LEAF, OTHER, WATER, Scene, Slab, _cars, _deck, _road
+from bridge_scenes import (
+    BUILDING,
+    DECK,
+    GROUND,
+    LEAF,
+    OTHER,
+    WATER,
+    Scene,
+    Slab,
+    _cars,
+    _deck,
+    _road,
+)
 
 
 def _piers(slabs, top, reach, half, step, foot):
     for s in np.arange(-reach + step, reach - 1, step):
-        slabs.append(Slab(s - 0.8, s + 0.8, -half + 1, half - 1, lambda a: top(a) - 1.4, -foot + 12.0, OTHER))
+        slabs.append(
+            Slab(s - 0.8, s + 0.8, -half + 1, half - 1, lambda a: top(a) - 1.4, -foot + 12.0, OTHER)
+        )
 
 
 def _trees(rng, ends, sides, count, tall):
@@ -32,8 +46,12 @@ def deep_valley(seed=0, half=7.0, reach=130.0, deep=30.0, bend=260.0, turn=0.1):
         return 0.3 + 0.0 * s
 
     def terrain(s, t):
-        z = -np.clip((reach - np.abs(s)) * 0.6, 0.0, deep) + 0.3 * np.sin(s / 13.0) * np.cos(t / 17.0)
-        return np.where((np.abs(s) > reach) & (np.abs(t) < half + 2), top(s), z), np.full(len(s), GROUND)
+        z = -np.clip((reach - np.abs(s)) * 0.6, 0.0, deep) + 0.3 * np.sin(s / 13.0) * np.cos(
+            t / 17.0
+        )
+        return np.where((np.abs(s) > reach) & (np.abs(t) < half + 2), top(s), z), np.full(
+            len(s), GROUND
+        )
 
     slabs: list[Slab] = []
     _deck(slabs, -reach, reach, -half, half, top, 2.5)
@@ -85,7 +103,9 @@ def upright(density=16.0, seed=0, reach=100.0, half=6.0, high=8.0, bank=16.0, we
     """
     rng = np.random.default_rng(seed)
     long, wide = 2 * reach + 100.0, 120.0
-    s, t = rng.uniform((-long / 2, -wide / 2), (long / 2, wide / 2), (int(density * long * wide), 2)).T
+    s, t = rng.uniform(
+        (-long / 2, -wide / 2), (long / 2, wide / 2), (int(density * long * wide), 2)
+    ).T
     over = np.clip(reach - np.abs(s), 0, None)
     ground = -np.minimum(over * high / bank, high)
     code = np.full(len(s), GROUND)
@@ -146,7 +166,12 @@ def parking_roof(seed=0, turn=0.8):
 
 def roof_beside_roofs(seed=0, turn=0.6):
     """A hall that the cloud's rim cuts; at its other end a lower roof of a quarter of its width, between higher ones."""
-    roofs = [(-80, 10, -14, 14, 4.5), (10, 30, -6, 0, 4.2), (10, 40, 0, 8, 9.0), (30, 40, -12, 8, 9.0)]
+    roofs = [
+        (-80, 10, -14, 14, 4.5),
+        (10, 30, -6, 0, 4.2),
+        (10, 40, 0, 8, 9.0),
+        (30, 40, -12, 8, 9.0),
+    ]
     slabs = [Slab(*place, lambda s, z=z: z + 0 * s, z, BUILDING) for *place, z in roofs]
     return Scene(_flat, slabs, [], turn, 120.0, 90.0)
 

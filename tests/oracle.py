@@ -93,7 +93,11 @@ def features(members, volume, q):
         "HeightAboveLowest": q[2] - members[:, 2].min(),
     }
     if len(members) < 3 or (members == members[0]).all():
-        return {**dict.fromkeys((*COVARIANCE, "Verticality"), 0.0), "SurfaceVariation": 1.0 / 3.0, **out}
+        return {
+            **dict.fromkeys((*COVARIANCE, "Verticality"), 0.0),
+            "SurfaceVariation": 1.0 / 3.0,
+            **out,
+        }
     l, vectors = eigen(members)
     e1, e2, e3 = l / l.sum()
     normal = abs(vectors[2, 2])
@@ -136,7 +140,11 @@ def surface(xyz, q):
         along = vectors[:, 0]
         normal = np.array([0.0, 0.0, 1.0]) - along[2] * along
         length = np.linalg.norm(normal)
-        return (normal / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])), float(l[2] / l.sum()), 1.0
+        return (
+            (normal / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])),
+            float(l[2] / l.sum()),
+            1.0,
+        )
     return normal, float(l[2] / l.sum()), normal_gap(members)
 
 

@@ -63,7 +63,9 @@ def test_all_measures_equal_scikit_learn(pair):
     p, r, f, n = metrics.precision_recall_fscore_support(
         reference, predicted, labels=present, zero_division=0.0
     )
-    iou = metrics.jaccard_score(reference, predicted, labels=present, average=None, zero_division=0.0)
+    iou = metrics.jaccard_score(
+        reference, predicted, labels=present, average=None, zero_division=0.0
+    )
     np.testing.assert_allclose(list(a.precision.values()), p)
     np.testing.assert_allclose(list(a.recall.values()), r)
     np.testing.assert_allclose(list(a.f1.values()), f)
@@ -78,10 +80,14 @@ def test_all_measures_equal_scikit_learn(pair):
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            assert a.kappa == pytest.approx(metrics.cohen_kappa_score(reference, predicted), abs=1e-12)
+            assert a.kappa == pytest.approx(
+                metrics.cohen_kappa_score(reference, predicted), abs=1e-12
+            )
     np.testing.assert_allclose(
         a.by_reference,
-        metrics.confusion_matrix(reference, predicted, labels=everything, normalize="true")[: len(present)],
+        metrics.confusion_matrix(reference, predicted, labels=everything, normalize="true")[
+            : len(present)
+        ],
     )
 
 
@@ -128,11 +134,19 @@ def test_tiles_add_to_the_whole(pair, cut, ignore):
 
     def compare(part):
         return Accuracy.from_labels(
-            reference[part], predicted[part], ignore=ignore, reliability=reliability[part], allow_empty=True
+            reference[part],
+            predicted[part],
+            ignore=ignore,
+            reliability=reliability[part],
+            allow_empty=True,
         )
 
     whole, tiles = compare(slice(None)), sum([compare(slice(cut)), compare(slice(cut, None))])
-    assert (whole.classes, whole.extra, whole.left_out) == (tiles.classes, tiles.extra, tiles.left_out)
+    assert (whole.classes, whole.extra, whole.left_out) == (
+        tiles.classes,
+        tiles.extra,
+        tiles.left_out,
+    )
     np.testing.assert_array_equal(whole.matrix, tiles.matrix)
     np.testing.assert_array_equal(whole.reliability.count, tiles.reliability.count)
     np.testing.assert_allclose(whole.reliability.total, tiles.reliability.total)
@@ -253,14 +267,20 @@ def test_table_is_ascii_and_aligned():
             "reliability has a different length",
         ),
         ({"reference": [2.0, np.nan], "predicted": [2, 2]}, "not class codes.*nan"),
-        ({"reference": [2], "predicted": [2], "classes": ["ground"]}, "a class in 'classes'.*'ground'"),
+        (
+            {"reference": [2], "predicted": [2], "classes": ["ground"]},
+            "a class in 'classes'.*'ground'",
+        ),
         (
             {"reference": [2], "predicted": [2], "merge": {5: [3], 6: [3]}},
             "to two others.*class 3 to 5 and 6",
         ),
         ({"reference": [2], "predicted": [2], "merge": {3: 5}}, "list of classes.*5"),
         ({"reference": [2], "predicted": [2], "reliability": [87.0]}, "not between 0 and 1.*87"),
-        ({"reference": np.arange(300), "predicted": np.zeros(300, int)}, "too many different values.*300"),
+        (
+            {"reference": np.arange(300), "predicted": np.zeros(300, int)},
+            "too many different values.*300",
+        ),
     ],
 )
 def test_misuse_is_told(arguments, message):

@@ -51,7 +51,9 @@ def models(tmp_path_factory):
         ("binary", {"strategy": "binary", "target": 6}),
         ("translated", {"classes": {"2": 5, "3,5": 4, "6": 2}}),
     ):
-        train([cloud], TrainingOptions(**common, **options), progress=False).save(folder / f"{name}.model")
+        train([cloud], TrainingOptions(**common, **options), progress=False).save(
+            folder / f"{name}.model"
+        )
     return folder
 
 
@@ -81,7 +83,10 @@ def test_the_trained_classes_are_scored(models, tmp_path, write_las, capfd):
         (5, "Anything green"),
         (6, "Building"),
     ]
-    assert figures["merged"] == {"3": 5} and figures["left_out"] == {"points": 90, "by_class": {"1": 90}}
+    assert figures["merged"] == {"3": 5} and figures["left_out"] == {
+        "points": 90,
+        "by_class": {"1": 90},
+    }
     assert figures["overall_accuracy"] > 0.5
     assert "Anything green" in capfd.readouterr().out
     for words in ("town.laz", "RGF93 / Lambert-93 (EPSG:2154)", "classes.model", "Importances"):
@@ -124,16 +129,23 @@ def test_files_are_compared_in_pairs_of_their_name(tmp_path, write_las, capfd):
     for seed, name in enumerate(("b", "a_2", "a")):
         arrays = scene(seed=seed)
         write_las(tmp_path / "true" / f"{name}.laz", arrays)
-        arrays["Classification"] = np.where(np.arange(900) < 180, 5, arrays["Classification"]).astype(
-            np.uint8
-        )
+        arrays["Classification"] = np.where(
+            np.arange(900) < 180, 5, arrays["Classification"]
+        ).astype(np.uint8)
         write_las(tmp_path / "found" / f"c_{name}.laz", arrays)
     for sources in (
         [tmp_path / "found"],
         [tmp_path / "found" / "c_*.laz"],
         sorted((tmp_path / "found").iterdir()),
     ):
-        words = ["accuracy", *sources, "--reference", tmp_path / "true", "--html", tmp_path / "a.html"]
+        words = [
+            "accuracy",
+            *sources,
+            "--reference",
+            tmp_path / "true",
+            "--html",
+            tmp_path / "a.html",
+        ]
         assert main([str(w) for w in words]) == 0
         out, _ = capfd.readouterr()
         assert re.search(r"Points compared +2,430\b", out)

@@ -62,12 +62,18 @@ def test_is_a_model_that_says_what_it_is_of(model, town, tmp_path, capsys):
     assert made.codes.tolist() == [2, 5, 6] and len(made.passes) == 2
     standard = ps.load_model("standard")
     assert made.voxel == standard.voxel and made.info["preparation"] == standard.info["preparation"]
-    assert made.info["teacher"]["name"] == "standard" and made.info["teacher"]["sure"] == adapting.SURE
+    assert (
+        made.info["teacher"]["name"] == "standard" and made.info["teacher"]["sure"] == adapting.SURE
+    )
     assert "what standard is sure of (0.7 and more)" in str(made)
     assert "not scored" in str(made) and "overall accuracy" not in str(made)
     source, target = town / "bare" / "t0.laz", tmp_path / "o.laz"
     code, said = run(capsys, "classify", source, target, "--model", model, "--keep-sure", "0.9")
-    assert code == 1 and "it was never scored" in said and "Its labels are another model's answers" in said
+    assert (
+        code == 1
+        and "it was never scored" in said
+        and "Its labels are another model's answers" in said
+    )
     assert run(capsys, "classify", source, target, "--model", model)[0] == 0
     truth = MADE().classification[MADE().xyz[:, 0] > 500_033.0]
     found = np.asarray(laspy.read(target).classification)
@@ -94,7 +100,9 @@ def test_only_what_is_sure_is_learned(tmp_path, write_las):
 
 def test_a_class_that_is_not_there(town, tmp_path, write_las, capsys):
     wood = (MADE().classification != 6) & (MADE().classification != 1)
-    write_las(tmp_path / "wood.laz", dict(zip("XYZ", MADE().xyz[wood].T, strict=True)), point_format=6)
+    write_las(
+        tmp_path / "wood.laz", dict(zip("XYZ", MADE().xyz[wood].T, strict=True)), point_format=6
+    )
     code, said = run(capsys, "adapt", tmp_path / "wood.laz", "--model", tmp_path / "o.model")
     assert code == 0 and "too few points of a class" in said and "class 6" in said
     assert ps.load_model(tmp_path / "o.model").codes.tolist() == [2, 5]
@@ -110,13 +118,18 @@ def test_a_class_that_is_not_there(town, tmp_path, write_las, capsys):
     [
         (("nix.laz", "--model", "o.model"), "there is no such file"),
         (("{town}/bare", "--model", "nix/o.model"), "does not exist"),
-        (("{town}/bare", "--model", "o.model", "--sure", "1.5"), "'--sure' must be a number from 0 to 1"),
+        (
+            ("{town}/bare", "--model", "o.model", "--sure", "1.5"),
+            "'--sure' must be a number from 0 to 1",
+        ),
         (("{town}/bare", "--model", "o.model", "--teacher", "standart"), "standart"),
         (("{town}/bare/t0.laz", "--model", "{town}/bare/t0.laz"), "t0.laz"),
         (("cut.laz", "--model", "o.model"), "cut.laz"),
     ],
 )
-def test_what_is_wrong_is_said_and_nothing_is_left(town, tmp_path, capsys, monkeypatch, words, said):
+def test_what_is_wrong_is_said_and_nothing_is_left(
+    town, tmp_path, capsys, monkeypatch, words, said
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cut.laz").write_bytes((town / "bare" / "t0.laz").read_bytes()[:9000])
     before = (town / "bare" / "t0.laz").read_bytes()

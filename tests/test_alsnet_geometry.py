@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 
 from pdal_stages.alsnet.circles import Circles, halo_m, spacing_for
 from pdal_stages.alsnet.configuration import parse_configuration
-from pdal_stages.alsnet.geometry import ball_query, build, farthest_points, scramble, stack, three_nearest
+from pdal_stages.alsnet.geometry import (
+    ball_query,
+    build,
+    farthest_points,
+    scramble,
+    stack,
+    three_nearest,
+)
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features.cells import density
 
@@ -35,9 +42,12 @@ def slow_ball(p, centers, radius, samples):
 
 clouds = st.builds(
     lambda seed, n, kind: (
-        np.random.default_rng(seed).integers(0, 4, (n, 3)).astype(float)  # ties and coinciding points
+        np.random.default_rng(seed)
+        .integers(0, 4, (n, 3))
+        .astype(float)  # ties and coinciding points
         if kind == "lattice"
-        else np.random.default_rng(seed).normal(size=(n, 3)) * (10.0 if kind == "wide" else [50.0, 1e-3, 2.0])
+        else np.random.default_rng(seed).normal(size=(n, 3))
+        * (10.0 if kind == "wide" else [50.0, 1e-3, 2.0])
     ),
     st.integers(0, 2**32),
     st.integers(1, 300),
@@ -61,7 +71,9 @@ def test_farthest_points_equal_the_reference(p, data):
 @settings(max_examples=30, deadline=None)
 def test_ball_query_equals_the_reference(p, radius, samples, seed):
     centers = np.random.default_rng(seed).integers(0, len(p), min(len(p), 30))
-    assert np.array_equal(ball_query(p, centers, radius, samples), slow_ball(p, centers, radius, samples))
+    assert np.array_equal(
+        ball_query(p, centers, radius, samples), slow_ball(p, centers, radius, samples)
+    )
 
 
 @given(clouds, st.integers(1, 10))
@@ -72,10 +84,15 @@ def test_three_nearest_weigh_by_inverse_square(p, m):
     d2 = ((p[:, None, :] - coarse[None, :, :]) ** 2).sum(axis=2)
     k = min(3, len(coarse))
     np.testing.assert_allclose(
-        np.take_along_axis(d2, index[:, :k], axis=1), np.sort(d2, axis=1)[:, :k], rtol=1e-9, atol=1e-12
+        np.take_along_axis(d2, index[:, :k], axis=1),
+        np.sort(d2, axis=1)[:, :k],
+        rtol=1e-9,
+        atol=1e-12,
     )
     expected = 1.0 / np.maximum(np.sort(d2, axis=1)[:, :k], 1e-10)
-    np.testing.assert_allclose(weight[:, :k], expected / expected.sum(axis=1, keepdims=True), rtol=1e-4)
+    np.testing.assert_allclose(
+        weight[:, :k], expected / expected.sum(axis=1, keepdims=True), rtol=1e-4
+    )
     assert not weight[:, k:].any()
 
 
@@ -140,13 +157,19 @@ def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
     xyz, _, _ = scene(20_000, 80.0)
     dense = (xyz[:, 0] > 40) & (xyz[:, 0] < 42)
     xyz = np.concatenate(
-        [xyz, np.repeat(xyz[dense], 9, axis=0) + np.random.default_rng(0).random((9 * dense.sum(), 3))]
+        [
+            xyz,
+            np.repeat(xyz[dense], 9, axis=0)
+            + np.random.default_rng(0).random((9 * dense.sum(), 3)),
+        ]
     )
     spacing = 4.0
     whole = Circles(xyz, 200, spacing)
     low, high = np.array([30.0, 30.0]), np.array([45.0, 50.0])
     own = ((xyz[:, :2] >= low) & (xyz[:, :2] < high)).all(axis=1)
-    around = ((xyz[:, :2] >= low - halo_m(spacing)) & (xyz[:, :2] < high + halo_m(spacing))).all(axis=1)
+    around = ((xyz[:, :2] >= low - halo_m(spacing)) & (xyz[:, :2] < high + halo_m(spacing))).all(
+        axis=1
+    )
     rows = np.flatnonzero(around)
     tile = Circles(xyz[rows], 200, spacing)
 
@@ -159,7 +182,9 @@ def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
         return out
 
     assert holding(whole, own, np.arange(len(xyz))) == holding(tile, own[rows], rows)
-    assert len(np.unique(whole.sizes)) == 1 and len(whole) > (80 / spacing) ** 2  # some cells were quartered
+    assert (
+        len(np.unique(whole.sizes)) == 1 and len(whole) > (80 / spacing) ** 2
+    )  # some cells were quartered
 
 
 # ---- pyramids -----------------------------------------------------------------------------------------------
@@ -190,7 +215,9 @@ def test_pyramid_shapes_and_who_is_where():
 
 
 def test_stacked_pyramids_do_not_mix():
-    parts = [build(scene(n, 6.0, n)[0], np.full((n, 1), n, np.float32), TINY) for n in (100, 256, 30)]
+    parts = [
+        build(scene(n, 6.0, n)[0], np.full((n, 1), n, np.float32), TINY) for n in (100, 256, 30)
+    ]
     whole = stack(parts)
     fine = np.repeat(np.arange(3), [100, 256, 30])
     for k, step in enumerate(whole.steps):
@@ -215,7 +242,10 @@ def test_scramble_follows_the_coordinates():
     [
         ("smal", "Did you mean 'small'"),
         ({"points": 100}, "needs 'levels'"),
-        ({"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "radius": float("nan")}]}, "'radius'"),
+        (
+            {"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "radius": float("nan")}]},
+            "'radius'",
+        ),
         ({"points": 100, "levels": [{**TINY.to_dict()["levels"][0], "mlp": [0]}]}, "'mlp'"),
     ],
 )

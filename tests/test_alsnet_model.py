@@ -20,7 +20,9 @@ INPUTS = ("Z", "HeightAboveGround", "Intensity")
 
 
 def net_with(**changes):
-    return dataclasses.replace(random_net(INPUTS), mean=(0.0, 1.0, 90.0), scale=(1.0, 2.0, 50.0), **changes)
+    return dataclasses.replace(
+        random_net(INPUTS), mean=(0.0, 1.0, 90.0), scale=(1.0, 2.0, 50.0), **changes
+    )
 
 
 # ---- the network ------------------------------------------------------------------------------------------
@@ -40,7 +42,9 @@ def test_a_level_equals_a_computation_by_hand():
     def layer(name, row):
         array = net.weights[name].astype(float)
         scale, shift, mean, variance = array[:, -4:].T
-        return np.maximum((array[:, :-4] @ row - mean) / np.sqrt(variance + 1e-5) * scale + shift, 0.0)
+        return np.maximum(
+            (array[:, :-4] @ row - mean) / np.sqrt(variance + 1e-5) * scale + shift, 0.0
+        )
 
     balls = []
     for ball in range(2):
@@ -91,7 +95,9 @@ def test_averages_equal_a_hand_computation():
     request = PredictRequest(xyz, dimensions)
     ((_, found),) = net.predict(request, lambda p: p)
     columns = scaled(xyz, dimensions, net.inputs, net.mean, net.scale)
-    np.testing.assert_allclose(columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5)
+    np.testing.assert_allclose(
+        columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5
+    )
     circles = Circles(xyz, TINY.points, net.spacing, columns)
     each = [[] for _ in xyz]
     for number in range(len(circles)):
@@ -112,7 +118,10 @@ def test_order_of_points_threads_and_rows_do_not_matter():
     whole = model.predict(xyz, dimensions, threads=1, probabilities=True, margin=True)
     shuffled = np.random.default_rng(5).permutation(len(xyz))
     other = model.predict(
-        xyz[shuffled], {k: v[shuffled] for k, v in dimensions.items()}, threads=2, probabilities=True
+        xyz[shuffled],
+        {k: v[shuffled] for k, v in dimensions.items()},
+        threads=2,
+        probabilities=True,
     )
     assert np.array_equal(whole.probabilities[shuffled], other.probabilities)
     where = xyz[:, 0] < 7
@@ -132,7 +141,9 @@ def test_a_tile_with_its_halo_gets_the_labels_of_the_whole():
     assert model.halo_m == pytest.approx((3.0 + 0.5**0.5) * 3.0)
     low = xyz.min(axis=0)[:2] + 20.0
     own = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 12.0)).all(axis=1)
-    near = ((xyz[:, :2] >= low - model.halo_m) & (xyz[:, :2] < low + 12.0 + model.halo_m)).all(axis=1)
+    near = ((xyz[:, :2] >= low - model.halo_m) & (xyz[:, :2] < low + 12.0 + model.halo_m)).all(
+        axis=1
+    )
     tile = model.predict(
         xyz[near], {k: v[near] for k, v in dimensions.items()}, own[near], probabilities=True
     )
@@ -153,7 +164,11 @@ def test_absurd_weights_give_an_error_not_nan():
     weights = {name: array * np.float32(1e30) for name, array in net.weights.items()}
     xyz, _, dimensions = scene(300, 8.0)
     with np.errstate(all="ignore"), pytest.raises(ModelError, match="not numbers"):
-        next(dataclasses.replace(net, weights=weights).predict(PredictRequest(xyz, dimensions), lambda p: p))
+        next(
+            dataclasses.replace(net, weights=weights).predict(
+                PredictRequest(xyz, dimensions), lambda p: p
+            )
+        )
 
 
 # ---- files ------------------------------------------------------------------------------------------------
@@ -245,8 +260,14 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "pdal_stages.alsnet.network", raising=False)
     xyz, labels, dimensions = scene(300, 8.0)
     monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
-    with pytest.raises(DependencyError, match=r"Install it with: pip install 'pdal-stages\[deep\]'"):
-        train([TrainingCloud(xyz, labels, dimensions)], TrainingOptions(algorithm="alsnet"), progress=False)
+    with pytest.raises(
+        DependencyError, match=r"Install it with: pip install 'pdal-stages\[deep\]'"
+    ):
+        train(
+            [TrainingCloud(xyz, labels, dimensions)],
+            TrainingOptions(algorithm="alsnet"),
+            progress=False,
+        )
     model_of(net_with()).predict(xyz, dimensions)  # applying needs none
 
 

@@ -36,7 +36,9 @@ def cloud(tmp_path, write_las):
 @pytest.fixture
 def model(tmp_path):
     path = tmp_path / "net.model"
-    net = dataclasses.replace(random_net(("Z", "Intensity"), seed=4), mean=(0.2, 100.0), scale=(0.3, 60.0))
+    net = dataclasses.replace(
+        random_net(("Z", "Intensity"), seed=4), mean=(0.2, 100.0), scale=(0.3, 60.0)
+    )
     model_of(net).save(path)
     return path
 
@@ -109,14 +111,28 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     path = write_las(tmp_path / "in.las", arrays, point_format=7)
     reader = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
     made, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
-    network = {"configuration": TINY.to_dict(), "epochs": 16, "validation": 0, "learning_rate": 0.01}
+    network = {
+        "configuration": TINY.to_dict(),
+        "epochs": 16,
+        "validation": 0,
+        "learning_rate": 0.01,
+    }
     network["checkpoint"] = str(tmp_path / "a.checkpoint")
-    writer = {"type": WRITER, "filename": made, "algorithm": "alsnet", "alsnet": network, "threads": 1}
+    writer = {
+        "type": WRITER,
+        "filename": made,
+        "algorithm": "alsnet",
+        "alsnet": network,
+        "threads": 1,
+    }
     ps.run_pipeline([reader, {**writer, "dimensions": "Red,EchoWidth"}])
     assert load_model(made).required_dimensions == ("Red", "EchoWidth")
     ps.run_pipeline([reader, {"type": "filters.modelclassifier", "model": made}, out])
     assert (np.asarray(laspy.read(out).classification) == labels).mean() > 0.95
-    assert len(load_model(made).info["training"]["curve"]) == 16 and (tmp_path / "a.checkpoint").exists()
+    assert (
+        len(load_model(made).info["training"]["curve"]) == 16
+        and (tmp_path / "a.checkpoint").exists()
+    )
     del arrays["EchoWidth"]
     bare = str(write_las(tmp_path / "bare.las", arrays, point_format=7))
     with pytest.raises(DimensionError, match="EchoWidth"):
@@ -127,7 +143,11 @@ def test_stage_options(model, tmp_path):
     classifier, writer = stage_type("filters.modelclassifier"), stage_type(WRITER)
     made = classifier({"model": str(model)})
     assert made.halo_m() == load_model(model).halo_m
-    given = {"filename": str(tmp_path / "m"), "algorithm": "alsnet", "alsnet": {"coordinates": "XYZ"}}
+    given = {
+        "filename": str(tmp_path / "m"),
+        "algorithm": "alsnet",
+        "alsnet": {"coordinates": "XYZ"},
+    }
     assert writer(given).reads() == ["Classification", "HeightAboveGround"]
     with pytest.raises(OptionError, match="epochs"):
         writer({**given, "alsnet": {"epochs": -1}})

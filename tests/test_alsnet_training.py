@@ -42,7 +42,13 @@ def fit(clouds=None, progress=False, dimensions=("HeightAboveGround",), **networ
     if clouds is None:
         xyz, labels, values = scene()
         clouds = [TrainingCloud(xyz, labels, values, name="scene")]
-    network = {"configuration": TINY, "validation": 0, "epochs": 2, "histogram_threshold": 100, **network}
+    network = {
+        "configuration": TINY,
+        "validation": 0,
+        "epochs": 2,
+        "histogram_threshold": 100,
+        **network,
+    }
     options = TrainingOptions(
         algorithm="alsnet", alsnet=network, dimensions=dimensions, seed=3, threads=1, voxel=0.0
     )
@@ -55,7 +61,9 @@ def fit(clouds=None, progress=False, dimensions=("HeightAboveGround",), **networ
 def test_batches_of_one_class_are_passed_over_unless_a_class_would_be_lost():
     random = np.random.default_rng(0)
     xyz = random.random((4000, 3)) * [80.0, 20.0, 1.0]
-    labels = np.where(xyz[:, 0] < 40, 0, random.integers(0, 2, 4000))  # left: one class; right: two, mixed
+    labels = np.where(
+        xyz[:, 0] < 40, 0, random.integers(0, 2, 4000)
+    )  # left: one class; right: two, mixed
     lonely = (xyz[:, 0] < 4) & (xyz[:, 1] < 4)
     labels[lonely] = 2
     circles = Circles(xyz, 200, 6.0)
@@ -88,7 +96,8 @@ def test_no_batch_holds_points_of_two_clouds():
     for k in (0, 1, 3):
         away = joined[of == k] - clouds[k]
         assert (
-            np.allclose(away, away[0], atol=1e-9) and abs(away[0, 0] / 3.0 - round(away[0, 0] / 3.0)) < 1e-9
+            np.allclose(away, away[0], atol=1e-9)
+            and abs(away[0, 0] / 3.0 - round(away[0, 0] / 3.0)) < 1e-9
         )
 
 
@@ -121,7 +130,10 @@ def test_augmentation_turns_shakes_and_thins(seed, n):
     assert len(out) == len(kept) == len(set(kept.tolist()))
     assert len(kept) >= max(min(n, 16), int((1 - THIN) * n) - 1)
     away = 3 * JITTER * 3**0.5 + 1e-9
-    assert np.abs(np.linalg.norm(out[:, :2], axis=1) - np.linalg.norm(xyz[kept, :2], axis=1)).max() <= away
+    assert (
+        np.abs(np.linalg.norm(out[:, :2], axis=1) - np.linalg.norm(xyz[kept, :2], axis=1)).max()
+        <= away
+    )
     assert np.abs(out[:, 2] - xyz[kept, 2]).max() <= away
 
 
@@ -152,7 +164,12 @@ def test_a_tiny_network_overfits_a_tiny_scene():
     """Without heights above ground: from the points' positions alone."""
     xyz, labels, _ = scene(1200, 12.0)
     model = fit(
-        [TrainingCloud(xyz, labels)], dimensions=(), points=600, epochs=25, learning_rate=0.01, augment=False
+        [TrainingCloud(xyz, labels)],
+        dimensions=(),
+        points=600,
+        epochs=25,
+        learning_rate=0.01,
+        augment=False,
     )
     found = model.predict(xyz, {})
     assert np.mean(found.classification == labels) > 0.97
@@ -195,7 +212,9 @@ def test_resumed_training_equals_one_without_a_break(tmp_path):
     with pytest.raises(ModelError, match=r"another training.*options"):
         fit(clouds, checkpoint=path, **{**setting, "learning_rate": 0.5})
     other = {name: np.asarray(column)[::-1] for name, column in values.items()}
-    with pytest.raises(ModelError, match=r"another training.*data"):  # of the same places, other values
+    with pytest.raises(
+        ModelError, match=r"another training.*data"
+    ):  # of the same places, other values
         fit([TrainingCloud(xyz, labels, other)], checkpoint=path, **setting)
 
 
@@ -300,10 +319,21 @@ def test_checkpoints_that_lie_are_refused(checkpoint, tmp_path):
         with pytest.raises(ModelError, match=r"checkpoint.*Delete"):
             go_on(path)
 
-    for changed in ({"identity": "another"}, {"network": {}}, {"network": _Runs(touched)}, {"best": [1]}):
+    for changed in (
+        {"identity": "another"},
+        {"network": {}},
+        {"network": _Runs(touched)},
+        {"best": [1]},
+    ):
         buffer = io.BytesIO()
         torch.save({**state, **changed}, buffer)
         refused(buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
-    for content in (b"", b"nothing", whole[:-30], whole[:500] + b"\0" + whole[501:], pickle.dumps({"a": 1})):
+    for content in (
+        b"",
+        b"nothing",
+        whole[:-30],
+        whole[:500] + b"\0" + whole[501:],
+        pickle.dumps({"a": 1}),
+    ):
         refused(content)
     assert not touched.exists()

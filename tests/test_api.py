@@ -84,7 +84,12 @@ def test_a_model_of_arrays_classifies_files_alike(scene, small, tmp_path, write_
     model = ps.train(xyz, y, small, progress=False)
     model.save(tmp_path / "m.model")
     source = write_las(tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), offset=(0, 0, 0))
-    assert main(["classify", str(source), str(tmp_path / "o.las"), "--model", str(tmp_path / "m.model")]) == 0
+    assert (
+        main(
+            ["classify", str(source), str(tmp_path / "o.las"), "--model", str(tmp_path / "m.model")]
+        )
+        == 0
+    )
     import laspy
 
     made = laspy.read(tmp_path / "o.las")

@@ -13,7 +13,9 @@ from pdal_stages.base.errors import OptionError
 
 @given(st.integers() | st.floats() | st.booleans() | st.none() | st.text())
 def test_numbers_are_taken_where_they_are_within(value):
-    good = isinstance(value, int | float) and not isinstance(value, bool) and -5 <= value <= 2**63 - 1
+    good = (
+        isinstance(value, int | float) and not isinstance(value, bool) and -5 <= value <= 2**63 - 1
+    )
     try:
         number = checks.number("'x'", value, -5, 2**63 - 1)
     except OptionError as error:
@@ -61,7 +63,12 @@ def test_cores_are_bounded_by_affinity_quota_and_what_a_worker_is_told(tmp_path,
     (tmp_path / "cpu/cpu.cfs_quota_us").write_text("-1\n")
     (tmp_path / "cpu/cpu.cfs_period_us").write_text("100000\n")
     assert count() == 12
-    for text, cores in (("max 100000\n", 12), ("250000 100000\n", 3), ("1000 100000\n", 1), ("", 12)):
+    for text, cores in (
+        ("max 100000\n", 12),
+        ("250000 100000\n", 3),
+        ("1000 100000\n", 1),
+        ("", 12),
+    ):
         (tmp_path / "cpu.max").write_text(text)
         assert count() == cores
     (tmp_path / "cpu/cpu.cfs_quota_us").write_text("400000\n")

@@ -12,7 +12,12 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.base.lascheck import check_complete
 
 COUNT = 300
-FAUX = {"type": "readers.faux", "count": COUNT, "mode": "uniform", "bounds": "([0,100],[0,100],[0,9])"}
+FAUX = {
+    "type": "readers.faux",
+    "count": COUNT,
+    "mode": "uniform",
+    "bounds": "([0,100],[0,100],[0,9])",
+}
 CASES = {
     "a.las": {},
     "b.laz": {"compression": "laszip"},

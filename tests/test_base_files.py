@@ -36,7 +36,10 @@ def test_several_files_appear_together_or_not_at_all(tmp_path):
         if final == b:
             raise StageError("not whole", found=str(made))
 
-    with pytest.raises(StageError, match="not whole") as caught, whole_files(a, b, check=check) as partials:
+    with (
+        pytest.raises(StageError, match="not whole") as caught,
+        whole_files(a, b, check=check) as partials,
+    ):
         for partial in partials:
             partial.write_text("new")
     assert str(b) in str(caught.value) and PREFIX not in str(caught.value)
@@ -165,14 +168,22 @@ def test_devices_stay_what_they_are(tmp_path, into):
         out.flush()
         target = out if into == "file" else subprocess.PIPE
         done = subprocess.run(
-            [sys.executable, "-c", program], stdout=target, stderr=subprocess.STDOUT, text=True, check=True
+            [sys.executable, "-c", program],
+            stdout=target,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=True,
         )
     for old, new in zip(before, map(os.lstat, devices[:-1]), strict=True):
         assert (old.st_ino, old.st_mode, old.st_rdev) == (new.st_ino, new.st_mode, new.st_rdev)
     lines = (seen.read_text().removeprefix("older\n") if into == "file" else done.stdout).split()
     # Standard output has all in its order; what goes to standard error passes lines that wait to be written.
     expected = ["before", "before", "/dev/stdout", "before", "before", "/dev/fd/1", "before"]
-    assert [line for line in lines if line != "/dev/stderr"] == [*expected, "/proc/self/fd/1", "after"]
+    assert [line for line in lines if line != "/dev/stderr"] == [
+        *expected,
+        "/proc/self/fd/1",
+        "after",
+    ]
     assert "/dev/stderr" in lines and names(tmp_path) == ["seen"]
 
 
@@ -210,5 +221,6 @@ def test_leftovers_of_the_dead_go_and_of_the_living_stay(tmp_path, monkeypatch):
     alive.communicate("")
     sweep(tmp_path)
     assert (
-        names(tmp_path) == [foreign.name, "folder", "other.txt"] and (tmp_path / "folder" / "mine").exists()
+        names(tmp_path) == [foreign.name, "folder", "other.txt"]
+        and (tmp_path / "folder" / "mine").exists()
     )

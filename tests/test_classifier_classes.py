@@ -14,26 +14,47 @@ def test_default_takes_every_label_that_names_a_kind_of_object():
     assert classes.names[:3] == ("Ground", "High vegetation", "Building")
 
 
-@pytest.mark.parametrize("spec", [[2, 1, 6], "2,1,6", "[2, 1, 6]", ["2", "1", "6"], (1, 2, 6), "1-2,6"])
+@pytest.mark.parametrize(
+    "spec", [[2, 1, 6], "2,1,6", "[2, 1, 6]", ["2", "1", "6"], (1, 2, 6), "1-2,6"]
+)
 def test_lists(spec):
     assert ClassMap.parse(spec).codes == (1, 2, 6)
 
 
 @pytest.mark.parametrize(
     "value",
-    ["Vegetation", "5 Vegetation", "5: Vegetation", {"code": 5, "name": "Vegetation"}, "5=Vegetation"],
+    [
+        "Vegetation",
+        "5 Vegetation",
+        "5: Vegetation",
+        {"code": 5, "name": "Vegetation"},
+        "5=Vegetation",
+    ],
 )
 def test_mapping_merges_renames_and_drops(value):
     classes = ClassMap.parse({"2": "Ground", "3-4,5": value, 6: 6, "9": "drop", "17": None})
     assert classes.codes == (2, 5, 6)
     assert classes.names == ("Ground", "Vegetation", "Building")
     assert classes.labels == ((2,), (3, 4, 5), (6,))
-    assert classes.index(np.array([2, 3, 5, 6, 9, 17, 200, 0])).tolist() == [0, 1, 1, 2, -1, -1, -1, -1]
+    assert classes.index(np.array([2, 3, 5, 6, 9, 17, 200, 0])).tolist() == [
+        0,
+        1,
+        1,
+        2,
+        -1,
+        -1,
+        -1,
+        -1,
+    ]
 
 
 def test_two_labels_may_become_one_class():
     classes = ClassMap.parse({"100": "6 Building", "101": "6", "2": 2})
-    assert classes.codes == (2, 6) and classes.labels == ((2,), (100, 101)) and classes.names[1] == "Building"
+    assert (
+        classes.codes == (2, 6)
+        and classes.labels == ((2,), (100, 101))
+        and classes.names[1] == "Building"
+    )
 
 
 def test_a_single_label_with_a_name_of_its_own_keeps_its_code():

@@ -48,13 +48,17 @@ def cloud(seed, n, kind="even"):
 
 @settings(max_examples=10, deadline=None)
 @given(
-    st.integers(0, 10**6), st.sampled_from([1, 7, 200]), st.sampled_from(["even", "copies", "corners", "far"])
+    st.integers(0, 10**6),
+    st.sampled_from([1, 7, 200]),
+    st.sampled_from(["even", "copies", "corners", "far"]),
 )
 def test_equals_the_reference(seed, n, kind):
     xyz, shares = cloud(seed, n, kind)
     context = Context(TOKENS)
     rows = np.flatnonzero(np.random.default_rng(seed).random(n) < 0.5)
-    assert np.array_equal(context.columns_of(xyz, shares, 2)(rows), reference(xyz, shares, rows, context))
+    assert np.array_equal(
+        context.columns_of(xyz, shares, 2)(rows), reference(xyz, shares, rows, context)
+    )
 
 
 class Said:
@@ -83,7 +87,9 @@ def test_band_by_band_is_the_same(seed, kind, size):
     got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(passes, "BAND", size)
-        run = PassRun([WeightedPass(Said(blocks=blocks), 3), WeightedPass(Said(context), 3)], request)
+        run = PassRun(
+            [WeightedPass(Said(blocks=blocks), 3), WeightedPass(Said(context), 3)], request
+        )
         for rows, columns in run.blocks(lambda columns, rows: columns):
             seen[rows] += 1
             got[rows] = columns
@@ -102,7 +108,9 @@ def test_what_is_around_is_all_that_matters(seed, kind):
     near = around(xyz, rows, context)
     near = np.arange(400) if near is None else near
     expected = reference(xyz, shares, rows, context)
-    assert np.array_equal(context.columns_of(xyz[near], shares[near])(np.searchsorted(near, rows)), expected)
+    assert np.array_equal(
+        context.columns_of(xyz[near], shares[near])(np.searchsorted(near, rows)), expected
+    )
     far = np.abs(xyz[:, None, :2] - xyz[None, rows, :2]).max(axis=2).min(axis=1) >= context.reach
     alone = np.flatnonzero(~far)  # a tile with that halo
     assert np.array_equal(

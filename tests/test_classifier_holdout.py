@@ -16,7 +16,10 @@ def block_folds(xy, label, folds, side):
 
 @settings(max_examples=15, deadline=None)
 @given(
-    st.integers(0, 10**6), st.integers(2, 5), st.sampled_from([5.0, 13.0]), st.sampled_from([0.0, 1.0, 6.0])
+    st.integers(0, 10**6),
+    st.integers(2, 5),
+    st.sampled_from([5.0, 13.0]),
+    st.sampled_from([0.0, 1.0, 6.0]),
 )
 def test_blocks_are_whole_and_the_gap_is_kept(seed, folds, block, gap):
     random = np.random.default_rng(seed)
@@ -28,7 +31,9 @@ def test_blocks_are_whole_and_the_gap_is_kept(seed, folds, block, gap):
     for one in np.unique(cell, axis=0):
         assert len(set(fold[(cell == one).all(axis=1)].tolist())) == 1
     p = random.permutation(400)
-    assert np.array_equal(fold[p], block_folds(xy[p], label[p], folds, block))  # the order does not matter
+    assert np.array_equal(
+        fold[p], block_folds(xy[p], label[p], folds, block)
+    )  # the order does not matter
     for number in range(folds):
         train, held = split(xy, fold, number, gap)
         assert (fold[held] == number).all() and not train[held].any()
@@ -52,10 +57,16 @@ def test_every_fold_gets_its_share_of_every_class():
 
 def test_folds_are_blocks_or_whole_surveys():
     random = np.random.default_rng(0)
-    xy, label, one = random.random((900, 2)) * (90, 70), random.integers(0, 2, 900), np.ones(900, int)
+    xy, label, one = (
+        random.random((900, 2)) * (90, 70),
+        random.integers(0, 2, 900),
+        np.ones(900, int),
+    )
     folds = Folds.of_ground(xy, label, one, ("x", "y"), 4)
     assert folds.count == 4 and not folds.surveys
-    far = random.random((500, 3)) * 1000 - 500  # ground without samples belongs to some fold as well
+    far = (
+        random.random((500, 3)) * 1000 - 500
+    )  # ground without samples belongs to some fold as well
     assert set(folds.points(far).tolist()) == {0, 1, 2, 3}
     folds = Folds.of_ground(xy, label, one, ("x", "y", "z", "x"), 5)
     assert folds.count == 3 and sorted(folds.surveys.values()) == [0, 1, 2]

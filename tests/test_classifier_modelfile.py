@@ -52,10 +52,22 @@ def manifest(**changes):
         "target": None,
         "background": None,
         "classes": [
-            {"code": c, "name": str(c), "labels": [c], "available": 9, "samples": 9, "duplicates": 0}
+            {
+                "code": c,
+                "name": str(c),
+                "labels": [c],
+                "available": 9,
+                "samples": 9,
+                "duplicates": 0,
+            }
             for c in (2, 5, 6)
         ],
-        "training": {"clouds": [{"name": "a.laz", "points": 9}], "count": 9, "seed": 0, "samples": 27},
+        "training": {
+            "clouds": [{"name": "a.laz", "points": 9}],
+            "count": 9,
+            "seed": 0,
+            "samples": 27,
+        },
         "accuracy": {"cross_validation": None},
         "created_by": {"pdal_stages": "0.1.0"},
     }
@@ -79,7 +91,9 @@ def members(path):
 
 
 def pack(path, contents, **options):
-    with zipfile.ZipFile(path, "w", options.pop("compression", zipfile.ZIP_DEFLATED), **options) as archive:
+    with zipfile.ZipFile(
+        path, "w", options.pop("compression", zipfile.ZIP_DEFLATED), **options
+    ) as archive:
         for name, data in contents.items() if isinstance(contents, dict) else contents:
             archive.writestr(name, data)
     return path
@@ -139,7 +153,15 @@ def test_no_pickle_on_the_way():
     folder = Path(modelfile.__file__).parent
     for name in ("modelfile", "forest", "model", "algorithms"):
         text = (folder / f"{name}.py").read_text()
-        for word in ("import pickle", "joblib", "skops", "np.load(", "allow_pickle=True", "eval(", "exec("):
+        for word in (
+            "import pickle",
+            "joblib",
+            "skops",
+            "np.load(",
+            "allow_pickle=True",
+            "eval(",
+            "exec(",
+        ):
             assert word not in text, (name, word)
 
 
@@ -154,7 +176,10 @@ def test_the_documented_layout_is_enough_to_read_a_file(good):
     row = forest()[2][0]
     share, start, leaf = np.zeros(3), 0, 0
     for size in a["tree_sizes"]:
-        feature, threshold = a["feature"][start : start + size], a["threshold"][start : start + size]
+        feature, threshold = (
+            a["feature"][start : start + size],
+            a["threshold"][start : start + size],
+        )
         i = 0
         while feature[i] >= 0:
             k = np.count_nonzero(feature[:i] >= 0)
@@ -271,7 +296,10 @@ def test_manifests_that_are_no_manifest(good):
         (b'{"a": 1e999}', "too large"),
         (b'{"a": 1, "a": 2}', "duplicate key"),
         (b"[" * 200_000 + b"]" * 200_000, "deep"),
-        (b'{"format": "pdal-stages model", "version": 2, "x": ' + b"[" * 900 + b"]" * 900 + b"}", "manifest"),
+        (
+            b'{"format": "pdal-stages model", "version": 2, "x": ' + b"[" * 900 + b"]" * 900 + b"}",
+            "manifest",
+        ),
         (b"1" * 100_000, "JSON|something else"),
         (b" " * (modelfile.MANIFEST_LIMIT + 1), "too large"),
     ):

@@ -84,7 +84,9 @@ def test_equals_passes_by_hand(two, other):
     p = second.forest.predict_proba(np.hstack([values[rows], columns]))
     p = p * two.factors
     p /= p.sum(axis=1, keepdims=True)
-    assert np.array_equal(everything(two, xyz, dimensions).probabilities[rows], p.astype(np.float32))
+    assert np.array_equal(
+        everything(two, xyz, dimensions).probabilities[rows], p.astype(np.float32)
+    )
 
 
 def test_blocks_threads_memory_and_order_change_nothing(two, other):
@@ -114,7 +116,9 @@ def test_where_and_tiles_change_nothing(three, other):
 
 
 def test_empty_and_lone(two):
-    assert len(two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}).classification) == 0
+    assert (
+        len(two.predict(np.zeros((0, 3)), {"HeightAboveGround": np.zeros(0)}).classification) == 0
+    )
     lone = two.predict(np.array([[1e6, 2e6, 3.0]]), {"HeightAboveGround": np.zeros(1)})
     assert lone.report.figures["classified"] == 1
 
@@ -140,7 +144,11 @@ def test_the_file_holds_all_passes(three, other, tmp_path):
         ["own", "columnvotes2"],
         ["own", "columnvotes2"],
     ]
-    assert set(described["passes"][1]["importances"]["group"]) == {"covariance", "dimension", "context"}
+    assert set(described["passes"][1]["importances"]["group"]) == {
+        "covariance",
+        "dimension",
+        "context",
+    }
     assert sum(again.importances("neighborhood", 2).values()) == pytest.approx(1)
     assert "pass 3" in str(again) and "columnvotes2" in str(again)
 
@@ -149,7 +157,9 @@ def test_training_depends_on_nothing_but_the_points(two, tmp_path):
     xyz, label, dimensions = scene()
     p = np.random.default_rng(1).permutation(len(xyz))
     cloud = TrainingCloud(xyz[p], label[p], {k: v[p] for k, v in dimensions.items()}, "a.laz")
-    again = train([cloud], TrainingOptions(**FEW, passes=2, threads=3, memory_mb=40), progress=False)
+    again = train(
+        [cloud], TrainingOptions(**FEW, passes=2, threads=3, memory_mb=40), progress=False
+    )
     two.save(tmp_path / "m")
     again.save(tmp_path / "n")
     assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()

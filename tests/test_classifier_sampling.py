@@ -11,7 +11,9 @@ def chosen(clouds, samples):
     """Coordinates, class and weight of each sample, sorted."""
     rows = [
         (*clouds[c][0][r], int(k), int(w))
-        for c, r, k, w in zip(samples.cloud, samples.row, samples.label, samples.weight, strict=True)
+        for c, r, k, w in zip(
+            samples.cloud, samples.row, samples.label, samples.weight, strict=True
+        )
     ]
     return sorted(rows)
 

@@ -44,7 +44,9 @@ def scene(seed=0, n=6000, origin=(0.0, 0.0, 0.0)):
 def trained() -> Model:
     xyz, label, dimensions = scene()
     return train(
-        [TrainingCloud(xyz, label, dimensions, "some/folder/a.laz")], TrainingOptions(**SMALL), progress=False
+        [TrainingCloud(xyz, label, dimensions, "some/folder/a.laz")],
+        TrainingOptions(**SMALL),
+        progress=False,
     )
 
 
@@ -71,7 +73,11 @@ def test_another_place_is_classified(trained, other):
     xyz, label, dimensions = other
     result = trained.predict(xyz, dimensions, margin=True, probabilities=True)
     assert accuracy(result, label) > 0.9
-    assert result.classification.dtype == np.uint8 and set(np.unique(result.classification)) <= {2, 5, 6}
+    assert result.classification.dtype == np.uint8 and set(np.unique(result.classification)) <= {
+        2,
+        5,
+        6,
+    }
     assert result.reliability.dtype == np.float32
     p = np.sort(result.probabilities, axis=1)
     assert np.allclose(p.sum(axis=1), 1, atol=1e-6)
@@ -171,7 +177,14 @@ def test_counts_scores_and_importances(trained):
     with pytest.raises(OptionError, match="grouped"):
         trained.importances("color")
     text = str(trained)
-    for word in ("Ground", "Building", "c1 s2 kopt(5,20)", "HeightAboveGround", "a.laz", "held out"):
+    for word in (
+        "Ground",
+        "Building",
+        "c1 s2 kopt(5,20)",
+        "HeightAboveGround",
+        "a.laz",
+        "held out",
+    ):
         assert word in text
 
 
@@ -197,7 +210,9 @@ def test_several_clouds_are_sampled_together_but_are_not_neighbors():
     # Overlapping clouds: each sees its own points only.
     alone = train([clouds[0]], options, progress=False)
     twice = train(
-        [clouds[0], TrainingCloud(a[0][:0], a[1][:0], {k: v[:0] for k, v in a[2].items()})], options, False
+        [clouds[0], TrainingCloud(a[0][:0], a[1][:0], {k: v[:0] for k, v in a[2].items()})],
+        options,
+        False,
     )
     assert np.array_equal(alone.algorithm.forest.threshold, twice.algorithm.forest.threshold)
 
@@ -208,15 +223,29 @@ def test_errors_say_what_was_found(monkeypatch):
     with pytest.raises(OptionError, match=r"class 9 .* has no samples .*2: "):
         train([cloud], TrainingOptions(**SMALL, classes=[2, 9]), progress=False)
     with pytest.raises(OptionError, match=r"at least two classes .*1: 500"):
-        train([TrainingCloud(xyz, np.ones(500, int), dimensions)], TrainingOptions(**SMALL), progress=False)
+        train(
+            [TrainingCloud(xyz, np.ones(500, int), dimensions)],
+            TrainingOptions(**SMALL),
+            progress=False,
+        )
     with pytest.raises(OptionError, match="differ in number"):
-        train([TrainingCloud(xyz, label[:-1], dimensions)], TrainingOptions(**SMALL), progress=False)
+        train(
+            [TrainingCloud(xyz, label[:-1], dimensions)], TrainingOptions(**SMALL), progress=False
+        )
     with pytest.raises(OptionError, match="no points to train on"):
         train([], TrainingOptions(**SMALL), progress=False)
     with pytest.raises(OptionError, match=r"no points to train on.* 7, 18 are left out"):
-        train([TrainingCloud(xyz, np.full(500, 7), dimensions)], TrainingOptions(**SMALL), progress=False)
+        train(
+            [TrainingCloud(xyz, np.full(500, 7), dimensions)],
+            TrainingOptions(**SMALL),
+            progress=False,
+        )
     with pytest.raises(OptionError, match="mask"):
-        train([TrainingCloud(xyz, label, dimensions, mask=label)], TrainingOptions(**SMALL), progress=False)
+        train(
+            [TrainingCloud(xyz, label, dimensions, mask=label)],
+            TrainingOptions(**SMALL),
+            progress=False,
+        )
     monkeypatch.setattr(foresttraining, "free_memory", lambda: 1000)
     with pytest.raises(OptionError, match="do not fit into the free memory"):
         train([cloud], TrainingOptions(**SMALL), progress=False)
@@ -237,7 +266,10 @@ def test_prior_weight(other):
     """Probabilities times (frequency in the clouds / in the samples) ** weight; the frequent gain, the rare lose."""
     xyz, label, dimensions = scene()
     clouds = [TrainingCloud(xyz, label, dimensions)]
-    models = {w: train(clouds, TrainingOptions(**SMALL, prior_weight=w), progress=False) for w in (0, 0.3, 1)}
+    models = {
+        w: train(clouds, TrainingOptions(**SMALL, prior_weight=w), progress=False)
+        for w in (0, 0.3, 1)
+    }
     xyz, label, dimensions = other
     results = {w: m.predict(xyz, dimensions, probabilities=True) for w, m in models.items()}
     frequency = np.array([e["available"] for e in models[1].info["classes"]]) / 150

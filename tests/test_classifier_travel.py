@@ -18,7 +18,10 @@ FEW = {**SMALL, "feature_set": "covariance", "neighborhoods": "s1", "trees": 6}
 def clouds(n=3, **more):
     return [
         TrainingCloud(
-            *scene(seed, 3000, (2000.0 * seed, 0.0, 0.0)), name=f"{seed}.laz", survey=f"flight {seed}", **more
+            *scene(seed, 3000, (2000.0 * seed, 0.0, 0.0)),
+            name=f"{seed}.laz",
+            survey=f"flight {seed}",
+            **more,
         )
         for seed in range(n)
     ]
@@ -42,7 +45,9 @@ def test_density_is_robust_and_knows_no_order():
     assert density(xyz) == pytest.approx(10.0, rel=0.05)
     strays = np.vstack([xyz, [[1e9, -1e9, 0.0]] * 5, random.normal(20, 0.01, (900, 3))])
     assert (
-        density(strays[random.permutation(len(strays))]) == density(strays) == pytest.approx(10.0, rel=0.05)
+        density(strays[random.permutation(len(strays))])
+        == density(strays)
+        == pytest.approx(10.0, rel=0.05)
     )
     assert density(np.zeros((0, 3))) == 0.0 and density(np.zeros((7, 3))) == 7 / 4
 
@@ -132,7 +137,9 @@ def test_surveys_weigh_alike():
     for name in ("cloud", "row", "label", "weight"):
         assert np.array_equal(getattr(one, name), getattr(alike, name))
     swapped = learned(pair[::-1])
-    assert np.array_equal(swapped.passes[0].forest.threshold, learned(pair).passes[0].forest.threshold)
+    assert np.array_equal(
+        swapped.passes[0].forest.threshold, learned(pair).passes[0].forest.threshold
+    )
 
 
 def test_more_points_than_are_put_in_order_at_a_time(monkeypatch):
@@ -205,7 +212,9 @@ def test_noise_is_not_even_a_neighbor(tmp_path):
 
 def test_clouds_made_one_at_a_time(tmp_path):
     at_hand = learned(clouds(3), passes=2, context=["own", "box1"], thin=[0.3])
-    streamed = learned((cloud for cloud in clouds(3)), passes=2, context=["own", "box1"], thin=[0.3])
+    streamed = learned(
+        (cloud for cloud in clouds(3)), passes=2, context=["own", "box1"], thin=[0.3]
+    )
     assert written(at_hand, tmp_path, "a") == written(streamed, tmp_path, "b")
     with pytest.raises(OptionError, match="no points to train on"):
         learned(iter(()))

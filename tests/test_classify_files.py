@@ -33,7 +33,13 @@ def folder(tmp_path_factory, write_las):
         if number == 0:
             arrays["Amplitude"] = arrays["X"].astype("f4")
         write_las(base / "in" / f"t{number}.laz", arrays, point_format=1)
-    words = ["train", str(base / "in" / "t0.laz"), "--model", str(base / "m.model"), *QUICK_TRAINING]
+    words = [
+        "train",
+        str(base / "in" / "t0.laz"),
+        "--model",
+        str(base / "m.model"),
+        *QUICK_TRAINING,
+    ]
     assert main([*words, "--writers.classifiermodel.dimensions=HeightAboveGround"]) == 0
     return base
 
@@ -103,7 +109,9 @@ def test_inputs_of_one_name_lie_in_their_folders(folder, classify, tmp_path):
     (tmp_path / "in/2023").mkdir(parents=True)
     (tmp_path / "in/2024/north").mkdir(parents=True)
     for place, name in (("2023", "t0"), ("2024/north", "t1")):
-        (tmp_path / "in" / place / f"{name}.laz").write_bytes((folder / f"in/{name}.laz").read_bytes())
+        (tmp_path / "in" / place / f"{name}.laz").write_bytes(
+            (folder / f"in/{name}.laz").read_bytes()
+        )
     given, out = str(tmp_path / "in/**/*.laz"), tmp_path / "out"
     code, _, err = classify(given, f"{out}/", "--resume")
     assert code == 0 and files_in(out) == ["t0.laz", "t1.laz"], err
@@ -133,11 +141,22 @@ def test_a_suffix_that_pdal_does_not_know(folder, classify, tmp_path):
 
 def test_metadata_of_many(folder, classify, tmp_path):
     (tmp_path / "bad.laz").write_bytes(b"LASF")
-    words = (folder / "in", tmp_path / "bad.laz", tmp_path / "out", "--metadata", tmp_path / "m.json")
+    words = (
+        folder / "in",
+        tmp_path / "bad.laz",
+        tmp_path / "out",
+        "--metadata",
+        tmp_path / "m.json",
+    )
     code, out, err = classify(*words)
     assert code == 1 and "bad.laz" in err and "3 files written, 1 failed" in out, err
     found = json.loads((tmp_path / "m.json").read_text())
-    assert [Path(one["input"]).name for one in found["outputs"]] == ["t0.laz", "t1.laz", "t2.laz", "bad.laz"]
+    assert [Path(one["input"]).name for one in found["outputs"]] == [
+        "t0.laz",
+        "t1.laz",
+        "t2.laz",
+        "bad.laz",
+    ]
     for one in found["outputs"][:3]:
         assert one["written"] == 500 and sum(one["classes"].values()) == 500
     assert found["outputs"][3]["state"] == "failed" and "bad.laz" in found["failures"][0]["what"]
@@ -161,7 +180,9 @@ def test_an_interrupt_says_what_is_finished(folder, tmp_path, write_las):
     ]
     command = [sys.executable, "-m", "pdal_stages.cli", *map(str, words), "--workers", "1"]
     command += ["--log", str(tmp_path / "log"), "--metadata", str(tmp_path / "m.json")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
         seen = [run.stdout.readline() for _ in range(3)]
         run.send_signal(signal.SIGINT)
         _, err = run.communicate(timeout=60)
@@ -181,9 +202,18 @@ def test_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path):
     rows = laspy.read(folder / "in" / "t0.laz").xyz
     for number in range(2):
         np.savetxt(tmp_path / f"t{number}.txt", rows, delimiter=",", header="X,Y,Z", comments="")
-    for given, words in (("*.txt", []), ("t0.txt", ["--resume"]), ("t0.txt", ["--report", "r.json"])):
+    for given, words in (
+        ("*.txt", []),
+        ("t0.txt", ["--resume"]),
+        ("t0.txt", ["--report", "r.json"]),
+    ):
         code, _, err = classify(tmp_path / given, tmp_path / "o.txt", *words)
-        assert code == 1 and "t0.txt" in err and "pdal translate" in err and not files_in(tmp_path, "o*")
+        assert (
+            code == 1
+            and "t0.txt" in err
+            and "pdal translate" in err
+            and not files_in(tmp_path, "o*")
+        )
     assert classify(tmp_path / "t0.txt", tmp_path / "o.txt")[0] == 0
 
 
@@ -203,14 +233,27 @@ def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_p
         code, out, err = classify(source, place / ("#.laz" if words else "o.laz"), *options, *words)
         assert code == 0, err
         said.append(
-            [line for line in out.splitlines() if line.startswith("  ") and not line[:5].strip().isdecimal()]
+            [
+                line
+                for line in out.splitlines()
+                if line.startswith("  ") and not line[:5].strip().isdecimal()
+            ]
         )
-        classes.append({line.strip() for line in out.splitlines() if re.match(r"  [ \d]{3} ", line)})
-        assert sum(int(line.split()[-1].replace(",", "")) for line in classes[-1]) == len(las.points)
+        classes.append(
+            {line.strip() for line in out.splitlines() if re.match(r"  [ \d]{3} ", line)}
+        )
+        assert sum(int(line.split()[-1].replace(",", "")) for line in classes[-1]) == len(
+            las.points
+        )
     assert said[0] == said[1] == said[2]
     assert classes[0] == classes[1] == classes[2]
     lines = "\n".join(said[0])
-    for text in ("rejected as unreliable", "noise and withheld points", "class kept (keep)", "outside where"):
+    for text in (
+        "rejected as unreliable",
+        "noise and withheld points",
+        "class kept (keep)",
+        "outside where",
+    ):
         assert text in lines, lines
 
 
@@ -219,7 +262,14 @@ def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_p
 )  # the second in some tiles alone
 def test_a_where_that_chooses_nothing_is_said_once(folder, classify, tmp_path, where, said):
     code, _, err = classify(
-        folder / "in" / "t1.laz", tmp_path / "o.laz", "--tile", "10", "--where", where, "--workers", "0"
+        folder / "in" / "t1.laz",
+        tmp_path / "o.laz",
+        "--tile",
+        "10",
+        "--where",
+        where,
+        "--workers",
+        "0",
     )
     told = [line for line in err.splitlines() if "'where' holds for none" in line]
     assert code == 0 and len(told) == said, err
@@ -242,7 +292,9 @@ def test_dimensions_are_chosen(folder, classify, tmp_path, words, made):
 
 
 def test_a_dimension_that_is_not_made(folder, classify, tmp_path):
-    code, _, err = classify(folder / "in" / "t0.laz", tmp_path / "o.laz", "--dimensions", "Reliabilty")
+    code, _, err = classify(
+        folder / "in" / "t0.laz", tmp_path / "o.laz", "--dimensions", "Reliabilty"
+    )
     assert code == 1 and "Did you mean 'Reliability'" in err
     code, _, err = classify(folder / "in" / "t0.laz", tmp_path / "o.ply", "--dimensions", "none")
     assert code == 1 and "--dimensions is for LAS" in err
@@ -277,7 +329,9 @@ def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
 def test_points_beyond_the_box_of_the_header(folder, classify, tmp_path, tile):
     """LAZ has no checksums: PDAL may decode a damaged file to points anywhere, without an error."""
     content = bytearray((folder / "in/t0.laz").read_bytes())
-    struct.pack_into("<d", content, 179, struct.unpack_from("<d", content, 179)[0] - 5.0)  # the highest x
+    struct.pack_into(
+        "<d", content, 179, struct.unpack_from("<d", content, 179)[0] - 5.0
+    )  # the highest x
     (tmp_path / "odd.laz").write_bytes(content)
     code, _, err = classify(tmp_path / "odd.laz", tmp_path / "out.laz", *tile)
     assert code == 0 and "odd.laz: points lie outside the bounding box in the header" in err, err

@@ -39,11 +39,19 @@ def job(tmp_path, cloud):
 
 def test_pipeline_with_overrides(job, tmp_path, run):
     out = tmp_path / "other.las"
-    words = ["--stage.height.cell=10", f"--writers.las.filename={out}", "--metadata", tmp_path / "m.json"]
+    words = [
+        "--stage.height.cell=10",
+        f"--writers.las.filename={out}",
+        "--metadata",
+        tmp_path / "m.json",
+    ]
     code, _, err = run("pipeline", job, *words)
     assert code == 0, err
     assert len(laspy.read(out)) == 800
-    assert json.loads((tmp_path / "m.json").read_text())["metadata"]["filters.hag_minima"]["cells"] == 9
+    assert (
+        json.loads((tmp_path / "m.json").read_text())["metadata"]["filters.hag_minima"]["cells"]
+        == 9
+    )
     assert "meters were assumed" in err
 
 
@@ -53,7 +61,11 @@ def test_stdin_and_expand(job, run, monkeypatch, tmp_path):
     code, out, _ = run("expand", job)
     assert code == 0
     plain = json.loads(out)
-    assert [s.get("type") for s in plain["pipeline"]] == ["readers.las", "filters.python", "writers.las"]
+    assert [s.get("type") for s in plain["pipeline"]] == [
+        "readers.las",
+        "filters.python",
+        "writers.las",
+    ]
     monkeypatch.setattr(sys, "stdin", io.StringIO(job.read_text(encoding="utf-8-sig")))
     assert run("pipeline", "--stdin")[0] == 0
     assert run("expand", job, "-o", tmp_path / "plain.json")[0] == 0
@@ -124,7 +136,9 @@ def test_names_may_stand_behind_flags(words, inputs, output):
     assert seen.inputs == inputs and getattr(seen, "output", None) == output
 
 
-@pytest.mark.parametrize("command", [None, *(name for names in _COMMANDS.values() for name in names)])
+@pytest.mark.parametrize(
+    "command", [None, *(name for names in _COMMANDS.values() for name in names)]
+)
 def test_help_fits_a_screen(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
@@ -140,7 +154,8 @@ def test_help_fits_a_screen(command, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("command", "told"), [("train", "Number of trees (default: 50)"), ("objects", "up to 4 (default: 0.5 m)")]
+    ("command", "told"),
+    [("train", "Number of trees (default: 50)"), ("objects", "up to 4 (default: 0.5 m)")],
 )
 def test_help_tells_the_defaults_of_options_of_stages(command, told, capsys):
     with pytest.raises(SystemExit):
@@ -157,9 +172,12 @@ def test_no_command_shows_the_help(capsys):
     assert shown[0] == shown[1] and "classify" in shown[0][1]
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing watches where processes cannot be forked")
+@pytest.mark.skipif(
+    not hasattr(os, "fork"), reason="nothing watches where processes cannot be forked"
+)
 @pytest.mark.parametrize(
-    ("kill", "number", "said"), [("kill(os.getpid()", 9, "died in"), ("killpg(0", 2, "interrupted; ")]
+    ("kill", "number", "said"),
+    [("kill(os.getpid()", 9, "died in"), ("killpg(0", 2, "interrupted; ")],
 )
 def test_a_process_that_dies_is_told_of(cloud, tmp_path, kill, number, said):
     """By a process beside it: a crash in PDAL and a lack of memory leave Python no time for a message."""

@@ -18,7 +18,9 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "1"}
 
     def said(code: str = code) -> str:
-        return subprocess.run([sys.executable, "-c", code], env=env, text=True, capture_output=True).stderr
+        return subprocess.run(
+            [sys.executable, "-c", code], env=env, text=True, capture_output=True
+        ).stderr
 
     assert "compiling for this processor, once" in said()
     assert not said()

@@ -30,7 +30,9 @@ def scene(seed=0, side=40, density=12):
     tree = np.hypot(x - 28, y - 28) < 4
     z[tree], truth[tree] = rng.uniform(2, 9, tree.sum()), 5
     k = 1500
-    wall = np.column_stack([rng.uniform(4, 16, k), 4 + rng.normal(0, 0.02, k), rng.uniform(0.3, 8, k)])
+    wall = np.column_stack(
+        [rng.uniform(4, 16, k), 4 + rng.normal(0, 0.02, k), rng.uniform(0.3, 8, k)]
+    )
     xyz = np.round(np.vstack([np.column_stack([x, y, z]), wall]), 3)
     truth = np.r_[truth, np.full(k, 6)].astype(np.uint8)
     height, ground = xyz[:, 2].copy(), (truth == 2).astype(np.uint8)
@@ -56,7 +58,9 @@ def slow(xyz, codes, height, ground, rules=RULES):
     kind = np.array([KIND.get(c, "o") for c in codes])
 
     def near(p):
-        return [q for d in product((-1, 0, 1), repeat=3) for q in members.get(tuple(cell[p] + d), ())]
+        return [
+            q for d in product((-1, 0, 1), repeat=3) for q in members.get(tuple(cell[p] + d), ())
+        ]
 
     counts = {}
     for rule in RULES:
@@ -139,7 +143,9 @@ def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(rules):
     for x0, y0 in ((5.3, 3.1), (20, 10), (28.5, 0), (23, 31.2), (12.5, 33.5)):
         beyond = np.max([[x0, y0] - xyz[:, :2], xyz[:, :2] - [x0 + 8, y0 + 8]], axis=(0, 2))
         inside, near = beyond < 0, beyond < consistency.reach(rules)
-        part, _ = consistent(xyz[near], codes[near], height=height[near], ground=ground[near], rules=rules)
+        part, _ = consistent(
+            xyz[near], codes[near], height=height[near], ground=ground[near], rules=rules
+        )
         assert np.array_equal(part[inside[near]], found[inside])
 
 
@@ -158,7 +164,12 @@ def test_only_what_may_be_changed_is():
 
 def arrays_of(seed=8, **size):
     xyz, codes, height, ground, truth = scene(seed, **size)
-    arrays = {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2], "Classification": codes.astype(np.uint8)}
+    arrays = {
+        "X": xyz[:, 0],
+        "Y": xyz[:, 1],
+        "Z": xyz[:, 2],
+        "Classification": codes.astype(np.uint8),
+    }
     return {**arrays, "HeightAboveGround": height, "Ground": ground}, truth
 
 
@@ -172,7 +183,9 @@ def test_the_stage_counts_by_rule_and_says_what_it_lacks():
     assert figures["changed"] == (codes != arrays["Classification"]).sum()
     assert figures["classes"] == {str(c): int((codes == c).sum()) for c in (2, 5, 6)}
     assert (codes != truth).sum() < (arrays["Classification"] != truth).sum()
-    bare = Consistency({}).points({k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")})
+    bare = Consistency({}).points(
+        {k: v for k, v in arrays.items() if k in ("X", "Y", "Z", "Classification")}
+    )
     Consistency({}).run(bare)
     assert bare.report.figures["ground"] == 0 and "no HeightAboveGround" in bare.report.warnings[0]
 
@@ -229,7 +242,9 @@ def test_three_classes_of_vegetation_in_one_command(tmp_path):
     assert (height[codes == 3] <= 0.5).all() and (
         height[codes == 5] >= 2
     ).all()  # heights are written rounded
-    assert ((height[codes == 4] >= 0.5) & (height[codes == 4] <= 2)).all() and (codes == 5).sum() > 500
+    assert ((height[codes == 4] >= 0.5) & (height[codes == 4] <= 2)).all() and (
+        codes == 5
+    ).sum() > 500
 
 
 def write_file(path, arrays):

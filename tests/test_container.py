@@ -13,7 +13,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPT = ROOT / "scripts" / "container"
-FILES = [ROOT / name for name in ("Dockerfile", "compose.yaml", ".dockerignore", "scripts/container")]
+FILES = [
+    ROOT / name for name in ("Dockerfile", "compose.yaml", ".dockerignore", "scripts/container")
+]
 
 
 def instructions():
@@ -25,7 +27,9 @@ def test_every_run_line_is_one_step_of_the_script_and_every_step_is_run():
     run = [rest for word, rest in instructions() if word == "RUN"]
     steps = [re.fullmatch(r"(?:/opt/pdal_stages/)?scripts/container (\w+)", line) for line in run]
     assert all(steps), run
-    named = re.search(r"^  ([\w| ]+)\)\n    mkdir -p", SCRIPT.read_text(), re.MULTILINE)[1].split(" | ")
+    named = re.search(r"^  ([\w| ]+)\)\n    mkdir -p", SCRIPT.read_text(), re.MULTILINE)[1].split(
+        " | "
+    )
     assert [step[1] for step in steps] == named
     for step in named:
         assert f"\n{step}() {{\n" in SCRIPT.read_text(), step
@@ -37,7 +41,9 @@ def test_every_run_line_is_one_step_of_the_script_and_every_step_is_run():
 def test_the_image_runs_as_a_user_and_takes_the_commands_arguments():
     made = dict(instructions())
     assert json.loads(made["ENTRYPOINT"]) == ["pdal-stages"]
-    assert re.search(rf"\buseradd\b.*\s{re.escape(made['USER'])}$", SCRIPT.read_text(), re.MULTILINE)
+    assert re.search(
+        rf"\buseradd\b.*\s{re.escape(made['USER'])}$", SCRIPT.read_text(), re.MULTILINE
+    )
     words = [word for word, _ in instructions()]
     assert words.index("USER") > max(place for place, word in enumerate(words) if word == "RUN")
     assert set(words) <= {"FROM", "WORKDIR", "COPY", "RUN", "USER", "ENTRYPOINT"}
@@ -50,10 +56,13 @@ def test_what_the_build_needs_is_sent_to_it():
     assert "*" in lines
     sent = {line[1:] for line in lines if line.startswith("!")}
     assert all((ROOT / name).exists() for name in sent)
-    copied = {rest.split()[0] for word, rest in instructions() if word == "COPY"} - {".", "--from=build"}
-    setup = re.search(r"^    cat (pyproject.*)$", (ROOT / "scripts/setup").read_text(), re.MULTILINE)[
-        1
-    ].split()
+    copied = {rest.split()[0] for word, rest in instructions() if word == "COPY"} - {
+        ".",
+        "--from=build",
+    }
+    setup = re.search(
+        r"^    cat (pyproject.*)$", (ROOT / "scripts/setup").read_text(), re.MULTILINE
+    )[1].split()
     assert copied | {name.split("/")[0] for name in setup} | {"pdal_stages"} <= sent
 
 

@@ -93,12 +93,16 @@ def test_all_around_a_change_was_seen(town, tmp_path):
     corner, _ = changed_copy(town, tmp_path / "after.laz")
     write_corrections(str(town), str(tmp_path / "o.laz"), str(tmp_path / "after.laz"), around=2.0)
     las = laspy.read(tmp_path / "o.laz")
-    assert np.array_equal(np.asarray(las["Checked"]) > 0, near_any(np.asarray(las.xyz), corner, 2.0))
+    assert np.array_equal(
+        np.asarray(las["Checked"]) > 0, near_any(np.asarray(las.xyz), corner, 2.0)
+    )
     # A second time adds to the first.
     again = laspy.read(tmp_path / "o.laz")
     again.classification[:5] = 21
     again.write(tmp_path / "again.laz")
-    done = write_corrections(str(tmp_path / "o.laz"), str(tmp_path / "p.laz"), str(tmp_path / "again.laz"))
+    done = write_corrections(
+        str(tmp_path / "o.laz"), str(tmp_path / "p.laz"), str(tmp_path / "again.laz")
+    )
     second = laspy.read(tmp_path / "p.laz")
     assert done[0].split(", ")[-2] == "5 changed" and (second["Checked"][:5] == 1).all()
     assert (np.asarray(second["Checked"]) >= np.asarray(las["Checked"])).all()
@@ -117,7 +121,9 @@ def test_a_copc_file_becomes_a_plain_one(tmp_path):
     out = tmp_path / "checked.laz"
     write_corrections(str(before), str(out), str(tmp_path / "after.laz"))
     made = laspy.read(out)
-    assert np.array_equal(made.xyz, las.xyz) and np.array_equal(made.classification, after.classification)
+    assert np.array_equal(made.xyz, las.xyz) and np.array_equal(
+        made.classification, after.classification
+    )
     assert made.header.parse_crs() == las.header.parse_crs()
     assert "copc" not in {one.user_id for one in [*made.header.vlrs, *(made.evlrs or [])]}
     assert len(ps.run_pipeline([str(out)]).arrays[0]) == len(las)
@@ -140,7 +146,9 @@ def test_areas_that_were_looked_at(town, tmp_path):
     shapely, pyogrio = pytest.importorskip("shapely"), pytest.importorskip("pyogrio")
     xyz = np.asarray(laspy.read(town).xyz)
     x, y = xyz[:, :2].min(axis=0)
-    shapes = np.array([shapely.to_wkb(shapely.box(x + k, y, x + k + 10, y + 10)) for k in (0, 40)], object)
+    shapes = np.array(
+        [shapely.to_wkb(shapely.box(x + k, y, x + k + 10, y + 10)) for k in (0, 40)], object
+    )
     area = tmp_path / "area.gpkg"
     fields = {"done": np.array([1, 0], np.int32)}
     pyogrio.raw.write(area, shapes, list(fields.values()), list(fields), driver="GPKG", layer="patches",
@@ -211,7 +219,9 @@ def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path,
     code, out, err = run("train", tmp_path / "checked.laz", *words)
     mine = {code: np.count_nonzero(checked & (codes == code)) for code in (2, 5, 6)}
     anchors = {
-        code: min(np.count_nonzero(sure & (codes == code)), max(mine.values())) for code in mine if mine[code]
+        code: min(np.count_nonzero(sure & (codes == code)), max(mine.values()))
+        for code in mine
+        if mine[code]
     }
     said = f"from about {sum(anchors.values()):,} others of which the base is sure"
     assert code == 0 and said in err + out

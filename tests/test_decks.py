@@ -128,7 +128,9 @@ def slow_ways(held, kinds, most=600):
             there = cell[0] + s * dj, cell[1] + s * di
             far = s * np.hypot(di, dj)
             steps = [
-                q for q in held.get(there, ()) if kinds[there, q] == SOLID and abs(q - z) <= 0.35 + 0.25 * far
+                q
+                for q in held.get(there, ())
+                if kinds[there, q] == SOLID and abs(q - z) <= 0.35 + 0.25 * far
             ]
             if steps:
                 way, last, _ = go(there, min(steps, key=lambda q: (abs(q - z), -q)), d)
@@ -175,7 +177,9 @@ def slow_ways(held, kinds, most=600):
             return (0, ACROSS, ACROSS) if far_below else (0, NOTHING, NOTHING)
         return None, WALLED, WALLED
 
-    return {(*key, d): go(*key, d) for key, kind in kinds.items() if kind == SOLID for d in range(8)}
+    return {
+        (*key, d): go(*key, d) for key, kind in kinds.items() if kind == SOLID for d in range(8)
+    }
 
 
 @pytest.mark.parametrize(("seed", "water"), [(0, False), (1, True)])
@@ -204,7 +208,11 @@ def test_the_kernels_equal_the_slow_reference(seed, water):
     for n in np.flatnonzero(kind == SOLID):
         for d in range(8):
             far, at, how = slow[cells[n], z[n], d]
-            assert (way[n, d], last[n, d], end[n, d]) == (walkable.ENDLESS if far is None else far, at, how)
+            assert (way[n, d], last[n, d], end[n, d]) == (
+                walkable.ENDLESS if far is None else far,
+                at,
+                how,
+            )
             ends.add(how)
     assert {ON, DOWN, WALLED} <= ends and (not water or ACROSS in ends)
 
@@ -219,9 +227,13 @@ def f1(deck, true, known):
 
 @pytest.mark.parametrize("name", [*SCENES, *MORE_SCENES])
 def test_decks_of_scenes_are_found_whole(name):
-    xyz, codes = seen(name, 8.0 if name == "walled ramps" else 4.0)  # walls show their faces in dense clouds
+    xyz, codes = seen(
+        name, 8.0 if name == "walled ramps" else 4.0
+    )  # walls show their faces in dense clouds
     deck = found(xyz) > 0
-    assert f1(deck, codes == DECK, codes != OTHER) > (0.86 if name in ("skewed", "overpass") else 0.9)
+    assert f1(deck, codes == DECK, codes != OTHER) > (
+        0.86 if name in ("skewed", "overpass") else 0.9
+    )
     wrong = deck & ~np.isin(codes, (DECK, OTHER, LEAF))
     assert wrong.mean() < 0.002  # a strip of a meter at the ends
 
@@ -269,7 +281,9 @@ def test_a_hall_of_300_meters_is_no_viaduct():
         return 0.1 * np.sin(s / 9), np.full(len(s), GROUND)
 
     slabs = [Slab(-150, 150, -25, 25, lambda s: 9.0 + 0 * s, 9.0, 6)]
-    slabs.append(Slab(-150, -149.8, -60, -25, lambda s: 9.0 + 0 * s, 0.1, 14))  # a wire that hangs on to it
+    slabs.append(
+        Slab(-150, -149.8, -60, -25, lambda s: 9.0 + 0 * s, 0.1, 14)
+    )  # a wire that hangs on to it
     xyz, _ = scan(Scene(terrain, slabs, [], 0.2, 360.0, 120.0), 6.0)
     assert not found(xyz).any()
 
@@ -316,7 +330,9 @@ def test_a_long_viaduct_in_tiles_as_in_one_piece():
     assert f1(whole > 0, codes == DECK, codes != OTHER) > 0.85
     for low in (-340, 200):
         core = (xyz[:, 0] >= 85_000 + low) & (xyz[:, 0] < 85_000 + low + 120)
-        near = (xyz[:, 0] >= 85_000 + low - decks.REACH) & (xyz[:, 0] < 85_000 + low + 120 + decks.REACH)
+        near = (xyz[:, 0] >= 85_000 + low - decks.REACH) & (
+            xyz[:, 0] < 85_000 + low + 120 + decks.REACH
+        )
         assert near.sum() < len(xyz)
         assert np.array_equal(found(xyz[near])[core[near]], whole[core])
 
@@ -331,7 +347,9 @@ def test_levels_of_far_points_stand_for_all():
 
 
 def test_degenerate_clouds_and_points_left_out():
-    clouds = [np.zeros((n, 3)) for n in (0, 1, 50)] + [np.random.default_rng(0).normal(0, 50, (500, 3))]
+    clouds = [np.zeros((n, 3)) for n in (0, 1, 50)] + [
+        np.random.default_rng(0).normal(0, 50, (500, 3))
+    ]
     assert not any(found(xyz).any() for xyz in clouds)
     far = np.vstack([np.random.default_rng(0).uniform(0, 9, (200, 3)), [[1e7, 1e7, 0.0]]])
     assert not found(far).any()
@@ -349,7 +367,9 @@ def test_the_terrain_runs_below_the_deck():
     on = (made["Deck"] == SURFACE) & (codes == DECK)
     middle = on & (np.hypot(*(xyz[:, :2] - (85_000, 447_000)).T) < 80)
     assert not made["Ground"][made["Deck"] > 0].any()
-    assert np.abs(made["HeightAboveGround"][middle] - xyz[middle, 2]).max() < 0.6  # the land is at 0
+    assert (
+        np.abs(made["HeightAboveGround"][middle] - xyz[middle, 2]).max() < 0.6
+    )  # the land is at 0
     plain = filtered_ground(xyz)
     land = (codes == GROUND) & (np.abs(xyz[:, 0] - 85_000) > 140)
     assert np.array_equal(plain["Ground"][land], made["Ground"][land])
@@ -373,7 +393,17 @@ def test_bridges_leave_ground_and_buildings():
     figures = points.report.figures
     assert (figures["decks"], figures["parts"], figures["left"]) == (5, 2, {"2": 2, "5": 1, "6": 2})
     stage = Bridges({"code": 20, "keep": "", "where": "Deck == 1"})
-    assert stage.run(stage.points(arrays))["Classification"].tolist() == [20, 20, 20, 6, 2, 5, 20, 7, 6]
+    assert stage.run(stage.points(arrays))["Classification"].tolist() == [
+        20,
+        20,
+        20,
+        6,
+        2,
+        5,
+        20,
+        7,
+        6,
+    ]
 
 
 def write(path, xyz):
@@ -395,7 +425,9 @@ def test_classify_finds_decks_unless_told_not_to(tmp_path, capsys):
     made = laspy.read(out)
     assert f1(np.asarray(made.classification) == 17, codes == DECK, codes != OTHER) > 0.85
     assert set(made.point_format.extra_dimension_names) == {"HeightAboveGround", "Reliability"}
-    assert main(["classify", str(tmp_path / "in.las"), str(out), "--no-progress", "--no-bridges"]) == 0
+    assert (
+        main(["classify", str(tmp_path / "in.las"), str(out), "--no-progress", "--no-bridges"]) == 0
+    )
     assert not np.any(np.asarray(laspy.read(out).classification) == 17)
 
 
@@ -420,7 +452,17 @@ def test_in_tiles_as_in_one_piece_through_pdal(tmp_path):
     job[-1]["filename"] = str(tmp_path / "tiled.las")
     (tmp_path / "job.json").write_text(json.dumps(job))
     assert (
-        main(["pipeline", str(tmp_path / "job.json"), "--tile", "200", "--workers", "0", "--no-progress"])
+        main(
+            [
+                "pipeline",
+                str(tmp_path / "job.json"),
+                "--tile",
+                "200",
+                "--workers",
+                "0",
+                "--no-progress",
+            ]
+        )
         == 0
     )
     whole, tiled = laspy.read(tmp_path / "whole.las"), laspy.read(tmp_path / "tiled.las")

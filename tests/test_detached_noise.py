@@ -37,7 +37,9 @@ def scene(seed=0, side=90, density=6.0, origin=(0.0, 0.0, 0.0)):
     wood = (x > 60) & (y > 55)
     z[wood] += rng.uniform(0, 12, wood.sum()) * (rng.random(wood.sum()) < 0.8)
     along = np.linspace(0, side, 400)
-    wire = np.column_stack([along, np.full(400, 10.0), 25 + 0.002 * (along - side / 2) ** 2 + 0.1 * along])
+    wire = np.column_stack(
+        [along, np.full(400, 10.0), 25 + 0.002 * (along - side / 2) ** 2 + 0.1 * along]
+    )
     noise, codes = [], []
     for _ in range(24):
         at = np.array([*rng.uniform(5, side - 5, 2), 0.0])
@@ -73,7 +75,9 @@ def slow_components(voxels):
 
 def slow_near(k):
     return [
-        (k[0] + a, k[1] + b, k[2] + c) for a, b, c in product((-1, 0, 1), repeat=3) if (a, b, c) != (0, 0, 0)
+        (k[0] + a, k[1] + b, k[2] + c)
+        for a, b, c in product((-1, 0, 1), repeat=3)
+        if (a, b, c) != (0, 0, 0)
     ]
 
 
@@ -88,7 +92,9 @@ def slow_small(count, usual, most, widest):
     for members in slow_components(strong):
         start, total = members[0], sum(count[m] for m in members)
         extent = np.ptp(np.array(members), axis=0).max()
-        widest = min(detached.EXTENT + detached.EXTENT_GROWTH * usual(start), detached.LARGEST_EXTENT)
+        widest = min(
+            detached.EXTENT + detached.EXTENT_GROWTH * usual(start), detached.LARGEST_EXTENT
+        )
         for m in members:
             small[m], size[m] = total <= most and extent < widest, total
     for k in count:
@@ -108,7 +114,9 @@ def slow_covered(count, whole, spacing, most):
             near = [n for n in range(3) if n < spacing(k) * detached.SPACINGS / SIDE + 0.5]
             columns = product(range(-near[-1], near[-1] + 1), repeat=2)
             tops = [top.get((k[0] + b, k[1] + a)) for b, a in columns]
-            above[whole[k]].append(any(t is not None and whole[t] != whole[k] and t[2] > k[2] for t in tops))
+            above[whole[k]].append(
+                any(t is not None and whole[t] != whole[k] and t[2] > k[2] for t in tops)
+            )
     under = set()
     for c, seen in above.items():
         members = [k for k in count if whole[k] == c]
@@ -179,14 +187,20 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
 
     small, size, cluster = slow_small(count, lambda k: density(k)[0], most, detached.LARGEST_EXTENT)
     for scale in range(1, detached.SCALES + 1):
-        thin = [k for k in count if small[k] and density(k)[1] * detached.SPACINGS > SIDE * 2 ** (scale - 1)]
+        thin = [
+            k
+            for k in count
+            if small[k] and density(k)[1] * detached.SPACINGS > SIDE * 2 ** (scale - 1)
+        ]
         if not thin:
             break
         wider = lambda k, s=scale: (k[0] >> s, k[1] >> s, k[2])  # noqa: E731
         coarse = defaultdict(int)
         for k, n in count.items():
             coarse[wider(k)] += n
-        still, total, all_of = slow_small(coarse, lambda k: 1.0, most, detached.LARGEST_EXTENT >> scale)
+        still, total, all_of = slow_small(
+            coarse, lambda k: 1.0, most, detached.LARGEST_EXTENT >> scale
+        )
         for k in thin:
             small[k], size[k] = still[wider(k)], total[wider(k)]
             cluster[k] = all_of[wider(k)] and (scale, all_of[wider(k)])
@@ -213,8 +227,14 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
             continue
         square = (j - k[0]) ** 2 + (i - k[1]) ** 2
         apart = density(k)[1]
-        least = gap + detached.GAP_OF_POINT * size[k] + detached.GAP_GROWTH * max(0, apart - detached.DENSE)
-        r = min(max(detached.ASIDE, int(np.ceil(detached.SPACINGS_ASIDE * apart / SIDE))), detached.FAR)
+        least = (
+            gap
+            + detached.GAP_OF_POINT * size[k]
+            + detached.GAP_GROWTH * max(0, apart - detached.DENSE)
+        )
+        r = min(
+            max(detached.ASIDE, int(np.ceil(detached.SPACINGS_ASIDE * apart / SIDE))), detached.FAR
+        )
         while True:
             near = top[(square <= r * r) & np.isfinite(top)]
             if len(near) >= belowground.ENOUGH or r == detached.FAR:
@@ -225,7 +245,9 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         others = []
         for (b, a), (z, suspect) in hung.items():
             square = (b - k[0]) ** 2 + (a - k[1]) ** 2
-            if 4 < square <= detached.FAR**2 and abs(z - lowest[k]) <= 1 + 0.3 * SIDE * np.sqrt(square):
+            if 4 < square <= detached.FAR**2 and abs(z - lowest[k]) <= 1 + 0.3 * SIDE * np.sqrt(
+                square
+            ):
                 others.append((a - k[1], b - k[0], z - lowest[k], suspect))
         codes[k] = 18
         for u, v, dz, _ in others:
@@ -269,7 +291,9 @@ def slow_below(low, base, side, depth=1.0):
     for at in np.argwhere(np.isfinite(low)):
         plane = slow_plane(base, *at, near, 2 * near + 1)
         lowest = plane[0] - depth - belowground.SCATTERS * plane[3] if plane else -np.inf
-        if low[tuple(at)] < lowest and not slow_company(base, supported, at, low[tuple(at)], plane, side):
+        if low[tuple(at)] < lowest and not slow_company(
+            base, supported, at, low[tuple(at)], plane, side
+        ):
             limit[tuple(at)] = lowest
     deep = np.isfinite(limit)
     supported, filled = slow_supported(np.where(deep, np.inf, every)), np.isfinite(every)
@@ -288,7 +312,9 @@ def slow_supported(base):
     for b, a in np.argwhere(np.isfinite(base)):
         square = base[max(b - 2, 0) : b + 3, max(a - 2, 0) : a + 3]
         level = (np.abs(square - base[b, a]) <= belowground.LEVEL).sum()
-        out[b, a] = level > belowground.SUPPORT + belowground.SUPPORT_SHARE * np.isfinite(square).sum()
+        out[b, a] = (
+            level > belowground.SUPPORT + belowground.SUPPORT_SHARE * np.isfinite(square).sum()
+        )
     return out
 
 
@@ -313,10 +339,15 @@ def slow_company(base, supported, at, z, plane, side):
     most = np.minimum(half, belowground.LEVEL + belowground.ROOM * away)
     deep = (base <= z + most) & (below >= half) & (away <= belowground.FAR)
     around = np.maximum(abs(j - at[0]), abs(i - at[1]))
-    seen, beside = supported & (around <= np.ceil(belowground.FAR / side)), around <= belowground.BESIDE
+    seen, beside = (
+        supported & (around <= np.ceil(belowground.FAR / side)),
+        around <= belowground.BESIDE,
+    )
     number = slow_linked(np.where(seen, base, np.inf), side)
     for k in set(number[beside & (number >= 0)]):
-        deep[(number == k) & (base[beside & (number == k)].min() > z + max(half, belowground.HIGHER))] = False
+        deep[
+            (number == k) & (base[beside & (number == k)].min() > z + max(half, belowground.HIGHER))
+        ] = False
     return (deep & supported).sum() >= belowground.COMPANY
 
 
@@ -326,7 +357,9 @@ def closed_wood(slope, seen, density, side, seed=0):
     x, y = rng.uniform(0, side, (2, int(side * side * density)))
     ground = slope * (0.9 * x + 0.4 * y) + 2.5 * np.sin(x / 17) * np.cos(y / 13)
     crowns = rng.uniform(18, 28, (side // 6 + 1,) * 2)[(y / 6).astype(int), (x / 6).astype(int)]
-    below = np.where(rng.random(len(x)) < 0.97, rng.beta(6, 1.5, len(x)), rng.uniform(0.03, 1, len(x)))
+    below = np.where(
+        rng.random(len(x)) < 0.97, rng.beta(6, 1.5, len(x)), rng.uniform(0.03, 1, len(x))
+    )
     ours = rng.random(len(x)) < seen
     return np.column_stack([x, y, ground + np.where(ours, 0.0, crowns * below)]), ours
 
@@ -350,7 +383,9 @@ def test_so_they_do_under_a_closed_canopy():
     ("density", "clusters", "size", "extent", "depth"),
     [(3.0, 1, 10, 0.5, 3), (0.4, 1, 30, 10, 60), (0.4, 3, 30, 4, 22)],
 )
-def test_clusters_below_land_that_falls_as_deep_and_below_thin_clouds(density, clusters, size, extent, depth):
+def test_clusters_below_land_that_falls_as_deep_and_below_thin_clouds(
+    density, clusters, size, extent, depth
+):
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 60, (2, int(3600 * density)))
     z = -0.3 * np.maximum(x - 32, 0) + rng.normal(0, 0.03, len(x))
@@ -457,13 +492,16 @@ def test_clusters_of_any_size_under_the_ground_are_found(size, across, below, de
         part[:, 2] += ground - below - part[:, 2].max() - 1
     found = detached_noise(np.vstack([xyz, *clusters]))
     missed = (found[len(xyz) :] != 7).reshape(4, -1).any(axis=1)
-    assert not missed[: 3 if density < 1 else 4].any()  # a thin wood shows its ground in single points, too
+    assert not missed[
+        : 3 if density < 1 else 4
+    ].any()  # a thin wood shows its ground in single points, too
     changed = (found[: len(xyz)] == 7) & (detached_noise(xyz) == 0)
     assert changed.sum() <= 2
 
 
 @pytest.mark.parametrize(
-    "what", ["basement", "well of light", "underpass", "terraces", "gorge", "quarry", "ditch and pit"]
+    "what",
+    ["basement", "well of light", "underpass", "terraces", "gorge", "quarry", "ditch and pit"],
 )
 def test_true_low_places_are_no_noise(what):
     """Each is bare above, wide, or has returns on the way down."""
@@ -493,7 +531,12 @@ def test_true_low_places_are_no_noise(what):
 
 
 def arrays_of(xyz, codes):
-    return {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2], "Classification": codes.astype(np.uint8)}
+    return {
+        "X": xyz[:, 0],
+        "Y": xyz[:, 1],
+        "Z": xyz[:, 2],
+        "Classification": codes.astype(np.uint8),
+    }
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, 0.65])

@@ -32,7 +32,9 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def test_names_of_the_api_page_are_there():
-    names = re.findall(r"^\.\. auto\w+:: (\S+)\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    names = re.findall(
+        r"^\.\. auto\w+:: (\S+)\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE
+    )
     assert names and all(hasattr(importlib.import_module(module), name) for module, name in names)
 
 
@@ -60,7 +62,9 @@ def test_json_in_the_docs_is_valid(tmp_path, monkeypatch):
 def test_numpy_snippet_runs(tmp_path, monkeypatch, write_las, capsys, random_cloud):
     monkeypatch.chdir(tmp_path)
     xyz = random_cloud(500)
-    write_las(tmp_path / "raw.laz", {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2]}, point_format=3)
+    write_las(
+        tmp_path / "raw.laz", {"X": xyz[:, 0], "Y": xyz[:, 1], "Z": xyz[:, 2]}, point_format=3
+    )
     (snippet,) = blocks(ROOT / "docs" / "api.md", "python")
     exec(compile(snippet, "api.md", "exec"), {})
     assert "Linearity_c1" in capsys.readouterr().out
@@ -73,9 +77,13 @@ def test_pipelines_and_python_objects_run(tmp_path, monkeypatch, write_las, pdal
     x, y = rng.uniform(0, 30, (2, 1500))
     block = (x > 15) & (y > 15)
     labels = np.where(block, 6, np.where(x < 8, 4, 2)).astype(np.uint8)
-    z = np.where(block, 5.0, np.where(x < 8, rng.uniform(0, 4, 1500), 0.0)) + rng.normal(0, 0.02, 1500)
+    z = np.where(block, 5.0, np.where(x < 8, rng.uniform(0, 4, 1500), 0.0)) + rng.normal(
+        0, 0.02, 1500
+    )
     for name in ("labeled.laz", "raw.laz"):
-        write_las(tmp_path / name, {"X": x, "Y": y, "Z": z, "Classification": labels}, point_format=3)
+        write_las(
+            tmp_path / name, {"X": x, "Y": y, "Z": z, "Classification": labels}, point_format=3
+        )
     page = ROOT / "docs" / "pdal-users.md"
     train, classify = blocks(page, "json")
     ps.run_pipeline(train)
@@ -92,7 +100,9 @@ def test_the_worked_example_of_a_stage_works(monkeypatch):
     monkeypatch.setitem(sys.modules, module.__name__, module)
     exec(compile(text, "adding-a-stage.md", "exec"), module.__dict__)
     (stage,) = [
-        v for v in vars(module).values() if isinstance(v, type) and issubclass(v, Stage) and v is not Stage
+        v
+        for v in vars(module).values()
+        if isinstance(v, type) and issubclass(v, Stage) and v is not Stage
     ]
     made = stage({"medium": 3})
     arrays = {
@@ -133,16 +143,25 @@ def test_links_between_pages_lead_somewhere():
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+?)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             path = (page.parent / target).resolve()
-            inside = str(path.relative_to(ROOT / "docs")) if path.is_relative_to(ROOT / "docs") else ""
+            inside = (
+                str(path.relative_to(ROOT / "docs")) if path.is_relative_to(ROOT / "docs") else ""
+            )
             assert path.exists() or inside in made, f"{page.name}: {target}"
 
 
 def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it(monkeypatch, capsys):
     words = ["--model", ROOT / "pdal_stages" / "models" / "standard.model"]
-    for option, name in (("scores", ""), ("rules", "-rules"), ("unseen", "-unseen"), ("places", "-places")):
+    for option, name in (
+        ("scores", ""),
+        ("rules", "-rules"),
+        ("unseen", "-unseen"),
+        ("places", "-places"),
+    ):
         words += [f"--{option}", ROOT / "benchmarks" / "results" / f"surveys{name}.json"]
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "surveys"))
-    monkeypatch.delitem(sys.modules, "clouds", raising=False)  # that of benchmarks/papers has the same name
+    monkeypatch.delitem(
+        sys.modules, "clouds", raising=False
+    )  # that of benchmarks/papers has the same name
     monkeypatch.setattr(sys, "argv", ["card.py", *map(str, words)])
     with contextlib.suppress(SystemExit):
         runpy.run_path(str(ROOT / "benchmarks" / "surveys" / "card.py"), run_name="__main__")

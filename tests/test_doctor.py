@@ -31,7 +31,9 @@ def test_what_is_missing_has_its_cure(tmp_path):
     lines = done.stdout.splitlines()
     missing = [n for n, line in enumerate(lines) if line.startswith("MISSING")]
     assert len(missing) == 2 and all("PDAL_DRIVER_PATH" in lines[n + 1] for n in missing)
-    assert any(line.startswith("ok      cores") for line in lines)  # one fault does not hide the next
+    assert any(
+        line.startswith("ok      cores") for line in lines
+    )  # one fault does not hide the next
 
 
 def test_another_python_is_told(tmp_path, monkeypatch):
@@ -44,7 +46,9 @@ def test_another_python_is_told(tmp_path, monkeypatch):
     assert found.cure == "/other/bin/python -m pip install pdal-stages" and "MISSING" in str(found)
 
     def another(stages):
-        Path(stages[1]["pdalargs"]["answer"]).write_text("/other\n/other/lib/pdal_stages/__init__.py")
+        Path(stages[1]["pdalargs"]["answer"]).write_text(
+            "/other\n/other/lib/pdal_stages/__init__.py"
+        )
 
     assert "another pdal_stages" in doctor._python_of("filters.python", another).found
     assert "did not run" in doctor._python_of("filters.python", lambda stages: None).found

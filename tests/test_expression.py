@@ -76,9 +76,14 @@ def test_any_text_parses_or_is_refused(text):
         pass
 
 
-_terms = st.sampled_from(["X", "Y", "Z", "Classification", "3", "0.5", "(X + Y)", "Z * 2", "Y - 1", "X / 2"])
+_terms = st.sampled_from(
+    ["X", "Y", "Z", "Classification", "3", "0.5", "(X + Y)", "Z * 2", "Y - 1", "X / 2"]
+)
 _comparisons = st.builds(
-    lambda a, op, b: f"{a} {op} {b}", _terms, st.sampled_from(["==", "!=", "<", "<=", ">", ">="]), _terms
+    lambda a, op, b: f"{a} {op} {b}",
+    _terms,
+    st.sampled_from(["==", "!=", "<", "<=", ">", ">="]),
+    _terms,
 )
 _conditions = st.recursive(
     _comparisons,
@@ -105,7 +110,9 @@ def _mask_of_pdal(pdal, points, condition):
 @pytest.fixture(scope="module")
 def points():
     rng = np.random.default_rng(7)
-    points = np.zeros(200, [(name, "f8") for name in ("X", "Y", "Z", "GpsTime")] + [("Classification", "u1")])
+    points = np.zeros(
+        200, [(name, "f8") for name in ("X", "Y", "Z", "GpsTime")] + [("Classification", "u1")]
+    )
     for name in (*"XYZ", "Classification"):
         points[name] = rng.integers(0, 6, 200)
     points["GpsTime"] = np.arange(200)

@@ -111,8 +111,15 @@ def test_stages_that_pdal_leaves_out(tmp_path, monkeypatch):
     """Newer PDAL does not call a filter where there are no points: what a stage says of that is said all the same."""
     text = tmp_path / "in.txt"
     text.write_text("X,Y,Z,Classification\n1,1,1,2\n2,2,2,2\n")
-    none = [{"type": "readers.text", "filename": str(text)}, {"type": "filters.range", "limits": "Z[5:]"}]
-    train = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m"), "feature_set": "covariance"}
+    none = [
+        {"type": "readers.text", "filename": str(text)},
+        {"type": "filters.range", "limits": "Z[5:]"},
+    ]
+    train = {
+        "type": "writers.classifiermodel",
+        "filename": str(tmp_path / "m"),
+        "feature_set": "covariance",
+    }
     for stop in (False, True):
         if stop:  # as if it had not been called
             monkeypatch.setattr(runtime, "_run_one", lambda *_: None)

@@ -40,7 +40,9 @@ def town(n=3000, seed=3, origin=(0.0, 0.0, 0.0)):
 def cospherical(n=400):
     """A point, and many at exactly the same squared distance from it (permutations and signs of 3, 4, 12)."""
     rng = np.random.default_rng(0)
-    base = np.array([rng.permutation([3.0, 4.0, 12.0]) for _ in range(n)]) * rng.choice([-1.0, 1.0], (n, 3))
+    base = np.array([rng.permutation([3.0, 4.0, 12.0]) for _ in range(n)]) * rng.choice(
+        [-1.0, 1.0], (n, 3)
+    )
     return np.vstack([[0.0, 0.0, 0.0], base])
 
 
@@ -147,7 +149,9 @@ def test_queries_that_are_no_points_of_the_cloud():
     rng = np.random.default_rng(3)
     queries = np.vstack([rng.uniform(-5, 25, (40, 3)), [[1e6, 1e6, 1e6]], [[5.0, 5.0, 1.0]] * 9])
     check_nearest(CLOUDS["town"], queries, 33)
-    far = np.vstack([CLOUDS["thirty"] + offset for offset in ([0, 0, 0], [5e5, 0, 0], [0, 3e6, 50])])
+    far = np.vstack(
+        [CLOUDS["thirty"] + offset for offset in ([0, 0, 0], [5e5, 0, 0], [0, 3e6, 50])]
+    )
     check_nearest(far, far[::7], 17)
     check_nearest(CLOUDS["town"], queries, 33, cap=1.0)
 
@@ -220,7 +224,11 @@ def test_features_of_kopt_and_k():
                     if name == "Verticality" and oracle.normal_gap(members) < 1e-7:
                         continue
                     value = float(got[f"{name}_{token}"][i])
-                    assert value == pytest.approx(expected[name], rel=1e-5, abs=1e-7), (token, name, i)
+                    assert value == pytest.approx(expected[name], rel=1e-5, abs=1e-7), (
+                        token,
+                        name,
+                        i,
+                    )
             assert got["Radius_kopt"][i] == np.float32(oracle.kopt(xyz, q)[1])
 
 
@@ -243,7 +251,8 @@ def test_features_are_finite_and_those_of_each_neighborhood_alone(cloud):
         assert np.array_equal(together.values[:, columns], alone.values)
     if cloud == "all copies":
         assert (
-            together["SurfaceVariation_kopt"][0] == np.float32(1 / 3) and together["Linearity_kopt"][0] == 0
+            together["SurfaceVariation_kopt"][0] == np.float32(1 / 3)
+            and together["Linearity_kopt"][0] == 0
         )
         assert together["Density_kopt"][0] == pytest.approx(101 / oracle.ball_volume(0.001))
 
@@ -253,7 +262,9 @@ def test_features_are_finite_and_those_of_each_neighborhood_alone(cloud):
 
 def oracle_ropt(xyz, q, radii, least=10):
     spheres = [oracle.sphere(xyz, q, r) for r in radii]
-    entropies = [oracle.entropy(members) if len(members) >= least else np.inf for members in spheres]
+    entropies = [
+        oracle.entropy(members) if len(members) >= least else np.inf for members in spheres
+    ]
     return radii[oracle._first_lowest(entropies)], entropies
 
 
@@ -262,7 +273,11 @@ def test_ropt_is_the_oracle_s(cloud):
     xyz = CLOUDS[cloud]
     queries = some(xyz, 25)
     default, single = radii_of(0.25, 2.0, 0.05), np.array([1.5])
-    for token, radii, least in (("ropt", default, 3), ("ropt", default, 10), ("ropt(1.5,1.5,1)", single, 10)):
+    for token, radii, least in (
+        ("ropt", default, 3),
+        ("ropt", default, 10),
+        ("ropt(1.5,1.5,1)", single, 10),
+    ):
         table = choose(xyz, queries, token, least)
         for i, q in enumerate(queries):
             r, entropies = oracle_ropt(xyz, q, radii, least)
@@ -321,7 +336,9 @@ def test_curvature_threshold_of_two_clear_groups():
 
 def test_copt_is_the_oracle_s():
     xyz = town(1200)
-    engine = FeatureEngine(xyz, FeaturePlan.parse("copt", ["Density", "Radius", "Eigenentropy"])).fit()
+    engine = FeatureEngine(
+        xyz, FeaturePlan.parse("copt", ["Density", "Radius", "Eigenentropy"])
+    ).fit()
     curvatures = np.array([oracle.curvature(xyz, q) for q in xyz])
     threshold = engine.copt_threshold
     assert threshold == pytest.approx(oracle.copt_threshold(curvatures), rel=1e-9)
@@ -336,7 +353,9 @@ def test_copt_is_the_oracle_s():
             members = oracle.sphere(xyz, q, r)
         kinds.add(curvatures[at[i]] >= threshold)
         assert got["Radius_copt"][i] == np.float32(r)
-        assert got["Density_copt"][i] == pytest.approx(len(members) / oracle.ball_volume(r), rel=1e-6)
+        assert got["Density_copt"][i] == pytest.approx(
+            len(members) / oracle.ball_volume(r), rel=1e-6
+        )
     assert kinds == {True, False}
 
 

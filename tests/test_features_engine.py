@@ -76,7 +76,9 @@ def test_number_of_features(spec, count, dimensions):
 
 def test_order_of_features():
     names = FeaturePlan.parse("c2.5,kopt", dimensions=["Intensity"]).names
-    assert names[:13] == tuple(f"{n}_c2_5" for n in (*GROUPS["covariance"], *GROUPS["geometric"][:4], "A3_0"))
+    assert names[:13] == tuple(
+        f"{n}_c2_5" for n in (*GROUPS["covariance"], *GROUPS["geometric"][:4], "A3_0")
+    )
     assert names[61] == "D4_9_c2_5" and names[62] == "Linearity_kopt"
     assert names[74] == "Radius_kopt" and names[75] == "A3_0_kopt" and names[-1] == "Intensity"
 
@@ -88,10 +90,15 @@ def test_feature_sets():
     assert names("linearity") == ("Linearity_c1", "Linearity_kopt")
     assert names("Linearity_c1, Radius") == ("Linearity_c1", "Radius_kopt")
     assert names(["A3_4", "Density_kopt"]) == ("A3_4_c1", "Density_kopt", "A3_4_kopt")
-    assert len(names("shapes")) == 100 and len(names("D1,D2")) == 40 and len(names("covariance")) == 16
+    assert (
+        len(names("shapes")) == 100 and len(names("D1,D2")) == 40 and len(names("covariance")) == 16
+    )
     assert FeaturePlan.parse("weinmann2018", "covariance").dimensions == ()
     assert FeaturePlan.parse("weinmann2018", "geometric").dimensions == ("HeightAboveGround",)
-    assert FeaturePlan.parse("weinmann2018", "covariance", "Intensity,Z").dimensions == ("Intensity", "Z")
+    assert FeaturePlan.parse("weinmann2018", "covariance", "Intensity,Z").dimensions == (
+        "Intensity",
+        "Z",
+    )
 
 
 @pytest.mark.parametrize(
@@ -112,7 +119,13 @@ def test_refused_plans(spec, feature_set, message):
 
 @pytest.mark.parametrize(
     "data",
-    [{}, [], None, {"neighborhoods": "c1", "features": [], "dimensions": []}, {"neighborhoods": ["c1"]}],
+    [
+        {},
+        [],
+        None,
+        {"neighborhoods": "c1", "features": [], "dimensions": []},
+        {"neighborhoods": ["c1"]},
+    ],
 )
 def test_refused_plan_dicts(data):
     with pytest.raises(OptionError):
@@ -151,7 +164,12 @@ def test_any_queries(cloud, whole):
 
 @pytest.mark.parametrize(
     ("part", "features"),
-    [("c1", "all"), ("kopt(5,30)", "D2,Radius"), ("copt,c2.5", "all"), (TOKENS, "HeightRange,A3_5,D4_9_c1")],
+    [
+        ("c1", "all"),
+        ("kopt(5,30)", "D2,Radius"),
+        ("copt,c2.5", "all"),
+        (TOKENS, "HeightRange,A3_5,D4_9_c1"),
+    ],
 )
 def test_any_other_neighborhoods_and_features(cloud, whole, part, features):
     table = again(whole, cloud, None, part, features)
@@ -163,14 +181,18 @@ def test_tile_with_halo(cloud, whole):
     plan = FeaturePlan.parse(TOKENS)
     low = cloud.min(axis=0)[:2] + 9.0
     inside = ((cloud[:, :2] >= low) & (cloud[:, :2] < low + 5.0)).all(axis=1)
-    near = ((cloud[:, :2] >= low - plan.halo_m) & (cloud[:, :2] < low + 5.0 + plan.halo_m)).all(axis=1)
+    near = ((cloud[:, :2] >= low - plan.halo_m) & (cloud[:, :2] < low + 5.0 + plan.halo_m)).all(
+        axis=1
+    )
     tile = cloud[near]
     assert 20 < inside.sum() < near.sum()
     part = again(whole, tile, np.flatnonzero(inside[near]))
     assert np.array_equal(part.values, whole.values[inside])
 
 
-@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data())
 def test_rigid_motions(data):
     """Shifts by whole cells change no bit; turns about z change nothing that has a meaning without north."""
@@ -186,7 +208,9 @@ def test_rigid_motions(data):
     assert np.array_equal(still, compute_features(exact + shift, None, spec, MOMENTS).values)
     turned = np.column_stack([-xyz[:, 1], xyz[:, 0], xyz[:, 2]])
     vertical = [
-        i for i, name in enumerate(FeaturePlan.parse(spec, MOMENTS).names) if name.startswith("Verticality")
+        i
+        for i, name in enumerate(FeaturePlan.parse(spec, MOMENTS).names)
+        if name.startswith("Verticality")
     ]
     both = [base, compute_features(turned, None, spec, MOMENTS).values]
     for values in both:
@@ -203,7 +227,9 @@ def test_blocks_cover_every_query_once(cloud, whole):
     for queries, count in ((None, len(cloud)), (np.arange(500, 900), 400)):
         seen = []
         for rows, values in engine.blocks(queries, memory_mb=16, threads=2):
-            assert rows.dtype == np.int64 and values.dtype == np.float32 and values.flags.c_contiguous
+            assert (
+                rows.dtype == np.int64 and values.dtype == np.float32 and values.flags.c_contiguous
+            )
             assert values.shape == (len(rows), len(plan.names))
             assert np.array_equal(values, whole.values[rows])  # rows of the cloud
             seen.append(rows)
@@ -263,7 +289,9 @@ def test_report(cloud):
     for token in ("c1", "s0.5"):
         suffix = token.replace(".", "_")
         volume = np.pi if token == "c1" else 4 / 3 * np.pi * 0.125
-        assert counts[token] == np.count_nonzero(np.rint(table[f"Density_{suffix}"] * volume) < 3) > 0
+        assert (
+            counts[token] == np.count_nonzero(np.rint(table[f"Density_{suffix}"] * volume) < 3) > 0
+        )
     assert counts["kopt(5,30)"] == 0
     assert table.report.figures["points"] == table.report.figures["queries"] == len(far)
     assert table.report.beyond_halo == {"kopt(5,30)": 1}
@@ -293,10 +321,14 @@ def test_dimensions(cloud):
 
     for queries in (None, np.array([7, 3, 9]), np.arange(0, len(cloud), 2)):
         found = list(engine.blocks(queries, dimensions=of))  # asked for block by block
-        assert all(np.array_equal(values[:, 2], own[rows].astype(np.float32)) for rows, values in found)
+        assert all(
+            np.array_equal(values[:, 2], own[rows].astype(np.float32)) for rows, values in found
+        )
         assert sum(map(len, seen)) == sum(len(rows) for rows, _ in found)
         seen.clear()
-    table = compute_features(cloud, neighborhoods="c1", feature_set="Density", dimensions={"Intensity": own})
+    table = compute_features(
+        cloud, neighborhoods="c1", feature_set="Density", dimensions={"Intensity": own}
+    )
     assert table.names == ("Density_c1", "Intensity") and np.array_equal(table["Intensity"], own)
 
 
@@ -351,7 +383,9 @@ def test_wrong_queries(cloud, queries, message):
 @pytest.mark.parametrize("far", [1e9, 2.5e9, 1e12])
 def test_strays_far_apart_change_nothing(cloud, far):
     strays = np.vstack([cloud[:500], [[far, far, 0.0], [-far, 5.0, 0.0]]])
-    one, other = (compute_features(xyz, range(500), "c1,k5", "covariance") for xyz in (cloud[:500], strays))
+    one, other = (
+        compute_features(xyz, range(500), "c1,k5", "covariance") for xyz in (cloud[:500], strays)
+    )
     assert np.array_equal(one.values, other.values)
 
 
@@ -430,7 +464,9 @@ def test_cached_code_follows_device_functions(tmp_path):
             f"from pdal_stages.base.jit import device\n@device\ndef value():\n    return {number}\n"
         )
         code = "from outer import f, value; print(f(), value(), sum(f.dispatcher.stats.cache_hits.values()))"
-        found.append(run_python(code, PYTHONPATH=str(tmp_path), PYTHONDONTWRITEBYTECODE="1").split())
+        found.append(
+            run_python(code, PYTHONPATH=str(tmp_path), PYTHONDONTWRITEBYTECODE="1").split()
+        )
     assert found == [["1", "1", "0"], ["1", "1", "1"], ["2", "2", "0"]]
 
 

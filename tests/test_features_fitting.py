@@ -67,7 +67,8 @@ def test_a_thinned_copy_gives_its_samples_too():
 
 def test_training_stores_what_all_clouds_give():
     clouds = [
-        TrainingCloud(xyz, np.where(xyz[:, 2] > 0, 5, 2), name=f"cloud {k}") for k, xyz in enumerate(CLOUDS)
+        TrainingCloud(xyz, np.where(xyz[:, 2] > 0, 5, 2), name=f"cloud {k}")
+        for k, xyz in enumerate(CLOUDS)
     ]
     options = TrainingOptions(
         neighborhoods="copt,s2", feature_set=("covariance", "D2"), dimensions=(), count=50, trees=2, passes=1, voxel=0.0,

@@ -20,23 +20,33 @@ def check(xyz, queries, radii=(1.0, 2.5), kinds="cs", atol=1e-9, results=None):
     radii = [round(radius, 6) for radius in radii]
     names = [f"{kind}{radius}" for kind in kinds for radius in radii]
     if results is None:
-        results = compute_features(xyz, queries, names, ["covariance", *oracle.GEOMETRIC], threads=1)
+        results = compute_features(
+            xyz, queries, names, ["covariance", *oracle.GEOMETRIC], threads=1
+        )
     coordinates = xyz[queries] if np.ndim(queries) == 1 else queries
     for kind in kinds:
         for radius in radii:
             (suffix,) = (n.suffix for n in parse_neighborhoods(f"{kind}{radius}"))
             volume = math.pi * radius**2 if kind == "c" else oracle.ball_volume(radius)
             for i, q in enumerate(coordinates):
-                members = oracle.cylinder(xyz, q, radius) if kind == "c" else oracle.sphere(xyz, q, radius)
+                members = (
+                    oracle.cylinder(xyz, q, radius)
+                    if kind == "c"
+                    else oracle.sphere(xyz, q, radius)
+                )
                 expected = oracle.features(members, volume, q)
                 where = f"{suffix}, query {i}, {len(members)} members"
                 assert round(float(results[f"Density_{suffix}"][i]) * volume) == len(members), where
                 for name in CHECKED:
                     got = float(results[f"{name}_{suffix}"][i])
-                    if name == "Verticality" and (len(members) < 3 or oracle.normal_gap(members) < 1e-7):
+                    if name == "Verticality" and (
+                        len(members) < 3 or oracle.normal_gap(members) < 1e-7
+                    ):
                         assert 0.0 <= got <= 1.0, where  # no normal to speak of
                         continue
-                    assert got == pytest.approx(expected[name], rel=RTOL, abs=ATOL.get(name, atol)), (
+                    assert got == pytest.approx(
+                        expected[name], rel=RTOL, abs=ATOL.get(name, atol)
+                    ), (
                         name,
                         where,
                     )
@@ -59,13 +69,24 @@ def test_utm_coordinates_with_millimeters(random_cloud, rng):
 
 def test_negative_coordinates_and_cell_borders(rng):
     # Integer and half coordinates: distances of exactly a radius, points on borders of cells.
-    grid = np.array([(x, y, z) for x in range(-7, 7) for y in range(-7, 7) for z in (0, 0.5, 1)], float)
+    grid = np.array(
+        [(x, y, z) for x in range(-7, 7) for y in range(-7, 7) for z in (0, 0.5, 1)], float
+    )
     check(grid, np.arange(0, len(grid), 23), radii=(1.0, 2.0, 5.0))
 
 
 def test_members_at_exactly_the_radius():
     xyz = np.array(
-        [[0, 0, 0], [3, 4, 0], [5, 0, 0], [-5, 0, 0], [0, -5, 0], [0, 0, 5], [3, 4, 1e-7], [5.0000001, 0, 0]]
+        [
+            [0, 0, 0],
+            [3, 4, 0],
+            [5, 0, 0],
+            [-5, 0, 0],
+            [0, -5, 0],
+            [0, 0, 5],
+            [3, 4, 1e-7],
+            [5.0000001, 0, 0],
+        ]
     )
     table = compute_features(xyz, [0], "c5,s5", "Density")
     assert round(table["Density_c5"][0] * math.pi * 25) == 7
@@ -83,11 +104,22 @@ def test_every_cell_size(rng, radius):
     "name, make",
     [
         ("plane", lambda r: np.column_stack([r.uniform(0, 9, (900, 2)), np.zeros(900)])),
-        ("slope", lambda r: (lambda p: np.column_stack([p, p @ [0.3, -0.7]]))(r.uniform(0, 9, (900, 2)))),
-        ("wall", lambda r: np.column_stack([r.uniform(0, 9, 900), np.full(900, 2.0), r.uniform(0, 9, 900)])),
+        (
+            "slope",
+            lambda r: (lambda p: np.column_stack([p, p @ [0.3, -0.7]]))(r.uniform(0, 9, (900, 2))),
+        ),
+        (
+            "wall",
+            lambda r: np.column_stack(
+                [r.uniform(0, 9, 900), np.full(900, 2.0), r.uniform(0, 9, 900)]
+            ),
+        ),
         ("line", lambda r: r.uniform(0, 20, (300, 1)) * [1.0, 0.5, 0.25]),
         ("pole", lambda r: r.uniform(0, 20, (300, 1)) * [0.0, 0.0, 1.0]),
-        ("thin line", lambda r: r.uniform(0, 20, (400, 1)) * [1.0, 0.5, 0.25] + r.normal(0, 1e-4, (400, 3))),
+        (
+            "thin line",
+            lambda r: r.uniform(0, 20, (400, 1)) * [1.0, 0.5, 0.25] + r.normal(0, 1e-4, (400, 3)),
+        ),
         ("duplicates", lambda r: np.repeat(r.uniform(0, 5, (60, 3)), 7, axis=0)),
         ("one place", lambda r: np.tile(r.uniform(0, 5, (1, 3)), (40, 1))),
         ("two places", lambda r: np.tile(r.uniform(0, 1, (2, 3)), (20, 1))),
@@ -97,7 +129,10 @@ def test_every_cell_size(rng, radius):
         ),
         ("sparse", lambda r: r.uniform(0, 300, (200, 3))),
         ("dense", lambda r: r.normal(0, 0.2, (3000, 3))),
-        ("stray", lambda r: np.vstack([r.uniform(0, 9, (400, 3)), [[1e9, -1e9, 1e4], [4.0, 4.0, 1e6]]])),
+        (
+            "stray",
+            lambda r: np.vstack([r.uniform(0, 9, (400, 3)), [[1e9, -1e9, 1e4], [4.0, 4.0, 1e6]]]),
+        ),
     ],
 )
 def test_degenerate_clouds(rng, name, make):
@@ -138,15 +173,21 @@ def test_queries_that_are_not_points(random_cloud, rng):
     check(xyz, queries, radii=(1.0, 4.0))
     cluster = np.tile([[4.0, 4.0, 1.0]], (5, 1))  # coinciding points away from the query
     table = compute_features(cluster, [[3.2, 3.5, 7.7]], "c2", ["covariance", *oracle.GEOMETRIC])
-    assert table["EigenvalueSum_c2"][0] == 0 and table["SurfaceVariation_c2"][0] == np.float32(1 / 3)
+    assert table["EigenvalueSum_c2"][0] == 0 and table["SurfaceVariation_c2"][0] == np.float32(
+        1 / 3
+    )
     assert table["HeightStd_c2"][0] == 0 and table["HeightRange_c2"][0] == 0
 
 
 def test_horizontal_line_is_not_vertical_and_a_pole_is():
     line = np.column_stack([np.arange(9.0), np.arange(9.0) * 0.5, np.zeros(9)])
     pole = np.column_stack([np.zeros(9), np.zeros(9), np.arange(9.0)])
-    assert compute_features(line, [4], "s3", "Verticality").values[0, 0] == pytest.approx(0.0, abs=1e-6)
-    assert compute_features(pole, [4], "s3", "Verticality").values[0, 0] == pytest.approx(1.0, abs=1e-6)
+    assert compute_features(line, [4], "s3", "Verticality").values[0, 0] == pytest.approx(
+        0.0, abs=1e-6
+    )
+    assert compute_features(pole, [4], "s3", "Verticality").values[0, 0] == pytest.approx(
+        1.0, abs=1e-6
+    )
 
 
 def test_large_spheres_in_a_dense_cloud(rng):

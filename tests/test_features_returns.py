@@ -20,7 +20,10 @@ def cloud(n=400, seed=0, spread=12.0):
 
 def slow(name, xyz, dimensions):
     """Point by point, over all others."""
-    number, total = dimensions["ReturnNumber"].astype(int), dimensions["NumberOfReturns"].astype(int)
+    number, total = (
+        dimensions["ReturnNumber"].astype(int),
+        dimensions["NumberOfReturns"].astype(int),
+    )
     flag = total > 1 if name.startswith("MultipleReturn") else (number > 0) & (number < total)
     one = returns.parse(name)
     if not one.axes:
@@ -48,7 +51,9 @@ def test_any_order_of_points_and_a_tile_with_its_halo_give_the_same_bits():
     low, high = xyz[:, :2].min(axis=0) + 20, xyz[:, :2].min(axis=0) + 40
     halo = FeaturePlan.parse("s1", "Linearity", returns.NAMES).halo_m
     near = ((xyz[:, :2] >= low - halo) & (xyz[:, :2] < high + halo)).all(axis=1)
-    tile = returns.return_features(returns.NAMES, xyz[near], {k: v[near] for k, v in dimensions.items()})
+    tile = returns.return_features(
+        returns.NAMES, xyz[near], {k: v[near] for k, v in dimensions.items()}
+    )
     inside = ((xyz[near, :2] >= low) & (xyz[near, :2] < high)).all(axis=1)
     for name in returns.NAMES:
         assert np.array_equal(moved[name], whole[name][order])
@@ -59,7 +64,9 @@ def test_without_return_numbers_all_is_zero():
     xyz, _ = cloud(50)
     assert required(returns.NAMES) == () and optional(returns.NAMES) == returns.SOURCES
     for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in returns.SOURCES}):
-        fed = gather(returns.NAMES, with_returns(returns.NAMES, xyz, dimensions), 50, np.arange(0, 50, 7))
+        fed = gather(
+            returns.NAMES, with_returns(returns.NAMES, xyz, dimensions), 50, np.arange(0, 50, 7)
+        )
         assert all(len(fed[name]) == 8 and not fed[name].any() for name in returns.NAMES)
     assert not len(returns.return_features(returns.NAMES, xyz[:0], {})["MultipleReturn_box2"])
 

@@ -32,7 +32,11 @@ def test_surfaces_are_the_oracle_s(cloud):
             for name, value in expected.items():
                 if name == "NormalAgreement" and gap < 1e-5:
                     continue  # some normal is any perpendicular of a line, or anything at all
-                assert got[f"{name}_k{k}"][i] == pytest.approx(value, rel=1e-4, abs=2e-5), (name, k, i)
+                assert got[f"{name}_k{k}"][i] == pytest.approx(value, rel=1e-4, abs=2e-5), (
+                    name,
+                    k,
+                    i,
+                )
 
 
 def test_queries_that_are_no_points_of_the_cloud():
@@ -41,7 +45,9 @@ def test_queries_that_are_no_points_of_the_cloud():
     got = compute_features(xyz, queries, "k3", "surfaces")
     for i, q in enumerate(queries):
         expected, gap = oracle.surfaces(xyz, q, 3)
-        assert gap < 1e-5 or got.values[i] == pytest.approx(list(expected.values()), rel=1e-4, abs=2e-5)
+        assert gap < 1e-5 or got.values[i] == pytest.approx(
+            list(expected.values()), rel=1e-4, abs=2e-5
+        )
 
 
 @settings(max_examples=25, deadline=None)
@@ -57,7 +63,9 @@ def test_variations_with_many_ties(points, k, scale):
         expected, gap = oracle.surfaces(xyz, q, k)
         assert got.values[i, 1:] == pytest.approx(list(expected.values())[1:], rel=1e-4, abs=2e-5)
         if gap > 1e-3:
-            assert got.values[i, 0] == pytest.approx(expected["NormalAgreement"], rel=1e-4, abs=2e-5)
+            assert got.values[i, 0] == pytest.approx(
+                expected["NormalAgreement"], rel=1e-4, abs=2e-5
+            )
 
 
 def test_a_plane_agrees_and_a_crown_does_not():
@@ -65,19 +73,28 @@ def test_a_plane_agrees_and_a_crown_does_not():
     xy = rng.uniform(0, 10, (800, 2))
     roof = np.column_stack([xy, 0.7 * xy[:, 0]])
     table = compute_features(roof, None, "k20", "surfaces")
-    assert table["NormalAgreement_k20"].min() > 1 - 1e-6 and table["SurfaceVariationMean_k20"].max() < 1e-12
+    assert (
+        table["NormalAgreement_k20"].min() > 1 - 1e-6
+        and table["SurfaceVariationMean_k20"].max() < 1e-12
+    )
     crown = compute_features(rng.normal(0, 2, (800, 3)), None, "k20", "surfaces")
     assert crown["NormalAgreement_k20"].max() < 0.95 and crown["SurfaceVariationMin_k20"].min() > 0
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 10_000), st.sampled_from([(0, 1, 2), (1, 0, 2), (2, 0, 1)]), st.integers(-4000, 4000))
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from([(0, 1, 2), (1, 0, 2), (2, 0, 1)]),
+    st.integers(-4000, 4000),
+)
 def test_rigid_motions(seed, axes, shift):
     """Surfaces know neither north nor up."""
     rng = np.random.default_rng(seed)
     xyz = np.round(rng.uniform(0, 6, (int(rng.integers(12, 80)), 3)) * 1024) / 1024
     one = compute_features(xyz, None, "k4,k12", "surfaces", threads=1).values
-    other = compute_features(xyz[:, axes] * [1, -1, 1] + shift, None, "k4,k12", "surfaces", threads=1).values
+    other = compute_features(
+        xyz[:, axes] * [1, -1, 1] + shift, None, "k4,k12", "surfaces", threads=1
+    ).values
     np.testing.assert_allclose(one, other, rtol=1e-4, atol=3e-4)
 
 
@@ -101,7 +118,9 @@ def test_any_order_threads_blocks_and_queries():
     xyz = np.vstack([town(6000), town(6000)[:50]])  # copies of points too
     whole = compute_features(xyz, None, TOKENS, "surfaces,Linearity", threads=1)
     order = np.random.default_rng(0).permutation(len(xyz))
-    other = compute_features(xyz[order], None, TOKENS, "surfaces,Linearity", threads=3, memory_mb=16)
+    other = compute_features(
+        xyz[order], None, TOKENS, "surfaces,Linearity", threads=3, memory_mb=16
+    )
     assert other.values.tobytes() == whole.values[order].tobytes()
     rows = order[:300]
     for queries in (rows, xyz[rows]):
@@ -113,7 +132,9 @@ def test_any_order_threads_blocks_and_queries():
 def test_beside_other_features():
     xyz = town(1500)
     alone = compute_features(xyz, None, "k8", "surfaces")
-    beside = compute_features(xyz, None, "c1,k3,k8,k30,kopt(5,20)", "all,HeightAboveLowest,surfaces")
+    beside = compute_features(
+        xyz, None, "c1,k3,k8,k30,kopt(5,20)", "all,HeightAboveLowest,surfaces"
+    )
     plain = compute_features(xyz, None, "k8,k30", "covariance,geometric")
     for table in (alone, plain):
         for name in table.names:
@@ -139,7 +160,8 @@ def test_the_second_step_is_counted():
     rng = np.random.default_rng(2)
     clumps = [rng.uniform(0, 1, (5, 3)) + np.array([40.0 * i, 0, 0]) for i in range(6)]
     lone, plain = (
-        compute_features(np.vstack(clumps), None, "k3", words) for words in ("surfaces", "Linearity")
+        compute_features(np.vstack(clumps), None, "k3", words)
+        for words in ("surfaces", "Linearity")
     )
     assert lone.report.beyond_halo == {"k3": 30} and not plain.report.beyond_halo
     assert 30 < lone.report.reach < 90 and plain.report.reach < 2
@@ -157,7 +179,9 @@ def test_plans():
     assert [name for name in plan.names if "Linearity" not in name] == [
         f"{name}_{token}" for token in ("k10", "k20") for name in SURFACES
     ]
-    assert FeaturePlan.parse("k10,k20", "surfacevariationstd_K20").names == ("SurfaceVariationStd_k20",)
+    assert FeaturePlan.parse("k10,k20", "surfacevariationstd_K20").names == (
+        "SurfaceVariationStd_k20",
+    )
     assert not {*SURFACES} & {name.split("_")[0] for name in FeaturePlan.parse("k10").names}
     assert FeaturePlan.from_dict(plan.to_dict()) == plan
     for spec in ("s1", "kopt", "ropt"):

@@ -40,10 +40,16 @@ def test_no_ground_is_an_error(tmp_path, kind, more):
     )
     with pytest.raises(StageError, match="no ground was found") as caught:
         job.execute()
-    assert f"{kind} (tag 'h')" in str(caught.value) and "100 points of class 1, 5" in str(caught.value)
+    assert f"{kind} (tag 'h')" in str(caught.value) and "100 points of class 1, 5" in str(
+        caught.value
+    )
     assert "filters.smrf" in str(caught.value) and not (tmp_path / "o.las").exists()
     run = ps.run_tiled(
-        stages(str(tmp_path / "a.las"), kind, tmp_path / "o_#.las"), 20, workers=0, buffer=5.0, progress=False
+        stages(str(tmp_path / "a.las"), kind, tmp_path / "o_#.las"),
+        20,
+        workers=0,
+        buffer=5.0,
+        progress=False,
     )
     assert len(run.failures) >= 4 and "no ground was found" in run.failures[0][1]
 
@@ -61,7 +67,9 @@ def test_heights_are_those_of_pdal(tmp_path, kind, codes, pdal_program):
         kind.partition(".")[2],
         "--writers.las.extra_dims=all",
     ]
-    subprocess.run([pdal_program, *words, "--writers.las.minor_version=4"], check=True, capture_output=True)
+    subprocess.run(
+        [pdal_program, *words, "--writers.las.minor_version=4"], check=True, capture_output=True
+    )
     ours, stock = (laspy.read(tmp_path / f"{name}.las") for name in ("ours", "stock"))
     np.testing.assert_array_equal(ours["HeightAboveGround"], stock["HeightAboveGround"])
     assert "filters.python" not in job.metadata["metadata"]
@@ -69,5 +77,7 @@ def test_heights_are_those_of_pdal(tmp_path, kind, codes, pdal_program):
 
 def test_no_points_are_no_error(tmp_path):
     cut = {"type": "filters.range", "limits": "Z[-9:-8]"}
-    first, *rest = stages(write(tmp_path / "a.las", [1] * 100), "filters.hag_nn", tmp_path / "o.las")
+    first, *rest = stages(
+        write(tmp_path / "a.las", [1] * 100), "filters.hag_nn", tmp_path / "o.las"
+    )
     assert ps.Pipeline([first, cut, *rest]).execute() == 0

@@ -22,7 +22,9 @@ def slow_pits(raster, highest, cell=1.0):
     covered = np.pad(highest > raster + 2.5, 1)
     under = lambda j, i: covered[j : j + 3, i : i + 3].any()  # noqa: E731
     few = [len(mine) <= 30 or np.mean([under(*at) for at in mine]) >= 0.8 for mine in sets]
-    small = [some and (np.ptp(mine, axis=0) < 20).all() for some, mine in zip(few, sets, strict=True)]
+    small = [
+        some and (np.ptp(mine, axis=0) < 20).all() for some, mine in zip(few, sets, strict=True)
+    ]
     island = np.append(small, False)[number]
     low, base = np.where(island, raster, np.inf), np.where(island, np.inf, raster)
     return np.isfinite(slow_below(low.astype(float), base.astype(float), cell))
@@ -60,7 +62,10 @@ def test_pits_do_not_depend_on_where_the_raster_ends(seed):
     far = pits_reach(1.0)
     raster = rough(seed, (2 * far + 15, 2 * far + 23))
     highest = raster + np.where(raster < 0, 8, 0)
-    whole, cut = pits(raster, highest, 1.0), pits(*(a[3:-3, 3:-3].copy() for a in (raster, highest)), 1.0)
+    whole, cut = (
+        pits(raster, highest, 1.0),
+        pits(*(a[3:-3, 3:-3].copy() for a in (raster, highest)), 1.0),
+    )
     inner = slice(far, -far)
     assert np.array_equal(cut[inner, inner], whole[3:-3, 3:-3][inner, inner])
 

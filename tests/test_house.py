@@ -15,7 +15,9 @@ FLOORS = (
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT))
+)
 def test_house(path):
     own, *rest = path.relative_to(ROOT).with_suffix("").parts
     for node in ast.walk(ast.parse(path.read_text())) if own != "__init__" else ():
@@ -23,9 +25,13 @@ def test_house(path):
             continue
         module = (*[own, *rest][: -node.level], *(node.module or "").split("."))
         for room in [module[0]] if module[0] else [alias.name for alias in node.names]:
-            assert room == own or FLOOR[room] < FLOOR[own], f"line {node.lineno}: {own} imports {room}"
+            assert room == own or FLOOR[room] < FLOOR[own], (
+                f"line {node.lineno}: {own} imports {room}"
+            )
             private = [
-                one.name for one in node.names if one.name.startswith("_") and one.name != "__version__"
+                one.name
+                for one in node.names
+                if one.name.startswith("_") and one.name != "__version__"
             ]
             assert room == own or not private, f"line {node.lineno}: {private} of {room}"
 
@@ -37,4 +43,6 @@ def test_one_class_one_name():
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 own = str(path.relative_to(ROOT))
-                assert found.setdefault(node.name, own) == own, f"{node.name} in {found[node.name]} and {own}"
+                assert found.setdefault(node.name, own) == own, (
+                    f"{node.name} in {found[node.name]} and {own}"
+                )

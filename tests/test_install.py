@@ -15,7 +15,14 @@ import pytest
 from processes import ended, printed
 
 ROOT = Path(__file__).resolve().parent.parent
-SHELL = ["scripts/lib.sh", "scripts/setup", "scripts/install-pdal", "scripts/demo", "scripts/test", ".ci/run"]
+SHELL = [
+    "scripts/lib.sh",
+    "scripts/setup",
+    "scripts/install-pdal",
+    "scripts/demo",
+    "scripts/test",
+    ".ci/run",
+]
 
 
 def load(name):
@@ -46,14 +53,22 @@ def test_shell_scripts_parse_and_are_executable(name):
     [
         ("cp: error writing 'x': No space left on device", "the disk is full"),
         ("E: Temporary failure resolving 'mirror.example'", "does not answer"),
-        ("SSLError(SSLCertVerificationError(1, 'certificate verify failed'))", "certificate is not trusted"),
-        ("ERROR: No matching distribution found for numba>=0.58", "no package that fits for numba>=0.58"),
+        (
+            "SSLError(SSLCertVerificationError(1, 'certificate verify failed'))",
+            "certificate is not trusted",
+        ),
+        (
+            "ERROR: No matching distribution found for numba>=0.58",
+            "no package that fits for numba>=0.58",
+        ),
         ("something new", "failed; see the output above"),
     ],
 )
 def test_failed_step_says_why(tmp_path, output, message):
     done = bash(
-        'fail() { echo "$1"; false; echo never; }\nstep "The step" fail "$OUTPUT"', tmp_path, OUTPUT=output
+        'fail() { echo "$1"; false; echo never; }\nstep "The step" fail "$OUTPUT"',
+        tmp_path,
+        OUTPUT=output,
     )
     assert done.returncode == 1
     assert "The step" in done.stdout and "FAILED" in done.stdout
@@ -99,9 +114,13 @@ def test_every_data_file_is_packaged():
     package = ROOT / "pdal_stages"
     code = {".py", ".pyc", ".nbi", ".nbc"}
     data = [
-        p.relative_to(package).as_posix() for p in package.rglob("*") if p.is_file() and p.suffix not in code
+        p.relative_to(package).as_posix()
+        for p in package.rglob("*")
+        if p.is_file() and p.suffix not in code
     ]
-    assert data and not [name for name in data if not any(fnmatch.fnmatch(name, p) for p in patterns)]
+    assert data and not [
+        name for name in data if not any(fnmatch.fnmatch(name, p) for p in patterns)
+    ]
     without_init = {p.parent for p in package.rglob("*.py")} - {
         p.parent for p in package.rglob("__init__.py")
     }

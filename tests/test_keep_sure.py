@@ -42,7 +42,11 @@ def test_limits_are_the_lowest_that_hold(seed, n, accuracy):
             assert np.isclose(limit.kept, (mine & (bins >= min(good))).sum() / mine.sum())
             assert np.isclose(limit.right, shares[min(good)])
         else:
-            assert limit.reliability > 1 and limit.kept == 0 and np.isclose(limit.right, max(shares.values()))
+            assert (
+                limit.reliability > 1
+                and limit.kept == 0
+                and np.isclose(limit.right, max(shares.values()))
+            )
     again = Sureness.from_dict(json.loads(json.dumps(known.to_dict())))
     assert again.limits(accuracy) == known.limits(accuracy)
     assert 0 <= known.kept(known.limits(accuracy)) <= 1
@@ -81,10 +85,15 @@ def test_the_shipped_model_says_what_it_costs():
     }
     standard = of_the_base({}, {}, find("standard"))
     joined = of_the_base(own, {}, find("standard"))
-    assert joined["about"] == standard["about"] and standard["about"].startswith("its base (15 surveys")
+    assert joined["about"] == standard["about"] and standard["about"].startswith(
+        "its base (15 surveys"
+    )
     assert {code: joined["classes"][code] for code in standard["classes"]} == standard["classes"]
     both = Sureness.from_dict(joined)
-    assert np.isclose(both.points([14]), both.points([2, 5, 6]), rtol=1e-3) and both.points([2, 5, 6]) > 1e6
+    assert (
+        np.isclose(both.points([14]), both.points([2, 5, 6]), rtol=1e-3)
+        and both.points([2, 5, 6]) > 1e6
+    )
     assert of_the_base(own, {}, "nowhere.model") == own
     sure = ClassifyRequest(keep_sure=0.98).cost  # buildings stay with 98 %, too
     assert not any("no point keeps it" in line for line in sure)
@@ -108,7 +117,9 @@ def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
     known = Sureness.from_dict(model.info["sureness"])
     assert "held out" in known.about and set(known.right) == {2, 6}
     # As many as the labels, not as the samples.
-    assert np.isclose(sum((known.right[c] + known.wrong[c]).sum() for c in (2, 6)), len(xyz), rtol=0.02)
+    assert np.isclose(
+        sum((known.right[c] + known.wrong[c]).sum() for c in (2, 6)), len(xyz), rtol=0.02
+    )
     limits = known.limits(0.9)
     other, truth = blocks(1)
     found = model.predict(other, {"HeightAboveGround": other[:, 2]},
@@ -129,7 +140,10 @@ def test_classify_keeps_only_what_is_sure_in_tiles_too(ready_town, tmp_path, cap
     """What is rejected is counted once, not with each tile's surroundings again."""
     source = str(ready_town)
     counted = []
-    for words in ([str(tmp_path / "whole.laz")], [str(tmp_path / "tiles"), "--tile", "30", "--workers", "0"]):
+    for words in (
+        [str(tmp_path / "whole.laz")],
+        [str(tmp_path / "tiles"), "--tile", "30", "--workers", "0"],
+    ):
         assert main(["classify", source, *words, "--keep-sure", "0.98"]) == 0
         text = capsys.readouterr()
         assert "expected to become class 1" in text.err

@@ -22,7 +22,9 @@ def test_every_shipped_model_loads_says_its_preparation_and_is_small(tmp_path):
     assert STANDARD in shipped()
     for path in shipped().values():
         model = load_model(path)
-        load_model(shutil.copy(path, tmp_path))  # held against the schema, as those beside the code are not
+        load_model(
+            shutil.copy(path, tmp_path)
+        )  # held against the schema, as those beside the code are not
         assert path.stat().st_size < 5e6
         made = {name for stage in model.info["preparation"] for name in _creates(stage)}
         assert set(model.required_dimensions) <= made
@@ -46,13 +48,16 @@ def test_heights_are_made_as_in_training_beside_return_numbers():
     rng = np.random.default_rng(0)
     xyz = rng.uniform(0, 40, (3000, 3)) * [1, 1, 0.01]
     returns = {
-        name: rng.integers(1, 3, 3000).astype(np.uint8) for name in ("ReturnNumber", "NumberOfReturns")
+        name: rng.integers(1, 3, 3000).astype(np.uint8)
+        for name in ("ReturnNumber", "NumberOfReturns")
     }
     model = load_model(shipped()[STANDARD])
     found = model.predict(xyz, returns).classification
     made = made_of_coordinates(model.info["preparation"], xyz)
     assert np.array_equal(found, model.predict(xyz, {**made, **returns}).classification)
-    assert not np.array_equal(model.predict(xyz).reliability, model.predict(xyz, returns).reliability)
+    assert not np.array_equal(
+        model.predict(xyz).reliability, model.predict(xyz, returns).reliability
+    )
     with pytest.raises(DimensionError, match=r"Leave out HeightAboveGround: .*hag_morphological"):
         model.predict(xyz, {"HeightAboveGround": xyz[:, 2], **returns})
 
@@ -70,7 +75,9 @@ def test_a_raw_tile_is_classified_without_a_model_named(ready_town, tmp_path, ca
     wanted = np.array([groups.get(code, 0) for code in range(256)])[known["Classification"]]
     given = found["Classification"]
     assert set(np.unique(given).tolist()) <= {2, 5, 6, 18}
-    assert np.mean(given[wanted > 0] == wanted[wanted > 0]) > 0.8  # it has never seen a generated town
+    assert (
+        np.mean(given[wanted > 0] == wanted[wanted > 0]) > 0.8
+    )  # it has never seen a generated town
 
 
 @pytest.mark.pdal
@@ -97,14 +104,26 @@ def test_missing_heights_come_with_the_stage_to_paste(ready_town):
     pipeline = Pipeline([str(ready_town), {"type": "filters.modelclassifier", "model": STANDARD}])
     with pytest.raises(StageError) as caught:
         pipeline.execute()
-    assert '{"type": "filters.hag_morphological", "ground": true, "openings": [5, 17]}' in str(caught.value)
+    assert '{"type": "filters.hag_morphological", "ground": true, "openings": [5, 17]}' in str(
+        caught.value
+    )
 
 
 @pytest.mark.pdal
 def test_training_keeps_the_stages_before_it(ready_town, tmp_path):
     path = tmp_path / "own.model"
-    writer = {"type": "writers.classifiermodel", "filename": str(path), "classes": {"2": 2, "5": 5, "6": 6}}
-    few = {"neighborhoods": "k10", "feature_set": "covariance", "count": 50, "trees": 3, "passes": 1}
+    writer = {
+        "type": "writers.classifiermodel",
+        "filename": str(path),
+        "classes": {"2": 2, "5": 5, "6": 6},
+    }
+    few = {
+        "neighborhoods": "k10",
+        "feature_set": "covariance",
+        "count": 50,
+        "trees": 3,
+        "passes": 1,
+    }
     heights = {"type": "filters.hag_minima", "cell": 10, "tag": "h"}
     few["dimensions"] = "HeightAboveGround"
     Pipeline([str(ready_town), heights, {**writer, **few}]).execute()
@@ -138,7 +157,9 @@ def test_vegetation_by_height(ready_town):
     expected[called & (height < 2.0)] = 4
     expected[called & (height < 0.5)] = 3
     assert np.array_equal(split["Classification"][sure], expected[sure])
-    assert not np.isin(split["Classification"][~sure & (plain["Classification"] == 5)], (3, 4)).all()
+    assert not np.isin(
+        split["Classification"][~sure & (plain["Classification"] == 5)], (3, 4)
+    ).all()
 
 
 def classified(town, **options):
@@ -164,7 +185,12 @@ def test_a_shipped_model_by_name_in_tiles(ready_town, tmp_path, monkeypatch):
     preparation = load_model(STANDARD).info["preparation"]
 
     def job(target):
-        return [str(ready_town), *preparation, {"type": "filters.modelclassifier", "model": STANDARD}, target]
+        return [
+            str(ready_town),
+            *preparation,
+            {"type": "filters.modelclassifier", "model": STANDARD},
+            target,
+        ]
 
     Pipeline(job("whole.laz")).execute(arrays=False)
     run = run_tiled(job("tiles.laz"), 40, workers=2, progress=False)

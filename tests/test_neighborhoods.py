@@ -5,7 +5,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.features.neighborhoods import PRESETS, Neighborhood, parse_neighborhoods, preset_dimensions
+from pdal_stages.features.neighborhoods import (
+    PRESETS,
+    Neighborhood,
+    parse_neighborhoods,
+    preset_dimensions,
+)
 
 
 def tokens(spec):
@@ -76,7 +81,8 @@ def test_refuses(spec, word):
 
 def test_suffix_and_reach():
     found = {
-        n.token: (n.suffix, n.reach, n.adaptive) for n in parse_neighborhoods("c2.5,s1,k50,kopt,ropt,copt")
+        n.token: (n.suffix, n.reach, n.adaptive)
+        for n in parse_neighborhoods("c2.5,s1,k50,kopt,ropt,copt")
     }
     assert found == {
         "c2.5": ("c2_5", 2.5, False),
@@ -92,14 +98,19 @@ def test_suffix_and_reach():
 def test_presets_bring_dimensions():
     assert preset_dimensions("blomley2016") == ("Z",)
     assert preset_dimensions("c1, weinmann2018") == ("HeightAboveGround",)
-    assert preset_dimensions(["he2017", "blomley2016", "weinmann2018"]) == ("Z", "HeightAboveGround")
+    assert preset_dimensions(["he2017", "blomley2016", "weinmann2018"]) == (
+        "Z",
+        "HeightAboveGround",
+    )
     assert preset_dimensions("c1") == ()
     assert all(parse_neighborhoods(list(words)) for words, _ in PRESETS.values())
 
 
 def test_neighborhoods_are_values():
     (one,) = parse_neighborhoods("c2")
-    assert one == Neighborhood("cylinder", (2.0,)) and hash(one) == hash(parse_neighborhoods("c2.0")[0])
+    assert one == Neighborhood("cylinder", (2.0,)) and hash(one) == hash(
+        parse_neighborhoods("c2.0")[0]
+    )
     assert str(one) == "c2"
 
 

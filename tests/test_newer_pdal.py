@@ -49,16 +49,24 @@ def test_copc_is_written(cloud, tmp_path):
     needs(2, 4, 0)
     out = tmp_path / "out.copc.laz"
     writer = {"type": "writers.copc", "filename": str(out), "forward": "all", "extra_dims": "all"}
-    ps.run_pipeline([{"type": "readers.las", "filename": str(cloud), "use_eb_vlr": True}, HAG, writer])
+    ps.run_pipeline(
+        [{"type": "readers.las", "filename": str(cloud), "use_eb_vlr": True}, HAG, writer]
+    )
     before, after = laspy.read(cloud), laspy.read(out)
     assert any(v.user_id == "copc" for v in after.header.vlrs)
     assert not list(tmp_path.glob(".*"))
     order, other = np.argsort(before.gps_time), np.argsort(after.gps_time)
     for name in ("X", "Y", "Z", "intensity", "classification", "Mine"):
         assert np.array_equal(np.asarray(after[name])[other], np.asarray(before[name])[order]), name
-    assert np.allclose(np.asarray(after["HeightAboveGround"])[other], heights(before)[order], atol=1e-5)
+    assert np.allclose(
+        np.asarray(after["HeightAboveGround"])[other], heights(before)[order], atol=1e-5
+    )
     part = [
-        {"type": "readers.copc", "filename": str(out), "bounds": "([500000,500010],[5400000,5400010])"},
+        {
+            "type": "readers.copc",
+            "filename": str(out),
+            "bounds": "([500000,500010],[5400000,5400010])",
+        },
         HAG,
     ]
     read = ps.run_pipeline(part).arrays[0]
@@ -100,7 +108,11 @@ def test_flags_are_dimensions_of_their_own(tmp_path, write_las, wide_model, poin
     assert (array["Classification"][~chosen] == 1).all()
     assert set(np.unique(array["Classification"][chosen])) == {2, 64}
     after = laspy.read(out)
-    for name, laspys in (("Synthetic", "synthetic"), ("KeyPoint", "key_point"), ("Withheld", "withheld")):
+    for name, laspys in (
+        ("Synthetic", "synthetic"),
+        ("KeyPoint", "key_point"),
+        ("Withheld", "withheld"),
+    ):
         assert np.array_equal(np.asarray(after[laspys]), arrays[name]), name
 
 
@@ -133,7 +145,10 @@ def test_every_join_that_python_pdal_lets_us_have(cloud, pdal_module):
         | ps.Filter.multiscalefeatures(neighborhoods="k4")
     )
     assert isinstance(ours, ps.Pipeline) and ours.execute() == 5
-    assert "Linearity_k4" in ours.arrays[0].dtype.names and "HeightAboveGround" in ours.arrays[0].dtype.names
+    assert (
+        "Linearity_k4" in ours.arrays[0].dtype.names
+        and "HeightAboveGround" in ours.arrays[0].dtype.names
+    )
     after = ps.Filter.hag_minima() | ps.Pipeline([{"type": "filters.head", "count": 7}])
     assert isinstance(after, ps.Pipeline) and (ps.Pipeline([str(cloud)]) | after).execute() == 7
     reader = pdal_module.Reader.las(str(cloud))

@@ -26,7 +26,10 @@ NEWER = {"minor_version": 4, "dataformat_id": 6}
 def flagged(seed=1):
     arrays = ground_and_block(900, seed)
     rng = np.random.default_rng(seed)
-    return {**arrays, **{name: (rng.random(len(arrays["X"])) < 0.2).astype(np.uint8) for name in FLAGS}}
+    return {
+        **arrays,
+        **{name: (rng.random(len(arrays["X"])) < 0.2).astype(np.uint8) for name in FLAGS},
+    }
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +51,13 @@ def all_flags(las):
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 @pytest.mark.parametrize("tiles", [False, True])
-def test_flags_of_old_files_stay_flags_in_new_ones(tmp_path, run, run_job, write_las, model, suffix, tiles):
-    source, out = write_las(tmp_path / "in.las", flagged(), point_format=1), tmp_path / f"out.{suffix}"
+def test_flags_of_old_files_stay_flags_in_new_ones(
+    tmp_path, run, run_job, write_las, model, suffix, tiles
+):
+    source, out = (
+        write_las(tmp_path / "in.las", flagged(), point_format=1),
+        tmp_path / f"out.{suffix}",
+    )
     if tiles:
         classifier = {"type": "filters.modelclassifier", "model": str(model), "ignore": ""}
         writer = {"type": "writers.las", "filename": str(out), "forward": "all", **NEWER}
@@ -79,7 +87,9 @@ def test_old_and_new_files_together(tmp_path, run_job, write_las, wiring):
     if made.x[0] != parts[0].x[0]:  # PDAL may take a pattern's files as the folder lists them
         parts.reverse()
     for name in ("x", "y", "classification"):
-        assert np.array_equal(made[name], np.concatenate([np.asarray(part[name]) for part in parts])), name
+        assert np.array_equal(
+            made[name], np.concatenate([np.asarray(part[name]) for part in parts])
+        ), name
     assert np.array_equal(all_flags(made), np.hstack([all_flags(part) for part in parts]))
     assert not list(made.point_format.extra_dimension_names)
 
@@ -89,9 +99,19 @@ def test_training_on_old_and_new_files(tmp_path, run, write_las):
     models = []
     for point_formats in ((1, 6), (6, 6)):
         files = [
-            write_las(tmp_path / f"{n}.las", flagged(n), point_format=f) for n, f in enumerate(point_formats)
+            write_las(tmp_path / f"{n}.las", flagged(n), point_format=f)
+            for n, f in enumerate(point_formats)
         ]
-        words = ["train", *files, "--model", tmp_path / "m.model", "--neighborhoods", "k8", "--count", 50]
+        words = [
+            "train",
+            *files,
+            "--model",
+            tmp_path / "m.model",
+            "--neighborhoods",
+            "k8",
+            "--count",
+            50,
+        ]
         more = ["--writers.classifiermodel.trees=2", "--writers.classifiermodel.passes=1"]
         code, _, err = run(*words, *more, "--writers.classifiermodel.threads=1")
         assert code == 0, err
@@ -137,7 +157,10 @@ def test_writers_of_both_are_refused_before_work(tmp_path, run_job, write_las, m
 
 @pytest.mark.parametrize("tiles", [False, True])
 def test_all_extra_dimensions_of_a_new_file(tmp_path, run_job, write_las, tiles):
-    arrays = flagged() | {"Amplitude": np.arange(900, dtype="f4"), "Linearity": np.arange(900, dtype="f8")}
+    arrays = flagged() | {
+        "Amplitude": np.arange(900, dtype="f4"),
+        "Linearity": np.arange(900, dtype="f8"),
+    }
     source = write_las(tmp_path / "in.laz", arrays, point_format=7)
     stages = [
         str(source),
@@ -148,8 +171,18 @@ def test_all_extra_dimensions_of_a_new_file(tmp_path, run_job, write_las, tiles)
     code, _, err = run_job(stages, *(["--tile", 20, "--workers", 0] if tiles else []))
     assert code == 0, err
     made = laspy.read(tmp_path / "o.las")
-    names = [name for name in made.point_format.extra_dimension_names if name != "ClassFlags"]  # of old PDAL
-    assert names == ["Red", "Green", "Blue", "Amplitude", "Linearity", "Reference", "HeightAboveGround"]
+    names = [
+        name for name in made.point_format.extra_dimension_names if name != "ClassFlags"
+    ]  # of old PDAL
+    assert names == [
+        "Red",
+        "Green",
+        "Blue",
+        "Amplitude",
+        "Linearity",
+        "Reference",
+        "HeightAboveGround",
+    ]
     assert np.array_equal(made.Amplitude, arrays["Amplitude"])
     assert np.array_equal(all_flags(laspy.read(source)), all_flags(made))
 
@@ -187,7 +220,9 @@ def test_noise_and_withheld_points_are_not_there(tmp_path, run, write_las, model
         out[name] = laspy.read(tmp_path / "o.las")
     assert "noise and withheld points, not classified (ignore)" in said and "120" in said
     for name in ("classification", "Reliability", "HeightAboveGround"):
-        assert np.array_equal(np.asarray(out["bad"][name])[:n], np.asarray(out["clean"][name])), name
+        assert np.array_equal(np.asarray(out["bad"][name])[:n], np.asarray(out["clean"][name])), (
+            name
+        )
     assert np.array_equal(np.asarray(out["bad"].classification)[n:], bad["Classification"][n:])
     assert np.abs(out["bad"].HeightAboveGround[n:]).max() > 1  # they still have heights
 
@@ -221,10 +256,18 @@ def test_features_and_training_without_unwanted_points(tmp_path, capsys, write_l
     features, models = [], []
     for name, arrays in (("clean", clean), ("bad", bad)):
         source = write_las(tmp_path / f"{name}.las", arrays, point_format=6)
-        planarity = {"type": "filters.multiscalefeatures", "neighborhoods": "k5", "feature_set": "covariance"}
+        planarity = {
+            "type": "filters.multiscalefeatures",
+            "neighborhoods": "k5",
+            "feature_set": "covariance",
+        }
         made = ps.run_pipeline([str(source), planarity])
         features.append(made.arrays[0]["Planarity_k5"])
-        writer = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "threads": 1}
+        writer = {
+            "type": "writers.classifiermodel",
+            "filename": str(tmp_path / "m.model"),
+            "threads": 1,
+        }
         few = {"neighborhoods": "k5", "passes": 1, "trees": 2, "count": 50}
         ps.run_pipeline([str(source), {"type": "filters.hag_minima"}, {**writer, **few}])
         models.append(ps.load_model(tmp_path / "m.model").passes[0].arrays())

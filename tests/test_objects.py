@@ -22,7 +22,9 @@ from pdal_stages.synthetic import TownOptions
 def house(x0, y0, x1, y1, z, step=0.3, code=6):
     """Points of a flat roof."""
     x, y = np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step))
-    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)]), np.full(x.size, code, np.uint8)
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)]), np.full(
+        x.size, code, np.uint8
+    )
 
 
 def scene(*parts, size=40.0, origin=(0.0, 0.0)):
@@ -80,7 +82,9 @@ def test_records_against_a_plain_twin():
     for at, key in enumerate(sorted(twin)):
         mm = np.rint(xyz[twin[key], 2] * 1000).astype(int)
         row = {name: int(values[at]) for name, values in cells.columns.items()}
-        assert row["count"] == len(mm) and row["told"] == np.count_nonzero(~np.isnan(told[twin[key]]))
+        assert row["count"] == len(mm) and row["told"] == np.count_nonzero(
+            ~np.isnan(told[twin[key]])
+        )
         assert (row["low"], row["high"], row["sum"]) == (mm.min(), mm.max(), mm.sum())
         assert row["sure"] == np.nansum(np.rint(told[twin[key]] * 1000))
 
@@ -138,12 +142,21 @@ def test_a_house_is_measured():
     assert len(table) == 1
     one = {name: values[0] for name, values in table.columns.items()}
     assert one["area"] == pytest.approx(96, abs=6) and one["h_ridge"] == one["h_eave"] == 6.0
-    assert one["planes"] == 1 and one["slope"] < 0.1 and one["ground"] == 0 and one["verdict"] == "sure"
+    assert (
+        one["planes"] == 1
+        and one["slope"] < 0.1
+        and one["ground"] == 0
+        and one["verdict"] == "sure"
+    )
     assert int(table.ids[0]) == int(object_id(Kind.BUILDING, np.array(20), np.array(20)))
 
 
 def test_roofs_part_at_a_step_alone():
-    low, near, far = house(10, 10, 20, 18, 4.0), house(20.1, 10, 30, 18, 5.0), house(20.1, 10, 30, 18, 9.0)
+    low, near, far = (
+        house(10, 10, 20, 18, 4.0),
+        house(20.1, 10, 30, 18, 5.0),
+        house(20.1, 10, 30, 18, 9.0),
+    )
     assert len(found_in(*scene(low, near)).tables[Kind.BUILDING]) == 1
     assert len(found_in(*scene(low, far)).tables[Kind.BUILDING]) == 2
     assert len(found_in(*scene(low, far), step=0).tables[Kind.BUILDING]) == 1
@@ -158,7 +171,10 @@ def test_rims_and_walls_between_roofs_part_nothing_and_join_nothing(rim, wall, t
     low, high = house(10, 10, 20, 18, 4.0), house(20.1, 10, 30, 18, 7.2)
     parts = [low, high]
     if rim:
-        parts += [house(19.7, 10, 20, 18, 4.0 + rim, 0.15), house(10, 10, 20, 10.3, 4.0 + rim, 0.15)]
+        parts += [
+            house(19.7, 10, 20, 18, 4.0 + rim, 0.15),
+            house(10, 10, 20, 10.3, 4.0 + rim, 0.15),
+        ]
     if wall:  # the last half meter before the higher roof: points of the wall alone
         parts[1] = house(20.6, 10, 30, 18, 7.2)
         parts += [house(20.1, 10, 20.6, 18, 5.5, 0.2)]
@@ -178,7 +194,9 @@ def test_roofs_that_meet_stay_one_whatever_their_slope():
 def test_tops_of_two_cones():
     rng = np.random.default_rng(1)
     xy = rng.uniform(0, 30, (9000, 2))
-    z = np.maximum(*(h - 1.6 * np.hypot(*(xy - p).T) for h, p in ((9.0, (10, 15)), (7.0, (17, 15)))))
+    z = np.maximum(
+        *(h - 1.6 * np.hypot(*(xy - p).T) for h, p in ((9.0, (10, 15)), (7.0, (17, 15))))
+    )
     leaves = np.column_stack([xy, z])[z > 1]
     got = found_in(*scene((leaves, np.full(len(leaves), 5, np.uint8))))
     table = got.tables[Kind.TREE]
@@ -193,9 +211,13 @@ def test_spans_end_at_poles_and_decks_have_room_below():
     wire = np.column_stack([t, np.full(t.size, 10.0), 8 + 0.004 * (t - 20) ** 2])
     pole = np.array([[20.0, 10.0, 8.0]])
     bridge = house(5, 20, 30, 26, 5.0, code=17)
-    got = found_in(*scene((wire, np.full(t.size, 14, np.uint8)), (pole, np.array([15], np.uint8)), bridge))
+    got = found_in(
+        *scene((wire, np.full(t.size, 14, np.uint8)), (pole, np.array([15], np.uint8)), bridge)
+    )
     spans, decks = got.tables[Kind.SPAN], got.tables[Kind.DECK]
-    assert len(spans) == 2 and 15 < spans.columns["length"].min() <= spans.columns["length"].max() < 21
+    assert (
+        len(spans) == 2 and 15 < spans.columns["length"].min() <= spans.columns["length"].max() < 21
+    )
     assert (
         len(decks) == 1
         and decks.columns["clear"][0] == 5.0
@@ -225,7 +247,11 @@ def test_a_roof_that_is_partly_called_leaves_is_whole(slope):
     away = np.hypot(crown[:, 0] - 18, crown[:, 1] - 13) / 2
     crown[:, 2] = 4.0 + 3.0 * np.sqrt(np.maximum(0, 1 - away**2)) * rng.uniform(0.5, 1, 400)
     chimney, _ = house(12, 12, 13, 13.1, 3.4 + slope * 2, 0.3, 5)
-    parts = [(roof, codes), (crown, np.full(400, 5, np.uint8)), (chimney, np.full(len(chimney), 5, np.uint8))]
+    parts = [
+        (roof, codes),
+        (crown, np.full(400, 5, np.uint8)),
+        (chimney, np.full(len(chimney), 5, np.uint8)),
+    ]
     found = found_in(*scene(*parts))
     columns = found.tables[Kind.BUILDING].columns
     assert columns["area"].tolist() == pytest.approx([30.0], abs=3.0)
@@ -238,7 +264,9 @@ def test_a_hedge_as_high_as_a_roof_is_not_of_it(height):
     """Nor where a classifier takes some of its points for a building."""
     rng = np.random.default_rng(2)
     roof, codes = house(10, 10, 16, 15, 3.0)
-    hedge = np.column_stack([rng.uniform(16, 26, 4000), rng.uniform(11.5, 13.5, 4000), np.zeros(4000)])
+    hedge = np.column_stack(
+        [rng.uniform(16, 26, 4000), rng.uniform(11.5, 13.5, 4000), np.zeros(4000)]
+    )
     hedge[:, 2] = height * np.sqrt(rng.uniform(0.3, 1, 4000))
     other = np.where(rng.random(4000) < 0.02, 6, 5).astype(np.uint8)
     columns = found_in(*scene((roof, codes), (hedge, other))).tables[Kind.BUILDING].columns
@@ -267,7 +295,10 @@ def test_a_roof_from_whose_inside_nothing_came_back(turned):
     parts.append((cars[keep], ones[keep]))
     xyz = np.concatenate([ground, *(p for p, _ in parts)])
     found = found_in(xyz, np.concatenate([codes, *(c for _, c in parts)])).tables[Kind.BUILDING]
-    area = {round(float(found.cells_of(n)[1].mean()) / 40): a for n, a in enumerate(found.columns["area"])}
+    area = {
+        round(float(found.cells_of(n)[1].mean()) / 40): a
+        for n, a in enumerate(found.columns["area"])
+    }
     assert area[0] == pytest.approx(64, abs=8)
     assert all(area.get(n, 0) < 35 for n in (1, 2))
 
@@ -301,7 +332,11 @@ def test_the_town(town):
     true = true_objects(TownOptions(150.0, 6.0, 4))
     got = found_in(town.xyz, town.classification, step=0)
     table = got.tables[Kind.BUILDING]
-    houses = shapely.union_all([shapely.Polygon(h.corners) for h in true.houses]).buffer(0.3).buffer(-0.3)
+    houses = (
+        shapely.union_all([shapely.Polygon(h.corners) for h in true.houses])
+        .buffer(0.3)
+        .buffer(-0.3)
+    )
     square = shapely.box(500_000, 5_400_000, 500_150, 5_400_150)
     blocks = [g for g in shapely.get_parts(houses.intersection(square)) if g.area > 4]
     hit = 0
@@ -373,7 +408,9 @@ def test_boxes_of_the_size_of_vehicles_and_containers(degrees, length, width, he
     roof[:, :2] = roof[:, :2] @ np.array([[c, s], [-s, c]]) + [20.2, 20.1]
     table = found_in(*scene((roof, codes))).tables[Kind.BUILDING]
     assert len(table) == 1
-    assert {"vehicle", "container"} & set(str(table.columns["reason"][0]).split(", ")) == ({like} - {""})
+    assert {"vehicle", "container"} & set(str(table.columns["reason"][0]).split(", ")) == (
+        {like} - {""}
+    )
 
 
 def plants(*trees, seed=0):
@@ -393,12 +430,16 @@ def plants(*trees, seed=0):
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 2.0]), st.booleans())
 def test_tops_of_trees_are_h_maxima_and_a_part_has_those_of_the_whole(seed, depth, whole_meters):
     reach, least = 8, 3.0
-    s = 10.0 + 15.0 * ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(60, 64)), 1.2)
+    s = 10.0 + 15.0 * ndimage.gaussian_filter(
+        np.random.default_rng(seed).normal(size=(60, 64)), 1.2
+    )
     s = np.maximum(np.round(s) if whole_meters else s, 0.0)
     owner = crown_cells(s, least, depth, float(reach))
     r, c = np.indices(s.shape)
     numbers = r * s.shape[1] + c
-    above = [(s > z) | ((s == z) & (numbers < n)) for z, n in zip(s.ravel(), range(s.size), strict=True)]
+    above = [
+        (s > z) | ((s == z) & (numbers < n)) for z, n in zip(s.ravel(), range(s.size), strict=True)
+    ]
     tops = []
     for n in range(s.size):
         y, x = divmod(n, s.shape[1])
@@ -441,15 +482,23 @@ def test_lamps_among_trees_are_to_be_checked():
 
 
 def test_objects_of_some_reasons_left_out():
-    wire, shed, van = house(5, 5, 35, 6.4, 7.0), house(10, 20, 14, 24, 3.0), house(30, 30, 35, 32, 2.0, 0.2)
+    wire, shed, van = (
+        house(5, 5, 35, 6.4, 7.0),
+        house(10, 20, 14, 24, 3.0),
+        house(30, 30, 35, 32, 2.0, 0.2),
+    )
     tree = np.random.default_rng(1).normal([20, 14, 6], [1, 1, 1], (300, 3))
     found = found_in(*scene(wire, shed, van, (tree, np.full(300, 5, np.uint8))))
     same(found.without(())[0], found)
     rest, left = found.without(["narrow", "vehicle"])
-    assert left == 2 and len(found.tables[Kind.BUILDING]) == 3 and len(rest.tables[Kind.BUILDING]) == 1
+    assert (
+        left == 2 and len(found.tables[Kind.BUILDING]) == 3 and len(rest.tables[Kind.BUILDING]) == 1
+    )
     kept = np.flatnonzero(found.tables[Kind.BUILDING].ids == rest.tables[Kind.BUILDING].ids[0])[0]
     for one, other in zip(
-        rest.tables[Kind.BUILDING].cells_of(0), found.tables[Kind.BUILDING].cells_of(kept), strict=True
+        rest.tables[Kind.BUILDING].cells_of(0),
+        found.tables[Kind.BUILDING].cells_of(kept),
+        strict=True,
     ):
         np.testing.assert_array_equal(one, other)
     assert set(rest.owner) == {i for table in rest.tables.values() for i in table.ids}

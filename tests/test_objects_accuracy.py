@@ -7,7 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from pdal_stages.objects.compare import compare_buildings, compare_trees, matched_by_overlap, matched_by_place
+from pdal_stages.objects.compare import (
+    compare_buildings,
+    compare_trees,
+    matched_by_overlap,
+    matched_by_place,
+)
 
 shapely = pytest.importorskip("shapely")
 pyogrio = pytest.importorskip("pyogrio")
@@ -32,7 +37,9 @@ def test_overlaps_are_matched_as_by_hand():
 
     def boxes(n):
         low = rng.uniform(0, 40, (n, 2))
-        return [shapely.box(*p, *(p + s)) for p, s in zip(low, rng.uniform(2, 12, (n, 2)), strict=True)]
+        return [
+            shapely.box(*p, *(p + s)) for p, s in zip(low, rng.uniform(2, 12, (n, 2)), strict=True)
+        ]
 
     found, true = boxes(60), boxes(60)
     all_pairs = sorted(
@@ -89,7 +96,11 @@ def test_figures_of_trees():
         np.array([[1.0, 0], [11, 0]]),
         np.array([9.0, np.nan]),
     )
-    assert got["objects"]["matched"] == 2 and got["height"]["bias"] == 1.0 and got["place"]["median"] == 1.0
+    assert (
+        got["objects"]["matched"] == 2
+        and got["height"]["bias"] == 1.0
+        and got["place"]["median"] == 1.0
+    )
 
 
 def test_the_command(tmp_path, run):
@@ -104,7 +115,8 @@ def test_the_command(tmp_path, run):
     assert code == 0 and "buildings: 1 found, 2 in the reference" in out
     figures = json.loads((tmp_path / "a.json").read_text())
     assert (
-        figures["buildings"]["objects"]["completeness"] == 0.5 and figures["trees"]["objects"]["matched"] == 1
+        figures["buildings"]["objects"]["completeness"] == 0.5
+        and figures["trees"]["objects"]["matched"] == 1
     )
     area = write(tmp_path / "area.gpkg", [shapely.box(-1, -1, 12, 40)])
     assert run(*command, "--area", area)[0] == 0
@@ -119,7 +131,10 @@ def test_errors(tmp_path, run):
     (tmp_path / "cloud.laz").write_bytes(b"LASF" + b"\0" * 400)
     for command, text in (
         (["accuracy", found, "--objects", other], "another reference system"),
-        (["accuracy", tmp_path / "cloud.laz", "--objects", found], "pdal-stages objects classified.laz"),
+        (
+            ["accuracy", tmp_path / "cloud.laz", "--objects", found],
+            "pdal-stages objects classified.laz",
+        ),
         (["accuracy", found, "--objects", tmp_path / "none.gpkg"], "no such file"),
         (["accuracy", found, found, "--objects", other], "one vector file"),
         (["accuracy", found, "--objects", found, "--html", "a.html"], "--area and --json alone"),
@@ -165,7 +180,11 @@ def test_heights_of_trees_may_be_texts_of_numbers_or_missing(tmp_path):
 
     spots = [shapely.Point(10 * n, 5) for n in range(4)]
     path = write(
-        tmp_path / "t.gpkg", spots, "Point", "trees", height=np.array(["12.5", "", "nan", "7"], object)
+        tmp_path / "t.gpkg",
+        spots,
+        "Point",
+        "trees",
+        height=np.array(["12.5", "", "nan", "7"], object),
     )
     np.testing.assert_array_equal(Things(path).trees[1], [12.5, np.nan, np.nan, 7])
     path = write(tmp_path / "u.gpkg", spots, "Point", "trees", h_m=[1, 2, 3, 4])
@@ -178,7 +197,10 @@ def test_heights_that_are_none(tmp_path, run, bad="12,5 m"):
     two = write(tmp_path / "two.gpkg", spots, "Point", "trees", height=np.array(["5", bad], object))
     code, _, said = run("accuracy", one, "--objects", two)
     assert (
-        code == 1 and "the column 'height' must hold heights" in said and bad in said and "two.gpkg" in said
+        code == 1
+        and "the column 'height' must hold heights" in said
+        and bad in said
+        and "two.gpkg" in said
     )
 
 

@@ -46,12 +46,16 @@ def folder(tmp_path_factory):
 def turned_rectangles(*boxes, angle=0.3):
     """Rectangles on a grid of cells, turned, as unions of the cells they cover most of."""
     c, s = np.cos(angle), np.sin(angle)
-    true = [shapely.affinity.rotate(shapely.box(*b), angle, origin=(0, 0), use_radians=True) for b in boxes]
+    true = [
+        shapely.affinity.rotate(shapely.box(*b), angle, origin=(0, 0), use_radians=True)
+        for b in boxes
+    ]
     grid = [shapely.box(x, y, x + 1, y + 1) for x in range(-60, 80) for y in range(-20, 90)]
     owners = [next((k for k, t in enumerate(true) if t.contains(g.centroid)), -1) for g in grid]
     assert abs(c * c + s * s - 1) < 1e-9
     return true, [
-        shapely.union_all([g for g, o in zip(grid, owners, strict=True) if o == k]) for k in range(len(true))
+        shapely.union_all([g for g, o in zip(grid, owners, strict=True) if o == k])
+        for k in range(len(true))
     ]
 
 
@@ -82,7 +86,8 @@ def test_holes_stay_and_small_ones_close():
     chimney = (np.abs(x - 8) < 0.8) & (np.abs(y - 8) < 0.8)
     roof = (x > 4) & (x < 36) & (y > 4) & (y < 36) & ~court & ~chimney
     found = find_objects(
-        Cells.of(x, y, np.where(roof, 6.0, 0.0), np.where(roof, 6, 2).astype(np.uint8), 0.5), progress=False
+        Cells.of(x, y, np.where(roof, 6.0, 0.0), np.where(roof, 6, 2).astype(np.uint8), 0.5),
+        progress=False,
     )
     raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
     for (shape,) in (raw, straight_outlines(raw, 0.5)):
@@ -93,7 +98,10 @@ def test_holes_stay_and_small_ones_close():
 @pytest.mark.pdal
 def test_one_file_or_four_give_the_same(folder, capsys):
     assert cli.main(["objects", str(folder / "town.laz"), str(folder / "one.gpkg")]) == 0
-    assert cli.main(["objects", str(folder / "parts"), str(folder / "four.gpkg"), "--workers", "2"]) == 0
+    assert (
+        cli.main(["objects", str(folder / "parts"), str(folder / "four.gpkg"), "--workers", "2"])
+        == 0
+    )
     assert "buildings, " in capsys.readouterr().out
     assert not list(folder.glob(".*"))
     for name in LAYERS:
@@ -111,7 +119,9 @@ def test_one_file_or_four_give_the_same(folder, capsys):
     with sqlite3.connect(folder / "one.gpkg") as base:
         table = "layer_styles ORDER BY update_time"  # as QGIS asks
         styled = base.execute(f"SELECT f_table_name, styleQML FROM {table}").fetchall()
-    assert [name for name, _ in styled] == list(LAYERS) and all("verdict" in text for _, text in styled)
+    assert [name for name, _ in styled] == list(LAYERS) and all(
+        "verdict" in text for _, text in styled
+    )
 
 
 @pytest.mark.pdal
@@ -127,13 +137,20 @@ def test_other_formats_hold_the_same(folder, tmp_path, ending):
     np.testing.assert_array_equal(one["object_id"][order], two["object_id"][other])
     np.testing.assert_allclose(one["h_ridge"][order], two["h_ridge"][other], atol=1e-3)
     np.testing.assert_allclose(shapely.area(shapes[order]), shapely.area(others[other]), atol=1e-3)
-    assert about["crs"] and (tmp_path / "town_buildings.qml").read_text().startswith("<!DOCTYPE qgis")
+    assert about["crs"] and (tmp_path / "town_buildings.qml").read_text().startswith(
+        "<!DOCTYPE qgis"
+    )
 
 
 @pytest.mark.pdal
 def test_settings_and_metadata(folder, tmp_path):
     def run(*more):
-        files = [str(folder / "town.laz"), str(tmp_path / "t.gpkg"), "--metadata", str(tmp_path / "m.json")]
+        files = [
+            str(folder / "town.laz"),
+            str(tmp_path / "t.gpkg"),
+            "--metadata",
+            str(tmp_path / "m.json"),
+        ]
         assert cli.main(["objects", *files, *more]) == 0
         return json.loads((tmp_path / "m.json").read_text())
 
@@ -141,7 +158,9 @@ def test_settings_and_metadata(folder, tmp_path):
     reason = max(checked["reasons"], key=checked["reasons"].get)
     left = run(f"--filters.objects.refuse={reason}")
     assert left["refused"]["objects"] >= checked["reasons"][reason] > 0
-    assert left["objects"]["buildings"]["objects"] == checked["objects"] - checked["reasons"][reason]
+    assert (
+        left["objects"]["buildings"]["objects"] == checked["objects"] - checked["reasons"][reason]
+    )
     assert reason not in left["objects"]["buildings"]["reasons"]
     shown, _, _ = layer(tmp_path / "t.gpkg", "buildings")
     assert len(shown["object_id"]) == left["objects"]["buildings"]["objects"]
@@ -189,7 +208,11 @@ def test_larger_cells_where_points_are_few(folder, tmp_path, capsys):
 @pytest.mark.pdal
 @pytest.mark.parametrize(
     ("target", "text"),
-    [("town.txt", "ends in .gpkg"), ("nowhere/town.gpkg", "nowhere"), ("town.gpkg", "no point has a class")],
+    [
+        ("town.txt", "ends in .gpkg"),
+        ("nowhere/town.gpkg", "nowhere"),
+        ("town.gpkg", "no point has a class"),
+    ],
 )
 def test_what_cannot_be(folder, tmp_path, target, text, capsys):
     las = laspy.read(folder / "parts" / "0.laz")
@@ -212,11 +235,17 @@ def test_without_the_extra(monkeypatch):
 
 
 @pytest.mark.pdal
-def test_layers_are_written_all_or_none_and_nothing_older_is_left(folder, tmp_path, capsys, ending="geojson"):
+def test_layers_are_written_all_or_none_and_nothing_older_is_left(
+    folder, tmp_path, capsys, ending="geojson"
+):
     target, names = tmp_path / f"t.{ending}", [f"t_{name}.{ending}" for name in LAYERS]
     old = tmp_path / f"t_decks.{ending}"
     without = {"type": "filters.range", "limits": "Classification![17:17]"}
-    job = [str(folder / "parts" / "0.laz"), without, {"type": "writers.objects", "filename": str(target)}]
+    job = [
+        str(folder / "parts" / "0.laz"),
+        without,
+        {"type": "writers.objects", "filename": str(target)},
+    ]
     stage = Pipeline(job).expanded.ours[0].stage
     assert [output.path for output in stage.outputs()] == [str(tmp_path / name) for name in names]
     old.write_text("of an earlier run")
@@ -238,14 +267,22 @@ def test_layers_are_written_all_or_none_and_nothing_older_is_left(folder, tmp_pa
 
 
 @pytest.mark.pdal
-def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path, capsys, monkeypatch):
+def test_classify_of_many_files_with_options_report_and_resume(
+    folder, tmp_path, capsys, monkeypatch
+):
     from pdal_stages.tiling import objects
 
     parts = [str(folder / "parts" / f"{n}.laz") for n in (0, 1)]
     out, html = tmp_path / "out", tmp_path / "run.html"
     target = out / "town.gpkg"
     command = ["classify", *parts, f"{out}/", "--objects", str(target)]
-    more = ["--writers.objects.tree_height=6", "--report", str(html), "--report", str(tmp_path / "run.json")]
+    more = [
+        "--writers.objects.tree_height=6",
+        "--report",
+        str(html),
+        "--report",
+        str(tmp_path / "run.json"),
+    ]
     assert cli.main([*command, "--writers.objects.tree_hight=6"]) == 1
     assert "tree_height" in capsys.readouterr().err and not list(out.glob("*"))
 
@@ -258,7 +295,12 @@ def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path,
     assert "the disk is full" in capsys.readouterr().err
     assert html.exists() and not target.exists() and len(list(out.glob("*.laz"))) == 2
     assert cli.main([*command, *more, "--resume"]) == 0
-    assert cli.main(["objects", str(out), str(tmp_path / "two.gpkg"), "--filters.objects.tree_height=6"]) == 0
+    assert (
+        cli.main(
+            ["objects", str(out), str(tmp_path / "two.gpkg"), "--filters.objects.tree_height=6"]
+        )
+        == 0
+    )
     for name in ("buildings", "trees"):
         one, shapes, _ = layer(target, name)
         two, others, _ = layer(tmp_path / "two.gpkg", name)

@@ -25,7 +25,9 @@ def town(tmp_path_factory):
 def run_stage(arrays, **options):
     """The stage on arrays, as PDAL's runtime calls it."""
     stage = stage_type("filters.objects")(options)
-    made = {name: np.zeros(len(arrays["X"]), "u8") for name in stage.creates() if name not in arrays}
+    made = {
+        name: np.zeros(len(arrays["X"]), "u8") for name in stage.creates() if name not in arrays
+    }
     return stage.run(stage.points({**arrays, **made}))
 
 
@@ -52,7 +54,9 @@ def test_ids_and_verdicts_of_points(town, tmp_path):
 
 def test_tiles_give_the_same(town, tmp_path):
     Pipeline(stages(town, tmp_path / "whole.laz", judged=True)).execute(arrays=False)
-    run = ps.run_tiled(stages(town, tmp_path / "tiled.laz", judged=True), 60, workers=0, progress=False)
+    run = ps.run_tiled(
+        stages(town, tmp_path / "tiled.laz", judged=True), 60, workers=0, progress=False
+    )
     assert not run.failures
     whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
     for name in ("ObjectID", "ObjectVerdict", "ObjectHeight", "ObjectExtent"):
@@ -69,7 +73,9 @@ def test_a_building_longer_than_what_a_tile_sees(tmp_path):
     las.classification = np.where(roof, 6, 2).astype(np.uint8)
     las.write(tmp_path / "row.las")
     Pipeline(stages(tmp_path / "row.las", tmp_path / "whole.laz")).execute(arrays=False)
-    ps.run_tiled(stages(tmp_path / "row.las", tmp_path / "tiled.laz"), 100, workers=0, progress=False)
+    ps.run_tiled(
+        stages(tmp_path / "row.las", tmp_path / "tiled.laz"), 100, workers=0, progress=False
+    )
     whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
     assert len(np.unique(whole["ObjectID"])) == 2
     np.testing.assert_array_equal(whole["ObjectID"], tiled["ObjectID"])

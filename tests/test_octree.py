@@ -94,7 +94,9 @@ def test_damaged_hierarchies_of_ept_sources(tmp_path, root, page, says):
     (tmp_path / "ept.json").write_text(json.dumps(ABOUT))
     reader = {"type": "readers.ept", "filename": str(tmp_path / "ept.json")}
     if not says:
-        assert check_ept(reader["filename"]) == ABOUT and len(ps.run_pipeline([reader]).arrays[0]) == 3
+        assert (
+            check_ept(reader["filename"]) == ABOUT and len(ps.run_pipeline([reader]).arrays[0]) == 3
+        )
         return
     with pytest.raises(StageError, match="the EPT source is damaged") as caught:
         ps.run_pipeline([reader])

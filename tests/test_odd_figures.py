@@ -33,7 +33,9 @@ def test_labels_of_another_number_of_points():
 def test_a_coordinate_that_is_none(wrong):
     xyz = np.random.default_rng(0).uniform(0, 9, (200, 3))
     labels = np.where(xyz[:, 2] > 4, 6, 2)
-    options = ps.TrainingOptions(neighborhoods="k5", dimensions=(), count=20, trees=2, passes=1, folds=0)
+    options = ps.TrainingOptions(
+        neighborhoods="k5", dimensions=(), count=20, trees=2, passes=1, folds=0
+    )
     model = ps.train(xyz, labels, options, dimensions={}, progress=False)
     xyz[7, 0] = wrong
     for call in (

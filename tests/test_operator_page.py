@@ -27,7 +27,9 @@ def test_the_hour_of_an_operator(tmp_path, monkeypatch, capsys):
     raw.classification[:] = 0
     raw.write("raw.laz")
     text = "\n".join(re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL))
-    lines = [line.split("#")[0].strip() for line in text.splitlines() if line.startswith("pdal-stages")]
+    lines = [
+        line.split("#")[0].strip() for line in text.splitlines() if line.startswith("pdal-stages")
+    ]
     assert [line.split()[1] for line in lines] == [
         "classify", "review", "corrections", "train", "classify", "review", "accuracy", "classify",
     ]  # fmt: skip

@@ -21,8 +21,13 @@ _CONDA = {"laspy[lazrs]": "laspy"}
 def test_one_version_everywhere():
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "recipe.yaml").read_text()
-    assert f'\n  version: "{__version__}"\n' in (ROOT / "recipe" / "plugin" / "recipe.yaml").read_text()
-    assert f"\nversion={__version__}\n" in (ROOT / "qgis" / "pdal_stages" / "metadata.txt").read_text()
+    assert (
+        f'\n  version: "{__version__}"\n'
+        in (ROOT / "recipe" / "plugin" / "recipe.yaml").read_text()
+    )
+    assert (
+        f"\nversion={__version__}\n" in (ROOT / "qgis" / "pdal_stages" / "metadata.txt").read_text()
+    )
     assert f"\n## {__version__} " in (ROOT / "CHANGELOG.md").read_text()
 
 
@@ -69,7 +74,12 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
     names = set(zipfile.ZipFile(wheel).namelist())
     here = {path.relative_to(ROOT).as_posix() for path in (ROOT / "pdal_stages").rglob("*.py")}
     assert here - {name for name in here if name not in listed} <= names
-    for needed in ("models/standard.model", "reports/templates/style.css", "plugin/stage.cpp", "py.typed"):
+    for needed in (
+        "models/standard.model",
+        "reports/templates/style.css",
+        "plugin/stage.cpp",
+        "py.typed",
+    ):
         assert f"pdal_stages/{needed}" in names, needed
     target = tmp_path / "env"
     zipfile.ZipFile(wheel).extractall(target)

@@ -29,11 +29,28 @@ pytestmark = pytest.mark.pdal
 #: Rows that run without --all-pairs.
 FIRST = 9
 VALUES = {
-    "input": ["las 1.2", "las 1.4", "laz 1.4", "copc", "feet", "several", "gaps", "noise unlabeled"],
+    "input": [
+        "las 1.2",
+        "las 1.4",
+        "laz 1.4",
+        "copc",
+        "feet",
+        "several",
+        "gaps",
+        "noise unlabeled",
+    ],
     "door": ["classify", "pipeline", "objects", "stock"],
     "model": ["standard", "one pass", "two passes", "binary", "network"],
     "tiles": ["none", "no workers", "two workers, per tile", "two workers, per file", "resumed"],
-    "option": ["none", "where", "ignore", "keep", "reject_below", "vegetation_heights", "probabilities"],
+    "option": [
+        "none",
+        "where",
+        "ignore",
+        "keep",
+        "reject_below",
+        "vegetation_heights",
+        "probabilities",
+    ],
     "writer": ["las 1.2", "las 1.4", "laz", "text", "gdal", "ogr", "none"],
 }
 OPTIONS = {
@@ -46,16 +63,32 @@ OPTIONS = {
     "probabilities": {"probabilities": True},
 }
 WRITERS = {
-    "las 1.2": ("las", {"type": "writers.las", "minor_version": 2, "dataformat_id": 1, "forward": "all"}),
-    "las 1.4": ("las", {"type": "writers.las", "minor_version": 4, "dataformat_id": 6, "forward": "all"}),
+    "las 1.2": (
+        "las",
+        {"type": "writers.las", "minor_version": 2, "dataformat_id": 1, "forward": "all"},
+    ),
+    "las 1.4": (
+        "las",
+        {"type": "writers.las", "minor_version": 4, "dataformat_id": 6, "forward": "all"},
+    ),
     "laz": ("laz", {"type": "writers.las", "forward": "all", "extra_dims": "all"}),
     "text": (
         "txt",
-        {"type": "writers.text", "order": "X,Y,Z,Classification", "keep_unspecified": False, "precision": 4},
+        {
+            "type": "writers.text",
+            "order": "X,Y,Z,Classification",
+            "keep_unspecified": False,
+            "precision": 4,
+        },
     ),
     "gdal": (
         "tif",
-        {"type": "writers.gdal", "resolution": 2, "dimension": "Classification", "output_type": "max"},
+        {
+            "type": "writers.gdal",
+            "resolution": 2,
+            "dimension": "Classification",
+            "output_type": "max",
+        },
     ),
     "ogr": ("geojson", {"type": "writers.ogr"}),
     "none": ("", {}),
@@ -78,7 +111,10 @@ def possible(values) -> bool:
         return False
     if tiles != "none" and writer in ("gdal", "none"):
         return False
-    return (row.get("model"), row.get("option")) != ("binary", "vegetation_heights")  # which is refused
+    return (row.get("model"), row.get("option")) != (
+        "binary",
+        "vegetation_heights",
+    )  # which is refused
 
 
 def rows() -> list[tuple]:
@@ -97,9 +133,13 @@ def rows() -> list[tuple]:
 
 def _neutral(name, given):
     """A value that goes with any other."""
-    return {"door": "pipeline", "writer": "laz", "model": "one pass", "option": "none", "tiles": "none"}.get(
-        name, VALUES[name][0]
-    )
+    return {
+        "door": "pipeline",
+        "writer": "laz",
+        "model": "one pass",
+        "option": "none",
+        "tiles": "none",
+    }.get(name, VALUES[name][0])
 
 
 ROWS = rows()
@@ -114,7 +154,9 @@ def scenes(tmp_path_factory, write_las):
     n = len(made.xyz)
     arrays = {
         **dict(zip("XYZ", np.round(made.xyz, 3).T, strict=True)),
-        "Classification": rng.choice(np.array([1, 2, 7, 12], np.uint8), n, p=[0.5, 0.4, 0.05, 0.05]),
+        "Classification": rng.choice(
+            np.array([1, 2, 7, 12], np.uint8), n, p=[0.5, 0.4, 0.05, 0.05]
+        ),
         "ReturnNumber": np.ones(n, np.uint8),
         "NumberOfReturns": np.ones(n, np.uint8),
         "GpsTime": np.arange(n, dtype=float),
@@ -139,7 +181,9 @@ def scenes(tmp_path_factory, write_las):
         # made by tests/data/make_copc.py of commit b10145c
         "copc": [Path(__file__).parent / "data" / "town.copc.laz"],
         "feet": [write_las(folder / "feet.laz", feet, wkt=FEET, minor_version=4, **modern)],
-        "several": [write_las(folder / f"part{k}.laz", part((x > 25) == k), **plain) for k in (False, True)],
+        "several": [
+            write_las(folder / f"part{k}.laz", part((x > 25) == k), **plain) for k in (False, True)
+        ],
         "gaps": [write_las(folder / "gaps.laz", part((x < 12) | (x > 38) | (y < 10)), **modern)],
         "noise unlabeled": [write_las(folder / "noise.laz", noisy, **plain)],
     }
@@ -160,7 +204,11 @@ def models(tmp_path_factory, write_las):
         "binary": {"passes": 1, "classes": classes, "strategy": "binary", "target": 6},
     }.items():
         found[name] = str(folder / f"{name.replace(' ', '-')}.model")
-        train = {"type": "writers.classifiermodel", "filename": found[name], "neighborhoods": "k10,s2"}
+        train = {
+            "type": "writers.classifiermodel",
+            "filename": found[name],
+            "neighborhoods": "k10,s2",
+        }
         train |= {"feature_set": "covariance", "count": 200, "trees": 8, "folds": 0, **more}
         ps.run_pipeline([source, {"type": "filters.hag_minima", "cell": 5}, train])
     found["network"] = str(folder / "network.model")
@@ -246,15 +294,30 @@ def run(row, files, model, folder):
         job.execute()
         return 0
     if row["door"] == "classify":
-        command = ["classify", *files, target, "--model", model, "--no-noise", "--no-consistency", *words]
+        command = [
+            "classify",
+            *files,
+            target,
+            "--model",
+            model,
+            "--no-noise",
+            "--no-consistency",
+            *words,
+        ]
         command += [
-            f"--filters.modelclassifier.{k}={v}" for k, v in OPTIONS[row["option"]].items() if k != "where"
+            f"--filters.modelclassifier.{k}={v}"
+            for k, v in OPTIONS[row["option"]].items()
+            if k != "where"
         ]
         command += ["--where", OPTIONS["where"]["where"]] if row["option"] == "where" else []
         if row["writer"].startswith("las"):
-            command += [f"--writers.las.{k}={writer[k]}" for k in ("minor_version", "dataformat_id")]
+            command += [
+                f"--writers.las.{k}={writer[k]}" for k in ("minor_version", "dataformat_id")
+            ]
     else:
-        (folder / "job.json").write_text(json.dumps([*map(reader, files), *stages(model, row), *last]))
+        (folder / "job.json").write_text(
+            json.dumps([*map(reader, files), *stages(model, row), *last])
+        )
         command = ["pipeline", str(folder / "job.json"), *words]
     if row["door"] == "stock":
         if main(["expand", str(folder / "job.json"), "-o", str(folder / "plain.json")]):
@@ -278,7 +341,10 @@ def read_back(row, outputs):
     if kind.startswith("la"):
         parts = [laspy.read(path) for path in outputs]
         return columns(
-            *(np.concatenate([np.asarray(p[n]) for p in parts]) for n in ("x", "y", "z", "classification"))
+            *(
+                np.concatenate([np.asarray(p[n]) for p in parts])
+                for n in ("x", "y", "z", "classification")
+            )
         )
     if kind == "text":
         return columns(*np.concatenate([_table(path) for path in outputs]).T)
@@ -312,7 +378,13 @@ def test_row(number, request, scenes, models, tmp_path, capfd):
         old = row["writer"].startswith("la") and laspy.read(outputs[0]).point_format.id < 6
         wanted = expected(row, files, model, old)
         if row["door"] == "objects" and not pdal_env.splits_class_flags():
-            found[:, 3] = found[:, 3].astype(int) & 31  # there PDAL 2.2 writes flags as it reads them
-        assert np.array_equal(np.bincount(found[:, 3].astype(int)), np.bincount(wanted[:, 3].astype(int)))
+            found[:, 3] = (
+                found[:, 3].astype(int) & 31
+            )  # there PDAL 2.2 writes flags as it reads them
+        assert np.array_equal(
+            np.bincount(found[:, 3].astype(int)), np.bincount(wanted[:, 3].astype(int))
+        )
         assert np.abs(found[:, :3] - wanted[:, :3]).max() <= 10.5  # a centimeter, in writers of LAS
-        assert (found[:, 3] == wanted[:, 3]).mean() > (0.9 if row["writer"].startswith("la") else 0.9999)
+        assert (found[:, 3] == wanted[:, 3]).mean() > (
+            0.9 if row["writer"].startswith("la") else 0.9999
+        )

@@ -70,7 +70,11 @@ def test_pts_through_pdal(folder, tmp_path, monkeypatch):
         assert not rest
         Pipeline(FOLDER / f"{name}.json", overrides).execute()
 
-    quick = ["--stage.model.neighborhoods=c2,s2", "--stage.model.count=200", "--stage.model.trees=10"]
+    quick = [
+        "--stage.model.neighborhoods=c2,s2",
+        "--stage.model.count=200",
+        "--stage.model.trees=10",
+    ]
     # A class that is not there is an error, so the stand-in names those it has.
     classes = json.loads((FOLDER / "vaihingen-train.json").read_text())[-1]["classes"]
     there = {str(label): classes[str(label)] for label in (1, 2, 5, 7, 8)}
@@ -95,7 +99,9 @@ def test_pts_through_pdal(folder, tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def scene(folder, tmp_path_factory):
     cache = kit.Cache(tmp_path_factory.mktemp("cache"))
-    return scenes.load(folder, "town", cache, classes=(1, 2, 5, 8), neighborhoods="c1,c2,c3,c5,kopt")
+    return scenes.load(
+        folder, "town", cache, classes=(1, 2, 5, 8), neighborhoods="c1,c2,c3,c5,kopt"
+    )
 
 
 def test_b16_names():
@@ -136,8 +142,12 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     cloud = clouds.with_height(clouds.Cloud("town", town.xyz, town.labels))
     part = h17_oakland.compute([cloud], kit.Cache(None), 1)
     words = (*h17_oakland.SIX, "Radius")
-    direct = compute_features(town.xyz, neighborhoods="copt", feature_set=words, copt_threshold=0.05)
-    np.testing.assert_array_equal(part.adaptive(0.05), np.column_stack([direct[f"{w}_copt"] for w in words]))
+    direct = compute_features(
+        town.xyz, neighborhoods="copt", feature_set=words, copt_threshold=0.05
+    )
+    np.testing.assert_array_equal(
+        part.adaptive(0.05), np.column_stack([direct[f"{w}_copt"] for w in words])
+    )
     assert 0.05 < (part.curvature >= 0.05).mean() < 0.95
     shares = h17_oakland.shares(part.labels, part.curvature, 0.0)
     assert all(one["points"] == one["scattered"] for one in shares.values())
@@ -167,7 +177,11 @@ def test_h17_radii_by_dimensionality(town):
             assert chosen == 2.0
         within = {radius: entropy for radius, entropy in entropies.items() if radius >= 0.5}
         other = round(float(regular[i, 6]), 2)
-        assert other == 2.0 if not within else within[other] == pytest.approx(min(within.values()), abs=1e-3)
+        assert (
+            other == 2.0
+            if not within
+            else within[other] == pytest.approx(min(within.values()), abs=1e-3)
+        )
         fewest.append((away <= chosen).sum())
         members = town.xyz[away <= chosen]
         assert made[i, 1] == pytest.approx(np.ptp(members[:, 2]), abs=1e-5)
@@ -212,8 +226,24 @@ def test_b16_command_on_pts_resumes(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(b16_experiments, "COUNT", 50)
     monkeypatch.setattr(b16_experiments, "TREES", (3,))
     monkeypatch.setattr(scenes, "NEIGHBORHOODS", "c1,c2,c3,c5,kopt")
-    words = ["--data", str(folder), "--scene", "town", "--cache", str(tmp_path / "cache"), "--seeds", "1"]
-    words += ["--threads", "1", "--json", str(tmp_path / "r.json"), "--tables", str(tmp_path / "t.md")]
+    words = [
+        "--data",
+        str(folder),
+        "--scene",
+        "town",
+        "--cache",
+        str(tmp_path / "cache"),
+        "--seeds",
+        "1",
+    ]
+    words += [
+        "--threads",
+        "1",
+        "--json",
+        str(tmp_path / "r.json"),
+        "--tables",
+        str(tmp_path / "t.md"),
+    ]
     monkeypatch.setattr(sys, "argv", ["b16_experiments.py", *words])
     b16_experiments.main()
     first = json.loads((tmp_path / "r.json").read_text())

@@ -38,7 +38,9 @@ def cloud(tmp_path_factory, write_las):
     bush = rng.normal([3, 4, 1], 0.8, (400, 3))
     xyz = np.concatenate([flat, wall, bush])
     arrays = dict(zip("XYZ", xyz.T, strict=True))
-    return write_las(tmp_path_factory.mktemp("features") / "in.las", arrays, scale=1e-6, offset=[0, 0, 0])
+    return write_las(
+        tmp_path_factory.mktemp("features") / "in.las", arrays, scale=1e-6, offset=[0, 0, 0]
+    )
 
 
 @pytest.mark.pdal
@@ -90,7 +92,9 @@ def test_the_table_of_the_docs_is_this_one():
     part = text[text.index("## Beside PDAL's") :].partition("\n## ")[0]
     for name, (named, modes, _) in TABLE.items():
         (row,) = [
-            line for line in part.splitlines() if line.startswith("|") and f"`{name}`" in line.split("|")[1]
+            line
+            for line in part.splitlines()
+            if line.startswith("|") and f"`{name}`" in line.split("|")[1]
         ]
         cells = [cell.strip() for cell in row.split("|")[1:-1]]
         assert f"`{named}`" in cells[1] or cells[1] == "the same", row

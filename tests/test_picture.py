@@ -84,7 +84,9 @@ def test_north_is_up_and_east_is_right():
 
 def test_the_highest_point_wins():
     x, y, z = block()
-    low = top_view(np.r_[x, x], np.r_[y, y], np.r_[z + 5, z], np.r_[z + 6, z + 2].astype(int), width=150)
+    low = top_view(
+        np.r_[x, x], np.r_[y, y], np.r_[z + 5, z], np.r_[z + 6, z + 2].astype(int), width=150
+    )
     assert has_color(low, class_color(6)) and not has_color(low, class_color(2))
 
 
@@ -108,7 +110,11 @@ def test_gaps_close_but_holes_stay():
 )
 def test_pictures_of_anything(n, wide, tall, seed, origin):
     rng = np.random.default_rng(seed)
-    x, y, z = origin + rng.uniform(0, wide, n), origin + rng.uniform(0, tall, n), rng.normal(0, 10, n)
+    x, y, z = (
+        origin + rng.uniform(0, wide, n),
+        origin + rng.uniform(0, tall, n),
+        rng.normal(0, 10, n),
+    )
     codes = rng.integers(0, 256, (2, n))
     image = triptych(x, y, z, codes[0], codes[1], width=400)
     assert image.shape[1] <= 403 and image.dtype == np.uint8

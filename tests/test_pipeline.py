@@ -90,9 +90,7 @@ def test_door_2_python_objects(cloud, pdal_module, model):
 
 
 def test_door_3_filters_python_by_hand(cloud, pdal_module):
-    source = (
-        "from pdal_stages import run_stage\ndef f(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
-    )
+    source = "from pdal_stages import run_stage\ndef f(ins, outs):\n    return run_stage(globals(), ins, outs)\n"
     stages = [
         str(cloud),
         {
@@ -114,7 +112,12 @@ def test_door_3_filters_python_by_hand(cloud, pdal_module):
 
 def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     """Those with tags stay apart: the same values, of dimensions that a later stage forgets too."""
-    heights = {"type": "filters.hag_morphological", "ground": True, "terrain_slope": True, "decks": True}
+    heights = {
+        "type": "filters.hag_morphological",
+        "ground": True,
+        "terrain_slope": True,
+        "decks": True,
+    }
     classifier = {"type": "filters.modelclassifier", "model": str(model)}
     ours = [{"type": "filters.detachednoise"}, heights, classifier, {"type": "filters.bridges"}]
     stages = [str(cloud), *ours, {"type": "filters.consistency"}]
@@ -130,7 +133,9 @@ def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     assert found["Ground"].any()
     for name in expected.dtype.names:
         assert found[name].tobytes() == expected[name].tobytes(), name
-    reports = [[[one.to_dict() for one in each] for _, each in pipeline.reports] for pipeline in pipelines]
+    reports = [
+        [[one.to_dict() for one in each] for _, each in pipeline.reports] for pipeline in pipelines
+    ]
     assert reports[0] == reports[1]
 
 
@@ -143,7 +148,10 @@ def test_codes_above_31_need_las_14(cloud, tmp_path, wide_model):
     with pytest.raises(OptionError, match=r"above 31.*\"minor_version\": 4.*\"dataformat_id\": 6"):
         ps.Pipeline([*stages, {"type": "writers.las", "filename": str(out), "forward": "all"}])
     ps.run_pipeline(
-        [*stages, {"type": "writers.las", "filename": str(out), "minor_version": 4, "dataformat_id": 7}]
+        [
+            *stages,
+            {"type": "writers.las", "filename": str(out), "minor_version": 4, "dataformat_id": 7},
+        ]
     )
     assert set(np.unique(laspy.read(out).classification)) == {2, 64}
 
@@ -152,7 +160,9 @@ def test_codes_above_31_need_las_14(cloud, tmp_path, wide_model):
 def test_codes_above_31_in_laz_14(tmp_path, write_las, wide_model, tiles):
     """PDAL 2.2 fails to compress them: the points that a model gives them, and those that keep them."""
     arrays = scene() | {"Withheld": (np.arange(3000) == 7).astype(np.uint8)}
-    arrays["Classification"] = np.where(arrays["Withheld"], 65, arrays["Classification"]).astype(np.uint8)
+    arrays["Classification"] = np.where(arrays["Withheld"], 65, arrays["Classification"]).astype(
+        np.uint8
+    )
     source, out = write_las(tmp_path / "in.laz", arrays, point_format=7), tmp_path / "out_#.laz"
     heights = {"type": "filters.hag_minima"}
     last = {"type": "writers.las", "filename": str(out), "forward": "all"}
@@ -172,7 +182,10 @@ def test_codes_above_31_in_laz_14(tmp_path, write_las, wide_model, tiles):
             assert np.array_equal(las.classification, arrays["Classification"])
         assert np.array_equal(las.gps_time, laspy.read(source).gps_time)
         made.unlink()
-    assert [path.name for path in tmp_path.iterdir() if path.name[0] == "."] in ([], [".pdal-stages"])
+    assert [path.name for path in tmp_path.iterdir() if path.name[0] == "."] in (
+        [],
+        [".pdal-stages"],
+    )
 
 
 # ---- views, merging, empty views -------------------------------------------------------------------------
@@ -207,7 +220,9 @@ def test_where_leaves_the_others_alone(cloud, model):
     classifier = {"type": "filters.modelclassifier", "model": str(model)}
     everything = ps.run_pipeline([*stages, classifier]).arrays[0]
     nine = {"type": "filters.assign", "assignment": "Classification[:]=9"}
-    part = ps.run_pipeline([*stages, nine, {**classifier, "where": "X < 500030 && Z > 0"}]).arrays[0]
+    part = ps.run_pipeline([*stages, nine, {**classifier, "where": "X < 500030 && Z > 0"}]).arrays[
+        0
+    ]
     inside = part["X"] < 500_030
     assert np.array_equal(part["Classification"][inside], everything["Classification"][inside])
     assert (part["Classification"][~inside] == 9).all()
@@ -230,7 +245,11 @@ def test_a_missing_dimension_names_the_stage_that_makes_it(cloud, tmp_path, mode
 
 def test_too_many_features_for_one_las_record(cloud, tmp_path):
     writer = {"type": "writers.las", "filename": str(tmp_path / "o.las")}
-    many = {"type": "filters.multiscalefeatures", "neighborhoods": "blomley2016,s1,s2", "feature_set": "all"}
+    many = {
+        "type": "filters.multiscalefeatures",
+        "neighborhoods": "blomley2016,s1,s2",
+        "feature_set": "all",
+    }
     with pytest.raises(DimensionError, match="extra dimensions"):
         ps.Pipeline([str(cloud), many, {**writer, "minor_version": 4, "extra_dims": "all"}])
 

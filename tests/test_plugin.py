@@ -87,7 +87,10 @@ def assert_same(one, other):
 
 
 def las(stages, output):
-    return [*stages, {"type": "writers.las", "filename": str(output), "forward": "all", "extra_dims": "all"}]
+    return [
+        *stages,
+        {"type": "writers.las", "filename": str(output), "forward": "all", "extra_dims": "all"},
+    ]
 
 
 # ---- what PDAL knows of the stages -------------------------------------------------------------------------
@@ -95,7 +98,8 @@ def las(stages, output):
 
 def test_every_stage_is_listed_with_its_options(stock):
     listed = {
-        entry["name"]: entry["description"] for entry in json.loads(stock("--drivers", "--showjson").stdout)
+        entry["name"]: entry["description"]
+        for entry in json.loads(stock("--drivers", "--showjson").stdout)
     }
     for name, kind in stage_types().items():
         assert listed[name] == kind.summary
@@ -143,7 +147,9 @@ def test_objects_are_written(pipeline, ready_town, tmp_path):
     layers = sorted(path.name.removeprefix("ours") for path in tmp_path.glob("ours*.geojson"))
     assert "_buildings.geojson" in layers
     for layer in layers:
-        stock, ours = (json.loads((tmp_path / f"{name}{layer}").read_text()) for name in ("stock", "ours"))
+        stock, ours = (
+            json.loads((tmp_path / f"{name}{layer}").read_text()) for name in ("stock", "ours")
+        )
         assert stock["features"] == ours["features"]
         assert stock["features"] or layer != "_buildings.geojson"
 
@@ -163,7 +169,11 @@ def test_a_ready_pipeline_gives_the_same_bytes(
     for door in ("stock", "ours"):
         (tmp_path / door).mkdir()
         source = ready_halves / "*.laz" if name == "tiles-to-tiles" else ready_town
-        words = [f"--stage.input.filename={source}", *READY[name], *(quick if name == "train" else ())]
+        words = [
+            f"--stage.input.filename={source}",
+            *READY[name],
+            *(quick if name == "train" else ()),
+        ]
         model = str(ready_models / "classes.model")
         stages = with_words(name, *(one.replace("MODEL", model) for one in words))
         if door == "stock":
@@ -181,7 +191,10 @@ def test_a_ready_pipeline_gives_the_same_bytes(
 
 
 def test_points_of_several_readers_see_each_other(pipeline, ready_halves, tmp_path):
-    files, accuracy = [str(ready_halves / f"{side}.laz") for side in ("west", "east")], tmp_path / "a.json"
+    files, accuracy = (
+        [str(ready_halves / f"{side}.laz") for side in ("west", "east")],
+        tmp_path / "a.json",
+    )
     for stages in (
         [*files, {"type": "filters.hag_minima"}],
         [
@@ -189,7 +202,11 @@ def test_points_of_several_readers_see_each_other(pipeline, ready_halves, tmp_pa
             {"type": "readers.las", "filename": files[1], "tag": "b"},
             {"type": "filters.hag_minima", "inputs": ["a", "b"]},
         ],
-        [files[0], {"type": "filters.splitter", "length": 30}, {**EVERY[-1], "json": str(accuracy)}],
+        [
+            files[0],
+            {"type": "filters.splitter", "length": 30},
+            {**EVERY[-1], "json": str(accuracy)},
+        ],
     ):
         pipeline(las(stages, tmp_path / "stock.las"))
         stock = accuracy.read_text() if accuracy.exists() else ""
@@ -271,7 +288,9 @@ def test_errors_of_the_work(pipeline, ready_town, ready_models, tmp_path):
     assert "numpy" not in missing + required + finite and "of a stage that failed" not in finite
     assert not out.exists()
     nan.write_text("X,Y,Z\n1,1,1\n2,2,2\n")
-    assert "meters were assumed" in pipeline(las([reader, {"type": "filters.hag_minima"}], out)).stderr
+    assert (
+        "meters were assumed" in pipeline(las([reader, {"type": "filters.hag_minima"}], out)).stderr
+    )
 
 
 def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
@@ -281,7 +300,9 @@ def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
     path.write_text(json.dumps(stages))
 
     def run(folder):
-        done = ended(pdal_env.program(), "pipeline", path, env={**environment, "PYTHONPATH": str(folder)})
+        done = ended(
+            pdal_env.program(), "pipeline", path, env={**environment, "PYTHONPATH": str(folder)}
+        )
         assert done.returncode == 1, (done.returncode, done.stderr)
         return done.stderr
 
@@ -292,11 +313,15 @@ def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
         "        if name == 'pdal_stages':\n            raise ModuleNotFoundError('No module', name=name)\n"
         "sys.meta_path.insert(0, Hide())\n"
     )
-    assert "has no package pdal_stages" in (said := run(hidden)) and "pip install pdal-stages" in said
+    assert (
+        "has no package pdal_stages" in (said := run(hidden)) and "pip install pdal-stages" in said
+    )
     broken = tmp_path / "broken" / "pdal_stages"
     broken.mkdir(parents=True)
     (broken / "__init__.py").write_text("raise OSError('cannot open shared object')")
-    assert "cannot be imported" in (said := run(broken.parent)) and "cannot open shared object" in said
+    assert (
+        "cannot be imported" in (said := run(broken.parent)) and "cannot open shared object" in said
+    )
     (broken / "__init__.py").write_text(  # a package that lacks what the library asks for
         "import sys\nclass Old:\n    def find_spec(self, name, path=None, target=None):\n"
         "        if name.startswith('pdal_stages.'):\n            raise ModuleNotFoundError(name, name=name)\n"
@@ -307,7 +332,13 @@ def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
 
 
 def test_a_plugin_of_another_version():
-    asked = {"version": "9.9", "digest": "x", "stage": "filters.hag_minima", "label": "l", "step": "prepare"}
+    asked = {
+        "version": "9.9",
+        "digest": "x",
+        "stage": "filters.hag_minima",
+        "label": "l",
+        "step": "prepare",
+    }
     module = {"pdalargs": asked}
     assert answers.answer(module, {}, {})
     (leaf,) = module["out_metadata"]["children"]
@@ -318,7 +349,9 @@ def test_a_plugin_of_another_version():
 def test_without_filters_python(plugin, pdal_program, ready_town, tmp_path):
     """PDAL that has our plugin but not what runs it."""
     path = tmp_path / "job.json"
-    path.write_text(json.dumps(las([str(ready_town), {"type": "filters.hag_minima"}], tmp_path / "o.laz")))
+    path.write_text(
+        json.dumps(las([str(ready_town), {"type": "filters.hag_minima"}], tmp_path / "o.laz"))
+    )
     done = ended(pdal_program, "pipeline", path, env={"PDAL_DRIVER_PATH": str(plugin)})
     assert done.returncode == 1
     assert "PDAL has no filters.python" in done.stderr and "PDAL_DRIVER_PATH" in done.stderr
@@ -376,7 +409,9 @@ def test_ctrl_c_ends_pdal_at_once(environment, pdal_program, ready_town, tmp_pat
     ]  # fmt: skip
     path = tmp_path / "job.json"
     path.write_text(json.dumps(las(stages, out)))
-    running = subprocess.Popen([pdal_program, "pipeline", str(path)], env=environment, stderr=subprocess.PIPE)
+    running = subprocess.Popen(
+        [pdal_program, "pipeline", str(path)], env=environment, stderr=subprocess.PIPE
+    )
     assert running.stderr is not None
     assert running.stderr.readline().strip() == b"here"
     begun = time.monotonic()

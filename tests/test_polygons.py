@@ -31,7 +31,9 @@ def write(path, shapes, epsg: int | None = RD, layer=None, kind="MultiPolygon", 
     shapes = [shapely.MultiPolygon([s]) if s.geom_type == "Polygon" else s for s in shapes]
     if epsg not in (None, RD):
         move = pyproj.Transformer.from_crs(RD, epsg, always_xy=True).transform
-        shapes = [shapely.transform(shapely.segmentize(s, 5), move, interleaved=False) for s in shapes]
+        shapes = [
+            shapely.transform(shapely.segmentize(s, 5), move, interleaved=False) for s in shapes
+        ]
     pyogrio.raw.write(
         str(path), np.array([shapely.to_wkb(s) for s in shapes], object), [np.arange(len(shapes))], ["id"],
         crs=None if epsg is None else f"EPSG:{epsg}", geometry_type=kind, layer=layer, append=append,
@@ -60,9 +62,20 @@ def run(polygons, arrays, epsg=RD, **more):
 
 def test_what_is_written_for_a_file_and_a_class():
     assert Overlay.parse("a=b/lakes.gpkg=9") == Overlay("a=b/lakes.gpkg", "", 9, (2,))
-    assert Overlay.parse("b.gpkg|layername=deck 1=17: 2, 6") == Overlay("b.gpkg", "deck 1", 17, (2, 6))
+    assert Overlay.parse("b.gpkg|layername=deck 1=17: 2, 6") == Overlay(
+        "b.gpkg", "deck 1", 17, (2, 6)
+    )
     assert Overlay.parse("C:\\maps\\r.shp=11:all") == Overlay("C:\\maps\\r.shp", "", 11, ())
-    for text in ("lakes.gpkg", "=9", "l.gpkg=", "l.gpkg=256", "l.gpkg=²", "l.gpkg=9:", "l.gpkg=9:x", "l=-1"):
+    for text in (
+        "lakes.gpkg",
+        "=9",
+        "l.gpkg=",
+        "l.gpkg=256",
+        "l.gpkg=²",
+        "l.gpkg=9:",
+        "l.gpkg=9:x",
+        "l=-1",
+    ):
         with pytest.raises(OptionError, match="polygons are written FILE=CODE"):
             Overlay.parse(text)
 
@@ -82,7 +95,9 @@ def test_ground_inside_becomes_the_class_and_nothing_else(tmp_path, suffix, epsg
     )
     certain = edge > (0.0 if epsg in (RD, None) else 0.01)
     assert np.array_equal(found[certain], want[certain]) and (want == 9).sum() > 300
-    assert report.figures["polygons"] == {f"{path}=9": {"polygons": 2, "points": int((found == 9).sum())}}
+    assert report.figures["polygons"] == {
+        f"{path}=9": {"polygons": 2, "points": int((found == 9).sum())}
+    }
     assert bool(report.notes) == (epsg is None)
 
 
@@ -160,7 +175,9 @@ def test_what_is_wrong_is_said_before_any_work(tmp_path):
         Polygons({"polygons": [f"{tmp_path}/none.gpkg=9"]})
     lines = tmp_path / "lines.gpkg"
     wkb = np.array([shapely.to_wkb(LAKE.exterior)], object)
-    pyogrio.raw.write(str(lines), wkb, [np.arange(1)], ["id"], crs="EPSG:28992", geometry_type="LineString")
+    pyogrio.raw.write(
+        str(lines), wkb, [np.arange(1)], ["id"], crs="EPSG:28992", geometry_type="LineString"
+    )
     with pytest.raises(StageError, match="must have one layer of polygons"):
         Polygons({"polygons": [f"{lines}=9"]})
     path = write(tmp_path / "a.gpkg", [LAKE])
@@ -217,7 +234,9 @@ def test_what_cannot_be_read_after_the_check_is_an_error_of_ours(tmp_path, monke
         raise shapely.errors.GEOSException("ParseException: Unknown WKB type 99")
 
     monkeypatch.setattr(shapely, "from_wkb", broken)
-    with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read.*GEOSException"):
+    with pytest.raises(
+        StageError, match=r"lake.gpkg: the vector file cannot be read.*GEOSException"
+    ):
         stage.run(points)
     monkeypatch.setattr(shapely, "from_wkb", real)
     monkeypatch.setattr(Overlay, "check", lambda self: "lake")

@@ -31,12 +31,19 @@ def test_no_option_that_holds_a_path_is_carried():
 
 
 def test_one_spelling():
-    given = {**HAG, "cell": "2.0", "ground": "TRUE", "openings": "5, 17", "ignore": "7,Withheld[1:1]"}
+    given = {
+        **HAG,
+        "cell": "2.0",
+        "ground": "TRUE",
+        "openings": "5, 17",
+        "ignore": "7,Withheld[1:1]",
+    }
     assert check([given]) == [
         {**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": ["7", "Withheld[1:1]"]}
     ]
     assert same(
-        [given], [{**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": [7, "Withheld[1:1]"]}]
+        [given],
+        [{**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": [7, "Withheld[1:1]"]}],
     )
     assert check(check([given])) == check([given])
     both = [{"type": "filters.smrf", "ignore": "Classification[7:7]"}, {"type": "filters.hag_nn"}]
@@ -96,7 +103,9 @@ def test_only_a_few_stages():
 
 _JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=True) | st.text(max_size=20),
-    lambda inside: st.lists(inside, max_size=4) | st.dictionaries(st.text(max_size=8), inside, max_size=3),
+    lambda inside: (
+        st.lists(inside, max_size=4) | st.dictionaries(st.text(max_size=8), inside, max_size=3)
+    ),
     max_leaves=8,
 )
 _KINDS = [*stage_types(), *PDAL_OPTIONS, "filters.python", "filters.stats", "filters.head"]

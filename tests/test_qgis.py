@@ -58,7 +58,9 @@ def program(tmp_path_factory):
     """This checkout's pdal-stages, as an environment of its own would hold it."""
     path = tmp_path_factory.mktemp("environment") / "bin" / "pdal-stages"
     path.parent.mkdir()
-    path.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m pdal_stages.cli "$@"\n')
+    path.write_text(
+        f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m pdal_stages.cli "$@"\n'
+    )
     path.chmod(0o755)
     return path
 
@@ -113,7 +115,9 @@ def test_found_by_itself(environment, program, tmp_path, monkeypatch):
     elsewhere.mkdir(parents=True)
     shutil.copy(program, elsewhere)
     (tmp_path / ".conda").mkdir()
-    (tmp_path / ".conda" / "environments.txt").write_text(f"{tmp_path / 'gone'}\n{elsewhere.parent}\n")
+    (tmp_path / ".conda" / "environments.txt").write_text(
+        f"{tmp_path / 'gone'}\n{elsewhere.parent}\n"
+    )
     assert environment.find() == str(elsewhere / "pdal-stages")
     monkeypatch.setenv("PATH", str(program.parent))
     assert environment.find() == str(program)
@@ -127,7 +131,9 @@ def test_forms_follow_the_command(capsys):
     said = json.loads(capsys.readouterr().out)
     arguments = {one["name"]: one for one in said["commands"]["classify"]["arguments"]}
     assert (
-        arguments["inputs"]["many"] and arguments["inputs"]["flag"] == "" and arguments["inputs"]["required"]
+        arguments["inputs"]["many"]
+        and arguments["inputs"]["flag"] == ""
+        and arguments["inputs"]["required"]
     )
     assert arguments["noise"] | {"help": ""} == {
         "name": "noise", "flag": "--noise", "off": "--no-noise", "kind": "boolean", "help": "", "default": True,
@@ -154,7 +160,9 @@ def test_run_tells_progress_and_messages(running, tmp_path):
 
 
 def test_run_fails_with_the_message(running, tmp_path):
-    program = script(tmp_path, "import sys\nprint('pdal-stages: no such file', file=sys.stderr)\nsys.exit(1)")
+    program = script(
+        tmp_path, "import sys\nprint('pdal-stages: no such file', file=sys.stderr)\nsys.exit(1)"
+    )
     with pytest.raises(running.Failed, match=r"^no such file$"):
         running.run(program, [], Feedback())
     with pytest.raises(running.Failed, match="exit code 3"):
@@ -284,7 +292,9 @@ def test_parameters_are_the_commands_own(session, capsys):
     for name in ("BRIDGES", "WIRES", "VEGETATION_HEIGHTS"):
         assert name in shown and not shown[name][1]
     heights = session("parameters", "heights")["parameters"]
-    assert heights["WINDOW"][2] == "75.0" and heights["WINDOW"][3].startswith("Radius of the largest window")
+    assert heights["WINDOW"][2] == "75.0" and heights["WINDOW"][3].startswith(
+        "Radius of the largest window"
+    )
 
 
 @pytest.fixture
@@ -314,7 +324,11 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
         said = algorithm("heights", code=1, INPUT=ready_town, OUTPUT=out / "x.laz", **wrong)
         assert re.search("found '4,5'|Did you mean WINDOW|ends in .tif", said)
     assert not (out / "x.laz").exists()
-    job = [str(ready_town), {"type": "filters.hag_morphological", "window": 40}, str(tmp_path / "h.laz")]
+    job = [
+        str(ready_town),
+        {"type": "filters.hag_morphological", "window": 40},
+        str(tmp_path / "h.laz"),
+    ]
     assert run_job(job, "--writers.las.extra_dims=all", "--writers.las.forward=all")[0] == 0
     ours, theirs = (laspy.read(path)["HeightAboveGround"] for path in (tmp_path / "h.laz", heights))
     assert np.array_equal(ours, theirs) and ours.max() > 3
@@ -324,7 +338,9 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     assert "Overall accuracy" in said and (out / "a.html").read_text().startswith("<!")
     pytest.importorskip("pyogrio")
     assert " buildings, " in algorithm("objects", INPUTS=cloud, OUTPUT=out / "o.gpkg")
-    shown = session("styles", out / "o.gpkg", out / "t.tif", heights.with_suffix(".tif"), out / "c.tif")
+    shown = session(
+        "styles", out / "o.gpkg", out / "t.tif", heights.with_suffix(".tif"), out / "c.tif"
+    )
     layers = {"terrain": "hillshade", "heights": "singlebandpseudocolor", "classes": "paletted"}
     assert shown["building"] == [214, 78, 60] and shown["layers"] | layers == shown["layers"]
     assert shown["layers"]["buildings"] == "RuleRenderer"
@@ -344,7 +360,9 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
 @needs_qgis
 def test_many_files_and_training(algorithm, ready_halves, ready_town, tmp_path):
     out, model = tmp_path / "out", tmp_path / "m.model"
-    said = algorithm("classifysurvey", FOLDER=ready_halves, OUTPUT=out, REPORT=tmp_path / "r.html", WORKERS=0)
+    said = algorithm(
+        "classifysurvey", FOLDER=ready_halves, OUTPUT=out, REPORT=tmp_path / "r.html", WORKERS=0
+    )
     assert sorted(path.name for path in out.glob("*.laz")) == ["east.laz", "west.laz"], said
     assert (tmp_path / "r.html").is_file()
     few = {"COUNT": 50, "TREES": 5, "NEIGHBORHOODS": "k10"}

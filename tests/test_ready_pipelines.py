@@ -51,16 +51,23 @@ def test_classify(ready_town, ready_models, tmp_path, name):
     )
     before, after = laspy.read(ready_town), laspy.read(out)
     sure = np.isin(before.classification, [2, 5, 6]) & (np.asarray(after["Reliability"]) > 0.5)
-    assert np.mean(np.asarray(after.classification)[sure] == np.asarray(before.classification)[sure]) > 0.85
+    assert (
+        np.mean(np.asarray(after.classification)[sure] == np.asarray(before.classification)[sure])
+        > 0.85
+    )
     if name == "classify-with-rejection":
         low = np.asarray(after["Reliability"]) < 0.5
         assert (np.asarray(after.classification)[low] == 1).all()
         assert {"Margin", "Probability_2"} <= set(after.point_format.dimension_names)
 
 
-@pytest.mark.parametrize("name", ["noise", "normalize", "features", "features-for-viewers", "copc-to-tiles"])
+@pytest.mark.parametrize(
+    "name", ["noise", "normalize", "features", "features-for-viewers", "copc-to-tiles"]
+)
 def test_those_that_need_no_model_of_their_own(ready_town, ready_models, tmp_path, name):
-    source = Path(__file__).parent / "data" / "town.copc.laz" if name.startswith("copc") else ready_town
+    source = (
+        Path(__file__).parent / "data" / "town.copc.laz" if name.startswith("copc") else ready_town
+    )
     words = [f"--stage.input.filename={source}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
     if '"classifier"' in (FOLDER / f"{name}.json").read_text():
         words.append(f"--stage.classifier.model={ready_models / 'classes.model'}")
@@ -77,7 +84,9 @@ def test_tile_index_to_tiles(ready_halves, ready_models, tmp_path):
     subprocess.run(command, input=files, text=True, check=True, capture_output=True)
     words = [f"--stage.input.filename={index}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
     words.append(f"--stage.classifier.model={ready_models / 'classes.model'}")
-    run_tiled(FOLDER / "tile-index-to-tiles.json", 500, parse_overrides(words)[0], per="tile", workers=0)
+    run_tiled(
+        FOLDER / "tile-index-to-tiles.json", 500, parse_overrides(words)[0], per="tile", workers=0
+    )
     assert list(tmp_path.glob("o_*.laz"))
 
 
@@ -139,10 +148,19 @@ def test_terrain_and_surface_of_a_survey_show_no_tiles(ready_town, ready_halves,
     writer["filename"] = str(tmp_path / "whole.laz")
     Pipeline([str(ready_town), heights, writer]).execute()
     rasters = {}
-    for kind, source in (("files", tmp_path / "classified" / "*.laz"), ("whole", tmp_path / "whole.laz")):
+    for kind, source in (
+        ("files", tmp_path / "classified" / "*.laz"),
+        ("whole", tmp_path / "whole.laz"),
+    ):
         words = [f"--stage.input.filename={source}"]
         for model in ("surface", "terrain"):
-            place = {"resolution": 1, "origin_x": 499_995, "origin_y": 5_399_995, "width": 70, "height": 70}
+            place = {
+                "resolution": 1,
+                "origin_x": 499_995,
+                "origin_y": 5_399_995,
+                "width": 70,
+                "height": 70,
+            }
             place["filename"] = tmp_path / f"{model}_{kind}.tif"
             words += [f"--stage.{model}.{name}={value}" for name, value in place.items()]
         run("terrain-and-surface", *words)

@@ -46,7 +46,10 @@ def inputs(tmp_path, write_las):
         for number, wkt in enumerate(references):
             xyz = rng.uniform(0, 1, (500, 3)) * (40, 40, 3) + (500_000 + 40 * number, 5_400_000, 0)
             write_las(
-                tmp_path / f"in{number}.las", dict(zip("XYZ", xyz.T, strict=True)), point_format=6, wkt=wkt
+                tmp_path / f"in{number}.las",
+                dict(zip("XYZ", xyz.T, strict=True)),
+                point_format=6,
+                wkt=wkt,
             )
         return str(tmp_path / "in*.las")
 
@@ -58,7 +61,9 @@ def ways(tmp_path, pattern, *more):
     stages = [{"type": "readers.las", "filename": pattern}, *more, {"type": "filters.hag_minima"}]
     writer = {"type": "writers.las", "extra_dims": "all"}
     yield lambda: ps.run_pipeline([*stages, {**writer, "filename": str(tmp_path / "whole.las")}])
-    yield lambda: run_tiled([*stages, {**writer, "filename": str(tmp_path / "o_#.las")}], 40, workers=0)
+    yield lambda: run_tiled(
+        [*stages, {**writer, "filename": str(tmp_path / "o_#.las")}], 40, workers=0
+    )
 
 
 @pytest.mark.parametrize(("one", "two"), [(METERS, FEET), (FEET, None)])
@@ -80,7 +85,9 @@ def test_degrees_beside_meters(tmp_path, inputs):
 
 def test_references_of_two_kinds(tmp_path, inputs):
     for way in ways(tmp_path, inputs(METERS, OTHER)):
-        with pytest.raises(StageError, match="the inputs have different reference systems") as caught:
+        with pytest.raises(
+            StageError, match="the inputs have different reference systems"
+        ) as caught:
             way()
         assert "in0.las" in str(caught.value) and "in1.las" in str(caught.value)
 
@@ -95,7 +102,10 @@ def test_units_of_one_kind(tmp_path, inputs, references):
 @pytest.mark.parametrize("references", [(METERS, None, METERS, None), (None, None)])
 def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, references):
     inputs(*references)
-    stages = [{"type": "readers.las", "filename": str(tmp_path / "in*.las")}, {"type": "filters.hag_minima"}]
+    stages = [
+        {"type": "readers.las", "filename": str(tmp_path / "in*.las")},
+        {"type": "filters.hag_minima"},
+    ]
     whole = ps.Pipeline(stages)
     whole.execute()
     writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
@@ -103,7 +113,9 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
         said = [one for one in messages if "assumed to have that of the other inputs" in one]
         assert len(said) == (1 if any(references) else 0)
         for line in said:
-            assert f"{tmp_path / 'in1.las'}, {tmp_path / 'in3.las'} have no spatial reference" in line
+            assert (
+                f"{tmp_path / 'in1.las'}, {tmp_path / 'in3.las'} have no spatial reference" in line
+            )
 
 
 def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, capsys):
@@ -115,7 +127,11 @@ def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, ca
 
 def test_geotiff_keys_of_las_14_in_old_point_formats(tmp_path, write_las):
     path, xyz = tmp_path / "in.las", np.random.default_rng(0).uniform(0, 30, (3, 100))
-    for key, value, horizontal in ((3072, 2264, 1200 / 3937), (3072, 32767, 1.0), (4096, 5703, 1.0)):
+    for key, value, horizontal in (
+        (3072, 2264, 1200 / 3937),
+        (3072, 32767, 1.0),
+        (4096, 5703, 1.0),
+    ):
         las = laspy.read(write_las(path, dict(zip("XYZ", xyz, strict=True)), 1, 4))
         data = struct.pack("<8H", 1, 1, 0, 1, key, 0, 1, value)
         las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", data))

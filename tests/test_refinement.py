@@ -85,7 +85,9 @@ def test_a_target_alone_changes(said, grown, target, trusted):
 
 def test_trust_grows_with_labels():
     assert trust(0) == 0.0 and trust(EVEN) == 0.5
-    assert all(a < b < 1.0 for a, b in zip(map(trust, range(99)), map(trust, range(1, 100)), strict=True))
+    assert all(
+        a < b < 1.0 for a, b in zip(map(trust, range(99)), map(trust, range(1, 100)), strict=True)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +113,12 @@ def test_a_file_holds_the_base(base, tmp_path, more):
     model = on_top(base, passes=more, prior_weight=0.3)
     assert [one.name for one in model.passes] == ["random_forest"] * 2 + ["refined_forest"] * more
     assert model.voxel == (base.voxel if more == 1 else FEW["voxel"]) and model.halo_m > base.halo_m
-    assert [one.blend.factors is not None for one in model.passes[2:]] == [False] * (more - 1) + [more > 1]
-    assert model.passes[2].context.tokens == (("own",) if more > 1 else model.passes[-1].context.tokens)
+    assert [one.blend.factors is not None for one in model.passes[2:]] == [False] * (more - 1) + [
+        more > 1
+    ]
+    assert model.passes[2].context.tokens == (
+        ("own",) if more > 1 else model.passes[-1].context.tokens
+    )
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
     xyz, _, dimensions = scene(seed=7, n=4000)
@@ -129,7 +135,10 @@ def test_any_order_and_any_part(base):
     whole = model.predict(xyz, dimensions, probabilities=True).probabilities
     order = np.random.default_rng(1).permutation(len(xyz))
     turned = model.predict(
-        xyz[order], {k: np.asarray(v)[order] for k, v in dimensions.items()}, probabilities=True, threads=1
+        xyz[order],
+        {k: np.asarray(v)[order] for k, v in dimensions.items()},
+        probabilities=True,
+        threads=1,
     ).probabilities
     assert np.array_equal(turned, whole[order])
     where = xyz[:, 0] < np.median(xyz[:, 0])
@@ -163,7 +172,9 @@ def test_a_new_class_is_learnt(base, new, passes):
     if passes == 1:  # and is one for who trains on top of it, even if its label often tells nothing
         assert new in label_classes([cloud], TrainingOptions(**FEW, base=model)).classes.codes
     found = model.predict(xyz, dimensions).classification
-    assert (found == label).mean() > (base.predict(xyz, dimensions).classification == label).mean() + 0.05
+    assert (found == label).mean() > (
+        base.predict(xyz, dimensions).classification == label
+    ).mean() + 0.05
 
 
 def test_one_class_alone_changes(base):
@@ -187,7 +198,10 @@ def test_every_label_counts(base):
         few[rng.choice(np.flatnonzero(label == code), 30, replace=False)] = code
     options = TrainingOptions(**FEW, base=base, folds=0)
     voxels = len(np.unique(np.floor(xyz[few > 0] / base.voxel), axis=0))
-    for cloud in (TrainingCloud(xyz, few, dimensions), TrainingCloud(xyz, label, dimensions, mask=few > 0)):
+    for cloud in (
+        TrainingCloud(xyz, few, dimensions),
+        TrainingCloud(xyz, label, dimensions, mask=few > 0),
+    ):
         model = train([cloud], options, progress=False)
         told = sum(one["available"] for one in model.info["classes"])
         assert told == voxels
@@ -244,7 +258,9 @@ def of_the_base(base, xyz, dimensions):
 def computed(features, xyz, dimensions):
     """The features of every point."""
     engine = FeatureEngine(xyz, features.plan, bins=features.bins)
-    return engine.table(dimensions={name: dimensions[name] for name in features.plan.dimensions}).values
+    return engine.table(
+        dimensions={name: dimensions[name] for name in features.plan.dimensions}
+    ).values
 
 
 def test_two_passes_equal_the_passes_by_hand(base):
@@ -264,7 +280,8 @@ def test_two_passes_equal_the_passes_by_hand(base):
     rows = np.arange(0, len(xyz), 9)
     columns = reference(xyz, shares, rows, second.context)
     grown = weighed(
-        second.forest.predict_proba(np.hstack([values[rows], columns])), np.array(second.blend.factors)
+        second.forest.predict_proba(np.hstack([values[rows], columns])),
+        np.array(second.blend.factors),
     )
     own = columns[:, : len(model.codes)].astype(float)
     own /= own.sum(axis=1, keepdims=True)
@@ -290,7 +307,9 @@ def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monke
     (cloud,) = passes.clouds
     xyz, fold = cloud.xyz, folds.points(cloud.xyz, cloud.survey)
     values = computed(passes.features, xyz, cloud.dimensions)
-    read = np.hstack([values, (of_the_base(base, xyz, cloud.dimensions) / WHOLE).astype(np.float32)])
+    read = np.hstack(
+        [values, (of_the_base(base, xyz, cloud.dimensions) / WHOLE).astype(np.float32)]
+    )
     grown = np.array(
         [forests[k].forest.predict_proba(read[i : i + 1])[0] for i, k in enumerate(fold.tolist())]
     )
@@ -302,7 +321,9 @@ def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monke
     )
     some = np.arange(0, len(passes.samples), 5)
     rows = passes.samples.row[some]
-    assert np.allclose(context[some], reference(xyz, shares, rows, model.passes[-1].context), atol=2e-5)
+    assert np.allclose(
+        context[some], reference(xyz, shares, rows, model.passes[-1].context), atol=2e-5
+    )
 
 
 @pytest.mark.pdal
@@ -315,12 +336,20 @@ def test_through_pdal(tmp_path, write_las):
     cloud = {"X": x + 5e5, "Y": y + 5e6, "Z": z + 100, "Classification": label}
     source = write_las(tmp_path / "in.las", cloud, point_format=3)
     model = tmp_path / "mine.model"
-    writer = {"type": "writers.classifiermodel", "filename": str(model), "base": "standard", "trees": 5}
+    writer = {
+        "type": "writers.classifiermodel",
+        "filename": str(model),
+        "base": "standard",
+        "trees": 5,
+    }
     heights = ps.load_model("standard").info["preparation"]
     ps.run_pipeline([str(source), *heights, {**writer, "classes": "2,6,11", "count": 200}])
     made = ps.load_model(model)
     assert made.codes.tolist() == [2, 5, 6, 11]
     assert made.info["base"]["name"] == "standard" and len(made.info["base"]["sha256"]) == 64
-    assert f"on top of      standard, the passes before (SHA-256 {made.info['base']['sha256']})" in str(made)
+    assert (
+        f"on top of      standard, the passes before (SHA-256 {made.info['base']['sha256']})"
+        in str(made)
+    )
     assert "pass 4" in str(made) and "pass 3" not in str(made)
     assert made.info["preparation"] == ps.load_model("standard").info["preparation"]

@@ -60,7 +60,9 @@ class Page(HTMLParser):
 def accuracy_page(a, **content):
     """The report as text."""
     with TemporaryDirectory() as folder:
-        return write_accuracy_report(Path(folder) / "a.html", a, **content).read_text(encoding="utf-8")
+        return write_accuracy_report(Path(folder) / "a.html", a, **content).read_text(
+            encoding="utf-8"
+        )
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,9 @@ def scene():
     xy = rng.random((20_000, 2)) * (60, 40)
     house = (np.abs(xy - (20, 20)) < 8).all(axis=1)
     tree = np.hypot(*(xy - (45, 25)).T) < 5
-    z = np.where(house, 8.0, np.where(tree, rng.uniform(2, 9, len(xy)), 0.0)) + rng.normal(0, 0.03, len(xy))
+    z = np.where(house, 8.0, np.where(tree, rng.uniform(2, 9, len(xy)), 0.0)) + rng.normal(
+        0, 0.03, len(xy)
+    )
     reference = np.where(house, 6, np.where(tree, 5, 2))
     reference[:50] = 1
     predicted = reference.copy()
@@ -151,7 +155,10 @@ def test_every_figure_is_there(full, accuracy):
         assert f"{100 * share:.1f} %" in text
     assert "Building taken for High vegetation" in text
     assert f"{accuracy.left_out_points} points (1 Unclassified: 50)" in text
-    assert "Points given a class that is not compared, which count as errors: 30 (1 Unclassified)." in text
+    assert (
+        "Points given a class that is not compared, which count as errors: 30 (1 Unclassified)."
+        in text
+    )
     assert "nan" not in text.lower().replace("national", "")
 
 
@@ -190,7 +197,9 @@ def test_error_map_shows_the_errors(full):
     inside = (columns / scale > 11.5) & (columns / scale < 28.5)
     inside &= (40 - rows / scale > 10.5) & (40 - rows / scale < 13.5)
     assert inside.mean() > 0.7
-    differs = (np.abs(reference.astype(int) - prediction) > 40).any(axis=2)  # each has a palette of its own
+    differs = (np.abs(reference.astype(int) - prediction) > 40).any(
+        axis=2
+    )  # each has a palette of its own
     assert red[differs].mean() > 0.5
 
 
@@ -218,7 +227,10 @@ def test_degenerate_clouds(xyz, maps):
     [
         ({"xyz": np.zeros((2, 3))}, "the reference must be one label per point"),
         ({"xyz": np.zeros((2, 2)), "reference": [2, 2], "predicted": [2, 2]}, "n x 3"),
-        ({"xyz": [[0, 0, np.nan], [1, 1, 1]], "reference": [2, 2], "predicted": [2, 2]}, "1 of 2 points"),
+        (
+            {"xyz": [[0, 0, np.nan], [1, 1, 1]], "reference": [2, 2], "predicted": [2, 2]},
+            "1 of 2 points",
+        ),
     ],
 )
 def test_misuse_is_told(accuracy, arguments, message):
@@ -265,7 +277,13 @@ def tiled(**changes):
         "failures": [{"what": nasty, "reason": nasty}],
         "tiles": [
             {"name": "770500_6277000", "tile": [1541, 12554], "state": "done", **done},
-            {"name": "771000_6277000", "tile": [1542, 12554], "state": "kept", "points": 3000, "tries": 0},
+            {
+                "name": "771000_6277000",
+                "tile": [1542, 12554],
+                "state": "kept",
+                "points": 3000,
+                "tries": 0,
+            },
             {
                 "name": nasty,
                 "tile": [1543, 12554],
@@ -298,5 +316,7 @@ def test_a_run_tells_what_it_did_and_what_it_kept():
 
 
 def test_a_run_of_nothing_makes_a_page():
-    empty = tiled(tiles=[], outputs=[], failures=[], notes=[], classes={}, states={"waiting": 0}, bounds=None)
+    empty = tiled(
+        tiles=[], outputs=[], failures=[], notes=[], classes={}, states={"waiting": 0}, bounds=None
+    )
     assert "Times of this run" not in Page(run_page(empty)).text

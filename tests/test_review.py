@@ -21,7 +21,11 @@ from pdal_stages.pipeline.reviewing import styles
 def cloud(seed, n=3000, wide=60.0):
     random = np.random.default_rng(seed)
     xyz = np.round(random.random((n, 3)) * [wide, wide, 8.0] + [500_000.0, 5_400_000.0, 40.0], 3)
-    return xyz, random.choice([1, 2, 3, 5, 6, 9], n).astype(np.uint8), random.random(n).astype(np.float32)
+    return (
+        xyz,
+        random.choice([1, 2, 3, 5, 6, 9], n).astype(np.uint8),
+        random.random(n).astype(np.float32),
+    )
 
 
 @settings(max_examples=10, deadline=None)
@@ -73,7 +77,10 @@ def test_patches_hold_each_cell_once_and_come_best_first():
     cells = ReviewCells.of(*cloud(9, 6000, 150.0), 2.0)
     found = find_patches(cells)
     assert np.array_equal(np.unique(found.of_cell), np.arange(len(found)))
-    assert np.isclose(found.errors.sum(), cells.errors.sum()) and found.points.sum() == cells.points.sum()
+    assert (
+        np.isclose(found.errors.sum(), cells.errors.sum())
+        and found.points.sum() == cells.points.sum()
+    )
     assert (np.diff(found.errors / found.minutes) <= 1e-6).all()
     for number in range(len(found)):
         mine = np.flatnonzero(found.of_cell == number)
@@ -127,8 +134,13 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
     assert rank == tuple(range(1, len(rank) + 1)) and all(reason) and min(expected) >= 0
     assert set(styles) == {"patches", "tiles"} and "looked at" in styles["patches"]
     # One file or two: the same is expected in all.
-    assert run("review", folder / "whole.laz", tmp_path / "w.gpkg", "--json", tmp_path / "w.json")[0] == 0
-    assert np.isclose(json.loads((tmp_path / "w.json").read_text())["expected"], figures["expected"])
+    assert (
+        run("review", folder / "whole.laz", tmp_path / "w.gpkg", "--json", tmp_path / "w.json")[0]
+        == 0
+    )
+    assert np.isclose(
+        json.loads((tmp_path / "w.json").read_text())["expected"], figures["expected"]
+    )
 
 
 @pytest.mark.pdal
@@ -153,7 +165,11 @@ def test_what_is_missing_is_made_and_said(folder, tmp_path, run):
 @pytest.mark.pdal
 @pytest.mark.parametrize(
     ("words", "what"),
-    [(["--share", "0"], "'--share'"), (["--cell", "0.1"], "'--cell'"), (["--workers", "0"], "--workers")],
+    [
+        (["--share", "0"], "'--share'"),
+        (["--cell", "0.1"], "'--cell'"),
+        (["--workers", "0"], "--workers"),
+    ],
 )
 def test_what_cannot_be_is_refused(folder, tmp_path, words, what, run):
     code, _, err = run("review", folder / "whole.laz", tmp_path / "r.gpkg", *words)

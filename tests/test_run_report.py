@@ -7,7 +7,10 @@ def test_merging_keeps_its_own_figures_and_joins_the_rest():
     own = Report({"points": 5, "few": {"c1": 2}}, notes=["a"], beyond_halo={"k10": 1})
     own.merge(
         Report(
-            {"points": 9, "density": 2.5, "few": {"c1": 7, "c2": 3}}, ["a", "b"], ["w"], {"k10": 4, "k50": 2}
+            {"points": 9, "density": 2.5, "few": {"c1": 7, "c2": 3}},
+            ["a", "b"],
+            ["w"],
+            {"k10": 4, "k50": 2},
         )
     )
     assert own.figures == {"points": 5, "few": {"c1": 2, "c2": 3}, "density": 2.5}
@@ -26,4 +29,9 @@ def test_merging_shares_nothing_with_the_other():
 def test_metadata_has_messages_only_where_there_are_any():
     assert Report({"points": 1}).to_dict() == {"points": 1}
     full = Report({"points": 1}, ["a"], ["w", "x"], {"k10": 3})
-    assert full.to_dict() == {"points": 1, "beyond_halo": {"k10": 3}, "warning": "w. x", "note": "a"}
+    assert full.to_dict() == {
+        "points": 1,
+        "beyond_halo": {"k10": 3},
+        "warning": "w. x",
+        "note": "a",
+    }

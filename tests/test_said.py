@@ -18,7 +18,12 @@ pytestmark = pytest.mark.pdal
 def cloud(tmp_path, write_las):
     rng = np.random.default_rng(1)
     x, y = rng.uniform(0, 30, (2, 500))
-    arrays = {"X": x, "Y": y, "Z": rng.normal(0, 0.02, 500), "Amplitude": rng.random(500).astype("f4")}
+    arrays = {
+        "X": x,
+        "Y": y,
+        "Z": rng.normal(0, 0.02, 500),
+        "Amplitude": rng.random(500).astype("f4"),
+    }
     return write_las(tmp_path / "cloud.las", arrays, point_format=1)
 
 
@@ -26,7 +31,12 @@ def cloud(tmp_path, write_las):
 def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run_job, tiles):
     """filters.hag_nn warns of ground points that are not there."""
     smrf = {"type": "filters.smrf", "cell": 20}
-    stages = [cloud, smrf, {"type": "filters.hag_minima"}, {"type": "filters.hag_minima", "tag": "b"}]
+    stages = [
+        cloud,
+        smrf,
+        {"type": "filters.hag_minima"},
+        {"type": "filters.hag_minima", "tag": "b"},
+    ]
     code, _, err = run_job([*stages, tmp_path / "o.las"], *tiles)
     assert code == 0, err
     assert err.count("small number of cells") == 1 and "pypipeline" not in err
@@ -36,7 +46,10 @@ def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run_job, tiles):
 def test_a_log_file(cloud, tmp_path, run_job):
     log = tmp_path / "run.log"
     out, meta = tmp_path / "o.las", tmp_path / "m.json"
-    assert run_job([cloud, {"type": "filters.hag_minima"}, out], "--log", log, "--metadata", meta)[0] == 0
+    assert (
+        run_job([cloud, {"type": "filters.hag_minima"}, out], "--log", log, "--metadata", meta)[0]
+        == 0
+    )
     assert json.loads(meta.read_text())["metadata"]["writers.las"]["filename"] == [str(out)]
     assert run_job([cloud, {"type": "filters.hag_minima", "cell": -1}, out], "--log", log)[0] == 1
     lines = log.read_text().splitlines()
@@ -51,14 +64,21 @@ def test_a_log_file(cloud, tmp_path, run_job):
 
 def test_the_log_hears_the_workers_of_tiles_and_the_summary(cloud, tmp_path, run_job):
     """What libraries print in the workers' processes is in the log, and what goes to standard output."""
-    says = "import os\ndef f(ins, outs):\n    os.write(2, b'said by a worker\\n')\n    return True\n"
+    says = (
+        "import os\ndef f(ins, outs):\n    os.write(2, b'said by a worker\\n')\n    return True\n"
+    )
     script = {"type": "filters.python", "source": says, "function": "f", "module": "m"}
-    log, stages = tmp_path / "run.log", [cloud, {"type": "filters.hag_minima"}, script, tmp_path / "o.las"]
+    log, stages = (
+        tmp_path / "run.log",
+        [cloud, {"type": "filters.hag_minima"}, script, tmp_path / "o.las"],
+    )
     assert run_job(stages, "--log", log, "--tile", 100, "--workers", 2, "--buffer", 0)[0] == 0
     lines = log.read_text().splitlines()
     assert any(line.endswith("said by a worker") for line in lines)
     assert any(" tiles done; " in line or " tile done; " in line for line in lines)
-    assert all(line[:2] == "20" and line[10] == " " for line in lines) and "exit code 0" in lines[-1]
+    assert (
+        all(line[:2] == "20" and line[10] == " " for line in lines) and "exit code 0" in lines[-1]
+    )
 
 
 def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run_job):
@@ -77,7 +97,10 @@ def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run
     ("stage", "says"),
     [
         ({"type": "filters.accuracy"}, "'Reference' is missing"),
-        ({"type": "filters.modelclassifier", "model": "standard"}, "'HeightAboveGround' is missing"),
+        (
+            {"type": "filters.modelclassifier", "model": "standard"},
+            "'HeightAboveGround' is missing",
+        ),
         ({"type": "filters.hag_minima", "cell": -1}, "must be a number"),
         ({"type": "filters.hag_nonsense"}, "no stage|Couldn't create"),
         ("degrees", "degrees"),
@@ -97,7 +120,9 @@ def test_what_cannot_run_is_not_valid(cloud, tmp_path, run_job, stage, says):
 
 def test_dimensions_that_a_file_or_a_stage_brings_are_valid(tmp_path, run_job, write_las):
     xyz = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 9, (3, 50)), strict=True))
-    mine = write_las(tmp_path / "mine.las", {**xyz, "Reference": np.full(50, 2, "u1")}, point_format=6)
+    mine = write_las(
+        tmp_path / "mine.las", {**xyz, "Reference": np.full(50, 2, "u1")}, point_format=6
+    )
     plain = write_las(tmp_path / "plain.las", xyz, point_format=6)
     ferry = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
     for stages in ([mine], [plain, ferry]):
@@ -128,7 +153,9 @@ def test_objects_like_those_of_python_pdal(cloud, tmp_path, pdal_module):
     job = ps.Pipeline([str(cloud), {"type": "filters.hag_minima"}]) | pdal_module.Writer.las(
         str(out), extra_dims="all"
     )
-    assert job.execute() == 500 and "HeightAboveGround" in laspy.read(out).point_format.dimension_names
+    assert (
+        job.execute() == 500 and "HeightAboveGround" in laspy.read(out).point_format.dimension_names
+    )
     more = ps.Pipeline([str(cloud)]) | stage | pdal_module.Writer(str(tmp_path / "b.las"))
     assert more.execute() == 500 and (tmp_path / "b.las").exists()
     with pytest.raises(TypeError):

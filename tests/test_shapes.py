@@ -14,7 +14,15 @@ from pdal_stages.features import compute_features
 from pdal_stages.features.bins import METRICS, ShapeBins
 from pdal_stages.features.engine import FeatureEngine
 from pdal_stages.features.plan import FeaturePlan
-from pdal_stages.features.shapes import PULLS, ROOM, draw, make_work, point_seeds, shape_counts, shape_values
+from pdal_stages.features.shapes import (
+    PULLS,
+    ROOM,
+    draw,
+    make_work,
+    point_seeds,
+    shape_counts,
+    shape_values,
+)
 
 f32 = np.float32
 
@@ -26,7 +34,9 @@ def seeds_of(count, seed=0):
 
 def as_record(members):
     members = np.asarray(members, float)
-    record = np.full((len(members) + 1, 4), np.nan, f32)  # neither the spare row nor the fourth column counts
+    record = np.full(
+        (len(members) + 1, 4), np.nan, f32
+    )  # neither the spare row nor the fourth column counts
     record[:-1, :3] = members
     return record, tuple(f32(v) for v in members.mean(axis=0))
 
@@ -42,7 +52,11 @@ def pulls(members, repeats=400, seed=0):
     a3, d1, d2, d3, d4 = np.concatenate(rows, axis=1)
     angle = np.arccos(np.clip(-np.sign(a3) * np.sqrt(abs(a3)), -1, 1))
     return dict(
-        zip(METRICS, (angle, np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)), strict=True)
+        zip(
+            METRICS,
+            (angle, np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)),
+            strict=True,
+        )
     )
 
 
@@ -151,7 +165,9 @@ def test_seeds():
     assert not (a == point_seeds(x, y, z, 2, "c1")).any()
     assert not (a == point_seeds(x, y, z, 1, "c2")).any()
     assert not (a == point_seeds(y, x, z, 1, "c1")).any()
-    many = point_seeds(*np.random.default_rng(0).integers(0, 1000, (3, 100_000)).astype(float), 0, "s1")
+    many = point_seeds(
+        *np.random.default_rng(0).integers(0, 1000, (3, 100_000)).astype(float), 0, "s1"
+    )
     assert len(np.unique(many)) > 99_900  # as many as there are different points
 
 
@@ -189,7 +205,9 @@ def test_counts_are_the_oracle_s(shape):
         expected = np.array([metric[name] for metric in metrics])
         # Values within rounding of a threshold may fall to either side.
         near = (abs(expected[:, None] - rows[m]) < 1e-3).any(axis=1).sum()
-        difference = np.abs(np.cumsum(counts[m] * PULLS - oracle.shape_counts(expected, rows[m]) * PULLS))
+        difference = np.abs(
+            np.cumsum(counts[m] * PULLS - oracle.shape_counts(expected, rows[m]) * PULLS)
+        )
         assert difference.max() <= near + 1e-3, name
 
 

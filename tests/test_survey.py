@@ -74,7 +74,9 @@ def fresh(survey):
 def values(*paths: Path) -> dict[str, np.ndarray]:
     """What was made of points, in an order of their own."""
     read = [laspy.read(path) for path in paths]
-    xyz = np.concatenate([np.column_stack([r.X, r.Y, r.Z, np.asarray(r.gps_time) * 1e6]) for r in read])
+    xyz = np.concatenate(
+        [np.column_stack([r.X, r.Y, r.Z, np.asarray(r.gps_time) * 1e6]) for r in read]
+    )
     names = ("classification", "Reliability", "HeightAboveGround")
     order = np.lexsort(xyz.T)
     return {name: np.concatenate([np.asarray(r[name]) for r in read])[order] for name in names}
@@ -84,23 +86,39 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.glob("*.la?"))}
 
 
-def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, classify, whole, tmp_path):
+def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(
+    survey, classify, whole, tmp_path
+):
     target = tmp_path / "made" / "classified"
-    code, out, err = classify(survey / "in", target, "--tile", 30, "--metadata", tmp_path / "m.json")
+    code, out, err = classify(
+        survey / "in", target, "--tile", 30, "--metadata", tmp_path / "m.json"
+    )
     assert code == 0, err
-    assert sorted(path.name for path in target.glob("t*")) == ["t0.laz", "t1.las", "t2.laz", "t3.laz"]
+    assert sorted(path.name for path in target.glob("t*")) == [
+        "t0.laz",
+        "t1.las",
+        "t2.laz",
+        "t3.laz",
+    ]
     one = values(whole)
     other = values(*target.glob("t*"))
     for name in one:
         assert np.array_equal(one[name], other[name]), name
-    extra = {p.name: sorted(laspy.read(p).point_format.extra_dimension_names) for p in target.glob("t*")}
+    extra = {
+        p.name: sorted(laspy.read(p).point_format.extra_dimension_names) for p in target.glob("t*")
+    }
     assert extra["t0.laz"] == ["Amplitude", "HeightAboveGround", "Reliability"]
     assert extra["t1.las"] == ["HeightAboveGround", "Reliability"]
     for number in (0, 1, 2, 3):  # headers are the inputs' own
         (name,) = [p.name for p in (survey / "in").glob(f"t{number}.*")]
         before, after = (laspy.read(folder / name).header for folder in (survey / "in", target))
-        assert np.array_equal(before.scales, after.scales) and np.array_equal(before.offsets, after.offsets)
-        assert before.point_format.id == after.point_format.id and before.parse_crs() == after.parse_crs()
+        assert np.array_equal(before.scales, after.scales) and np.array_equal(
+            before.offsets, after.offsets
+        )
+        assert (
+            before.point_format.id == after.point_format.id
+            and before.parse_crs() == after.parse_crs()
+        )
         one_file, other_file = laspy.read(survey / "in" / name), laspy.read(target / name)
         for axis in ("X", "Y", "Z", "gps_time"):
             assert np.array_equal(one_file[axis], other_file[axis])
@@ -111,7 +129,8 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, cla
     }
     codes, counts = np.unique(one["classification"], return_counts=True)
     table = {
-        int(c): int(n.replace(",", "")) for c, n in re.findall(r"^ +(\d+) .*?([\d,]+)$", out, re.MULTILINE)
+        int(c): int(n.replace(",", ""))
+        for c, n in re.findall(r"^ +(\d+) .*?([\d,]+)$", out, re.MULTILINE)
     }
     assert table == dict(zip(codes.tolist(), counts.tolist(), strict=True))
     found = json.loads((tmp_path / "m.json").read_text())
@@ -121,7 +140,9 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, cla
 
     before = contents(target)
     (target / "t2.laz").unlink()
-    code, out, err = classify(survey / "in", target, "--resume")  # the tiles stay those of the first run
+    code, out, err = classify(
+        survey / "in", target, "--resume"
+    )  # the tiles stay those of the first run
     assert code == 0 and "1 file written, 3 kept from an earlier run" in out, out + err
     assert contents(target) == before
 
@@ -129,9 +150,18 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(survey, cla
 def test_a_dry_run_writes_nothing_and_finds_what_is_wrong(survey, classify, tmp_path):
     code, out, err = classify(survey / "in", tmp_path / "out", "--dry-run")
     assert code == 0 and "4 inputs" in out and not list(tmp_path.iterdir()), err
-    code, _, err = classify(survey / "in", tmp_path / "out", "--dry-run", "--where", "Classificaton == 2 &&")
+    code, _, err = classify(
+        survey / "in", tmp_path / "out", "--dry-run", "--where", "Classificaton == 2 &&"
+    )
     assert code == 1 and "where" in err
-    words = ["classify", str(survey / "in"), str(tmp_path / "out"), "--dry-run", "--model", "standart"]
+    words = [
+        "classify",
+        str(survey / "in"),
+        str(tmp_path / "out"),
+        "--dry-run",
+        "--model",
+        "standart",
+    ]
     assert main(words) == 1
     assert not list(tmp_path.iterdir())
 
@@ -146,7 +176,9 @@ def test_one_output_for_each_tile(survey, classify, whole, tmp_path):
 
 
 def test_a_cloud_beyond_the_memory_is_cut(survey, classify, whole, tmp_path):
-    code, out, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "1.3GB", "--tile", 60)
+    code, out, err = classify(
+        survey / "town.laz", tmp_path / "cut.laz", "--memory", "1.3GB", "--tile", 60
+    )
     assert code == 0 and "tiles done" in out, err
     clouds.same_points(tmp_path / "cut.laz", whole)
     code, _, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "0.2GB")
@@ -166,7 +198,9 @@ def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, fresh, tmp_
 
     monkeypatch.setattr(run, "run_tile", some)
     code, out, err = classify(survey / "in", tmp_path / "out/", "--tile", 45)
-    assert code == 130 and "3 of 6 tiles done" in err and "--resume" in err and "pdal-stages" in err, err
+    assert (
+        code == 130 and "3 of 6 tiles done" in err and "--resume" in err and "pdal-stages" in err
+    ), err
     assert re.search(r"\d of 4 files written", err)
     monkeypatch.undo()
     code, out, err = classify(survey / "in", tmp_path / "out/", "--resume")
@@ -178,7 +212,13 @@ def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, fresh, tmp_
 
 
 def test_amounts_of_memory():
-    for text, size in {"4GB": 4e9, "4 GiB": 4 * 2**30, "1.5g": 15e8, "500M": 5e8, "77000000": 77e6}.items():
+    for text, size in {
+        "4GB": 4e9,
+        "4 GiB": 4 * 2**30,
+        "1.5g": 15e8,
+        "500M": 5e8,
+        "77000000": 77e6,
+    }.items():
         assert parse_size(text) == size
     for text in ("", "GB", "-1GB", "0", "4", "4 apples", "1e9"):
         with pytest.raises(OptionError, match="a number and a unit"):
@@ -193,7 +233,10 @@ def test_there_is_memory():
 @pytest.mark.parametrize("memory", [1.5e9, 4e9, 16e9, 64e9])
 @pytest.mark.parametrize("halo", [0.0, 32.0, 368.0])
 def test_the_side_of_tiles_keeps_to_the_memory(density, memory, halo):
-    extents = [Extent(int(density * 10**6), (i * 1000.0, 0.0, (i + 1) * 1000.0, 1000.0)) for i in range(100)]
+    extents = [
+        Extent(int(density * 10**6), (i * 1000.0, 0.0, (i + 1) * 1000.0, 1000.0))
+        for i in range(100)
+    ]
     found = Density.of(extents)
     options = TilingOptions(memory=int(memory), workers=None)
     try:

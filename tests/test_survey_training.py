@@ -13,8 +13,17 @@ from pdal_stages.tiling.training import surveys_of
 
 def test_surveys_are_files_or_groups_of_them():
     files = ["a/1.laz", "a/2.laz", "b/1.laz", "c.laz"]
-    assert surveys_of(files) == {"1": ["a/1.laz"], "2": ["a/2.laz"], "b/1.laz": ["b/1.laz"], "c": ["c.laz"]}
-    assert surveys_of(files, ["north=a/*"]) == {"north": files[:2], "1": ["b/1.laz"], "c": ["c.laz"]}
+    assert surveys_of(files) == {
+        "1": ["a/1.laz"],
+        "2": ["a/2.laz"],
+        "b/1.laz": ["b/1.laz"],
+        "c": ["c.laz"],
+    }
+    assert surveys_of(files, ["north=a/*"]) == {
+        "north": files[:2],
+        "1": ["b/1.laz"],
+        "c": ["c.laz"],
+    }
     assert surveys_of(files, ["n=a/*,b/*", "s=c.laz"]) == {"n": files[:3], "s": files[3:]}
     for wrong in (["a/*"], ["n=x/*"], ["n=a/*", "s=a/1.laz"], ["=a/*"]):
         with pytest.raises(OptionError):
@@ -32,7 +41,12 @@ def test_surveys_of_two_reference_systems_are_left_out_in_turn(tmp_path, write_l
             point_format=6,
             wkt=pyproj.CRS(epsg).to_wkt("WKT1_GDAL"),
         )
-    words = ["train", *(str(tmp_path / f"t{k}.laz") for k in range(3)), "--model", str(tmp_path / "m.model")]
+    words = [
+        "train",
+        *(str(tmp_path / f"t{k}.laz") for k in range(3)),
+        "--model",
+        str(tmp_path / "m.model"),
+    ]
     telling = ["--feature-set", "HeightAboveLowest", "--neighborhoods", "s12"]
     assert main([*words, *QUICK_WORDS, *telling, "--surveys"]) == 0
     out = capsys.readouterr().out
@@ -61,7 +75,10 @@ def test_it_is_said_that_there_is_no_score_and_what_to_label_next(tmp_path, writ
     corner = (points["X"] > 20) | (points["Y"] > 20)
     points["Classification"][building & corner] = 1
     write_las(tmp_path / "a.laz", points, point_format=1)
-    assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS]) == 0
+    assert (
+        main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS])
+        == 0
+    )
     said = capsys.readouterr()
     assert "there is no score on ground held out" in said.err and "6 Building" in said.err
     assert "Label next" in said.err and "not scored" in said.out

@@ -18,7 +18,15 @@ from pdal_stages.classifier.model import load_model
 from pdal_stages.stages.base import stage_type, stage_types
 from pdal_stages.synthetic import Town, make_town, write_town
 from pdal_stages.synthetic.demo import pipelines
-from pdal_stages.synthetic.solids import BUILDING, COUNT, FIRST, VEGETATION, Site, build_scene, first_hit
+from pdal_stages.synthetic.solids import (
+    BUILDING,
+    COUNT,
+    FIRST,
+    VEGETATION,
+    Site,
+    build_scene,
+    first_hit,
+)
 from pdal_stages.synthetic.townplan import plan_town
 
 COLUMNS = [f.name for f in dataclasses.fields(Town) if f.name != "options"]
@@ -79,7 +87,9 @@ def test_ground_lies_on_the_ground_and_noise_moves_it(town):
         return t.z[of] - t.ground_height(t.x[of], t.y[of])
 
     # Rounding to 1 mm on slopes of one, and kerbs that end at a step.
-    assert np.percentile(np.abs(error(town, 2)), 99.9) < 0.003 and np.abs(error(town, 2)).max() < 0.13
+    assert (
+        np.percentile(np.abs(error(town, 2)), 99.9) < 0.003 and np.abs(error(town, 2)).max() < 0.13
+    )
     assert np.abs(error(town, 9)).max() < 0.002
     noisy = make_town(60, 3, noise=0.05, progress=False)
     assert np.std(error(noisy, 2)) == pytest.approx(0.05, rel=0.15)
@@ -112,7 +122,9 @@ def test_beams_pass_canopies_and_meet_walls(town):
     assert 0.55 < share[1] < 0.9 and share[2] > 0.05 and share[3] > 0.02 and share[5] > 0.002
     tree = np.flatnonzero((town.return_number == 1) & (town.classification == 5))
     last = tree + town.number_of_returns[tree] - 1
-    assert 0.15 < np.isin(town.classification[last], (2, 3)).mean() < 0.75, "ground is seen below trees"
+    assert 0.15 < np.isin(town.classification[last], (2, 3)).mean() < 0.75, (
+        "ground is seen below trees"
+    )
     cell = np.floor(town.xyz[town.classification == 6, :2] / 0.8).astype(np.int64)
     _, which = np.unique(cell, axis=0, return_inverse=True)
     low, high = np.full(which.max() + 1, np.inf), np.full(which.max() + 1, -np.inf)
@@ -145,7 +157,18 @@ def test_first_hit_equals_marching_through_all_things():
         a, b, z = *rng.uniform(0, 30, 2), rng.uniform(0, 10)
         half, up = rng.uniform(0.3, 4), rng.uniform(0.5, 6)
         cuts = [(0, 1.0, z + 4), (0.5, 0, z + 3)] if rng.random() < 0.5 else ()
-        site.box(a, b, rng.uniform(0, 6), half, rng.uniform(0.3, 2), z, z + up, BUILDING, "tile", cuts=cuts)
+        site.box(
+            a,
+            b,
+            rng.uniform(0, 6),
+            half,
+            rng.uniform(0.3, 2),
+            z,
+            z + up,
+            BUILDING,
+            "tile",
+            cuts=cuts,
+        )
         site.ball(*rng.uniform(0, 30, 2), rng.uniform(2, 12), *rng.uniform(0.5, 3, 3), 0.0)
         site.bar(rng.uniform(0, 15, 3), rng.uniform(5, 20, 3), 0.15, 14, "metal")
     scene, met = scene_of(site), 0

@@ -73,7 +73,9 @@ def slow_steepness(opened, measured, radius):
 def test_openings_and_objects_equal_the_slow_reference(shape):
     """The last of them is as steep as mountains."""
     rng = np.random.default_rng(1)
-    raster = (rng.normal(0, 3, shape) + np.arange(shape[1]) * 1.7 * (shape[0] == 60)).astype(np.float32)
+    raster = (rng.normal(0, 3, shape) + np.arange(shape[1]) * 1.7 * (shape[0] == 60)).astype(
+        np.float32
+    )
     raster[rng.random(shape) < 0.3] = np.inf
     window, measured = 21, np.isfinite(raster)
     objects, floor, opened, steep = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
@@ -84,7 +86,9 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
     for radius in opening_radii(window):
         after = slow_opening(raster, radius)
         land = radius * want_steep
-        drop = before - after > np.maximum(min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * (radius >= 14) * land)
+        drop = before - after > np.maximum(
+            min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * (radius >= 14) * land
+        )
         again = before - after > np.maximum(LARGEST_DROP, 3 * land)
         new = measured & np.where(want, again, drop)
         want_floor[new] = after[new]
@@ -126,7 +130,9 @@ def slow_planes(cells, level, floor, at):
                 share = (1 - abs(uv[0] - parent[0])) * (1 - abs(uv[1] - parent[1]))
                 if plane is not None and share > 0:
                     d = center - (parent + 0.5) * 2 * size
-                    prior += share * np.array([plane[0] + plane[1] * d[0] + plane[2] * d[1], *plane[1:]])
+                    prior += share * np.array(
+                        [plane[0] + plane[1] * d[0] + plane[2] * d[1], *plane[1:]]
+                    )
                     total += share
         if total == 0:
             return None
@@ -140,7 +146,11 @@ def slow_planes(cells, level, floor, at):
         k = np.sqrt(weight(c))
         rows.append(k * np.array([1, *d]))
         right.append(k * (z - prior[0] - prior[1:] @ d))
-    rows += [np.sqrt([0.1, 0, 0]), np.sqrt([0, 0.02 * n * size**2, 0]), np.sqrt([0, 0, 0.02 * n * size**2])]
+    rows += [
+        np.sqrt([0.1, 0, 0]),
+        np.sqrt([0, 0.02 * n * size**2, 0]),
+        np.sqrt([0, 0, 0.02 * n * size**2]),
+    ]
     right += [0, 0, 0]
     return prior + np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
 
@@ -161,15 +171,23 @@ def test_planes_equal_the_slow_reference(slope):
     for k in rng.choice(len(places), 4, replace=False):
         column, row = np.array(places[k][2]) // 2
         want = slow_planes(cells, 1, known, (column, row))
-        assert planes.values[row - planes.bottom, column - planes.left] == pytest.approx(want, abs=1e-6)
+        assert planes.values[row - planes.bottom, column - planes.left] == pytest.approx(
+            want, abs=1e-6
+        )
 
 
 def square(place, reach):
-    return [(place[0] + b, place[1] + a) for b in range(-reach, reach + 1) for a in range(-reach, reach + 1)]
+    return [
+        (place[0] + b, place[1] + a)
+        for b in range(-reach, reach + 1)
+        for a in range(-reach, reach + 1)
+    ]
 
 
 def heights_of(raster):
-    return {(j, i): float(raster[j, i]) for j, i in zip(*np.nonzero(np.isfinite(raster)), strict=True)}
+    return {
+        (j, i): float(raster[j, i]) for j, i in zip(*np.nonzero(np.isfinite(raster)), strict=True)
+    }
 
 
 def walked(cells, cell, reach):
@@ -236,7 +254,12 @@ def test_plateaus_equal_the_slow_reference(seed):
     j, i = np.mgrid[:h, :w]
     level = 0.05 * i * cell
     for _ in range(6):
-        y, x, size, high = rng.integers(0, h), rng.integers(0, w), rng.integers(3, 9), rng.uniform(1, 30)
+        y, x, size, high = (
+            rng.integers(0, h),
+            rng.integers(0, w),
+            rng.integers(3, 9),
+            rng.uniform(1, 30),
+        )
         level = np.where((abs(j - y) < size) & (abs(i - x) < size), level.min() + high, level)
     raster = (level + rng.normal(0, 0.1, (h, w))).astype(np.float32)
     raster[rng.random((h, w)) < (0.2 + 0.1 * seed)] = np.inf
@@ -259,7 +282,9 @@ def slow_roofs(ground, raster, cell):
         length, ends = np.hypot(dj, di), []
         for t in (-1, 1):
             steps = range(int(arm / length + 0.5), 0, -1)
-            ends.append([(s, cells[c]) for s in steps if (c := (j + t * s * dj, i + t * s * di)) in cells])
+            ends.append(
+                [(s, cells[c]) for s in steps if (c := (j + t * s * dj, i + t * s * di)) in cells]
+            )
         if not all(ends):
             return False
         (n, one), (m, other) = ends[0][0], ends[1][0]
@@ -274,13 +299,17 @@ def slow_roofs(ground, raster, cell):
             continue
         feet, high, others, creased, directions = [], 0, 0, 0, set()
         for here in members:
-            beside = [c for c in square(here, reach) if c in cells and ground[c] and c not in members]
+            beside = [
+                c for c in square(here, reach) if c in cells and ground[c] and c not in members
+            ]
             far = {c: max(1, cell * np.hypot(*np.subtract(c, here))) for c in beside}
             walls = {c: cells[here] - cells[c] for c in beside if cells[here] - cells[c] > far[c]}
             directions |= {turn_of(c, at.mean(axis=0)) for c in walls}
             feet += [cells[here] - max(walls.values())] if walls else []
             high = max([high, *walls.values()])
-            near = any(c in creases and abs(cells[c] - cells[here]) <= 0.75 for c in square(here, 1))
+            near = any(
+                c in creases and abs(cells[c] - cells[here]) <= 0.75 for c in square(here, 1)
+            )
             others += not walls and bool(beside or near)
             creased += near
         rim = len(feet) >= 0.5 * (len(feet) + others) and len(directions) >= 10 and high >= 1.8
@@ -301,14 +330,16 @@ def test_roofs_of_hillsides_equal_the_slow_reference(seed, cell):
     for y, x in ((4, 6), (6, 30), (25, 8), (24, 29), (20, 90), (5, 100)):
         deep, wide = rng.integers(8, 14, 2)
         house = (j >= y) & (j < y + deep) & (i >= x) & (i < x + wide)
-        raster[house] = 0.5 * cell * (y + deep) + 0.4 * cell * np.minimum(j - y, y + deep - j)[house] * (
-            seed % 2
-        )
+        raster[house] = 0.5 * cell * (y + deep) + 0.4 * cell * np.minimum(j - y, y + deep - j)[
+            house
+        ] * (seed % 2)
     raster[rng.random(raster.shape) < 0.1 * seed] = np.inf
     raster = raster.astype(np.float32)
     ground = np.isfinite(raster) & (rng.random(raster.shape) < 0.9)
     found, want = roofs_of_hillsides(ground, raster, cell), slow_roofs(ground, raster, cell)
-    assert {tuple(map(int, at)) for at in np.argwhere(np.isfinite(found))} == set(want) and len(want) > 100
+    assert {tuple(map(int, at)) for at in np.argwhere(np.isfinite(found))} == set(want) and len(
+        want
+    ) > 100
     assert [found[at] for at in want] == pytest.approx(list(want.values()), abs=1e-4)
     part = roofs_of_hillsides(ground[:, 40:], raster[:, 40:], cell)
     assert np.array_equal(part[:, 50:], found[:, 90:])
@@ -339,7 +370,9 @@ def test_a_roof_is_no_ground_whatever_its_width_and_steps():
         assert ground[far > 97].mean() > 0.999
         assert height[far < 90].min() > 1.0
     ramp = np.clip((x - 320) / 25, 0, 1) * 5.0
-    hill = np.where((far < 95) & (x > 320) & (abs(y - 250) < 10), 5.0 - ramp, np.where(far < 95, 5.0, 0.0))
+    hill = np.where(
+        (far < 95) & (x > 320) & (abs(y - 250) < 10), 5.0 - ramp, np.where(far < 95, 5.0, 0.0)
+    )
     ground, _ = ground_of(hill)
     assert ground[far < 30].mean() > 0.99
     ground, _ = ground_of(np.where(far < 130, 6.0, 0.0))
@@ -389,7 +422,9 @@ def test_ground_is_found_in_a_town_on_a_slope():
     assert figures["ground_points"] == found["Ground"].sum()
     roofs = height == 7
     assert (
-        np.median(found["HeightAboveOpening_5"][roofs]) < 1 < np.median(found["HeightAboveOpening_17"][roofs])
+        np.median(found["HeightAboveOpening_5"][roofs])
+        < 1
+        < np.median(found["HeightAboveOpening_17"][roofs])
     )
 
 
@@ -401,7 +436,10 @@ def test_order_and_shifts_by_whole_cells_change_nothing(seed, n, cells):
     x, y, z = rng.integers(0, 160, (3, n)) / 4.0
     found = filtered_ground(x, y, z, **SMALL)
     order = rng.permutation(n)
-    same(filtered_ground(x[order], y[order], z[order], **SMALL), {k: v[order] for k, v in found.items()})
+    same(
+        filtered_ground(x[order], y[order], z[order], **SMALL),
+        {k: v[order] for k, v in found.items()},
+    )
     same(filtered_ground(x + 32 * cells, y - 32 * cells, z, **SMALL), found)
 
 
@@ -442,7 +480,9 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
     n = 800
     cluster = rng.uniform(0, 8 * spacing, (2, 16))[:, rng.integers(0, 16, n)]
     x, y = np.round(cluster + rng.normal(0, 4, (2, n)) - 700.0, 2)
-    z = np.round(0.1 * x + rng.choice([0.0, 6.0, -20.0], n, p=[0.7, 0.29, 0.01]) + rng.normal(0, 0.1, n), 2)
+    z = np.round(
+        0.1 * x + rng.choice([0.0, 6.0, -20.0], n, p=[0.7, 0.29, 0.01]) + rng.normal(0, 0.1, n), 2
+    )
     mask = rng.random(n) < 0.95
     options = {"openings": (5, 120), "slope_too": True, "window": 40.0, "mask": mask}
     shapes, real = [], groundcells.pits
@@ -591,7 +631,10 @@ def test_through_pdal_with_noise_where_and_classes_kept(tmp_path, write_las):
     assert np.array_equal(array["Classification"], codes)
     assert (array["Ground"].dtype, array["HeightAboveOpening_5"].dtype) == (np.uint8, np.float32)
     metadata = pipeline.metadata["metadata"]["filters.hag_morphological"]
-    assert metadata["ignored"] == (codes == 7).sum() and metadata["ground_points"] == want["Ground"].sum()
+    assert (
+        metadata["ignored"] == (codes == 7).sum()
+        and metadata["ground_points"] == want["Ground"].sum()
+    )
 
 
 @pytest.mark.pdal
@@ -602,7 +645,9 @@ def test_feet_in_feet_out(data_dir):
     foot = 0.3048
     want = filtered_ground(*(array[k] * foot for k in "XYZ"), openings=(9,))
     assert np.allclose(array["HeightAboveGround"], want["HeightAboveGround"] / foot, atol=1e-4)
-    assert np.allclose(array["HeightAboveOpening_9"], want["HeightAboveOpening_9"] / foot, atol=1e-4)
+    assert np.allclose(
+        array["HeightAboveOpening_9"], want["HeightAboveOpening_9"] / foot, atol=1e-4
+    )
     ground = array["Classification"] == 2
     assert array["Ground"][ground].mean() > 0.99
     assert np.abs(array["HeightAboveGround"][ground]).mean() < 0.25  # feet

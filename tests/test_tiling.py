@@ -46,7 +46,9 @@ def town_file(tmp_path_factory, write_las):
         "TrueHeight": made.height_above_ground[keep],
     }
     path = tmp_path_factory.mktemp("tiling") / "town.laz"
-    return write_las(path, arrays, point_format=6, wkt=WKT, scale=0.001, offset=(499_000.0, 5_399_000.0, 0.0))
+    return write_las(
+        path, arrays, point_format=6, wkt=WKT, scale=0.001, offset=(499_000.0, 5_399_000.0, 0.0)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -70,16 +72,25 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
         "Extra": xyz[:, 0],
     }
     path = write_las(
-        tmp_path / f"cloud{suffix}", arrays, point_format=point_format, wkt=WKT if point_format == 6 else None
+        tmp_path / f"cloud{suffix}",
+        arrays,
+        point_format=point_format,
+        wkt=WKT if point_format == 6 else None,
     )
     grid = TileGrid(25.0)
-    index = CloudIndex.of(sort_points(str(path), grid, str(tmp_path / "copy")), str(tmp_path / "copy"))
+    index = CloudIndex.of(
+        sort_points(str(path), grid, str(tmp_path / "copy")), str(tmp_path / "copy")
+    )
     assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
     fine = sort_points(str(path), TileGrid(0.1), str(tmp_path / "fine"))
     assert len(fine["tiles"]) > 0.5 * len(xyz)  # small tiles are no sign of damage
-    (piece,) = cut_all(grid, (1, 2), [(InputSource(str(path), {}, "las"), index)], 3.0, str(tmp_path))
+    (piece,) = cut_all(
+        grid, (1, 2), [(InputSource(str(path), {}, "las"), index)], 3.0, str(tmp_path)
+    )
     las, all_ = laspy.read(piece.path), laspy.read(path)
-    expected = np.flatnonzero((xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78))
+    expected = np.flatnonzero(
+        (xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78)
+    )
     assert np.array_equal(piece.index, expected)
     assert las.points.array.tobytes() == all_.points.array[expected].tobytes()
     core = ((xyz[expected, :2] >= (25, 50)) & (xyz[expected, :2] < (50, 75))).all(axis=1)
@@ -110,7 +121,9 @@ def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole)
     assert len(run.tiles) == 11  # the hole's tile has no points
     x, y = (np.asarray(v) for v in (laspy.read(town_file).x, laspy.read(town_file).y))
     assert np.count_nonzero(x == 500_040.0) > 10 and np.count_nonzero(y == 5_400_030.0) > 10
-    assert any(job.record["read"] < run.summary["points"] for job in run.tiles)  # some were really cut
+    assert any(
+        job.record["read"] < run.summary["points"] for job in run.tiles
+    )  # some were really cut
     clouds.same_points(whole, tmp_path / "out.laz")
     counted = np.bincount(np.asarray(laspy.read(whole).classification), minlength=7)
     assert run.summary["classes"] == {str(c): int(counted[c]) for c in np.flatnonzero(counted)}
@@ -125,10 +138,18 @@ def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole
     assert not run_tiled(clouds.stages([town_file], out, model_file), 60, workers=0).failures
     clouds.same_points(whole, out)
     one, two = laspy.read(whole).header, laspy.read(out).header
-    for name in ("mins", "maxs", "number_of_points_by_return", "generating_software", "point_count"):
+    for name in (
+        "mins",
+        "maxs",
+        "number_of_points_by_return",
+        "generating_software",
+        "point_count",
+    ):
         assert np.all(getattr(one, name) == getattr(two, name)), name
     # Automatic offsets would differ from part to part: such a file is written at once.
-    stages = clouds.stages([town_file], tmp_path / "auto.las", model_file, offset_x="auto", forward="vlr")
+    stages = clouds.stages(
+        [town_file], tmp_path / "auto.las", model_file, offset_x="auto", forward="vlr"
+    )
     assert not run_tiled(stages, 60, workers=0).failures
     assert len(laspy.read(tmp_path / "auto.las")) == len(laspy.read(whole))
     assert not clouds.hidden(tmp_path)
@@ -166,7 +187,10 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
     ends = np.cumsum([0, *(np.count_nonzero(part == n) for n in range(3))])
     names = {"classification": "Classification", "gps_time": "GpsTime", "intensity": "Intensity"}
     for number in range(3):
-        made, given_ = laspy.read(tmp_path / f"c_part{number}.laz"), laspy.read(folder / f"part{number}.laz")
+        made, given_ = (
+            laspy.read(tmp_path / f"c_part{number}.laz"),
+            laspy.read(folder / f"part{number}.laz"),
+        )
         expected = arrays[ends[number] : ends[number + 1]]
         assert np.array_equal(made.points.array["X"], given_.points.array["X"])
         assert np.array_equal(made.header.offsets, given_.header.offsets)
@@ -174,7 +198,10 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
         for name in ("classification", "HeightAboveGround", "Reliability", "gps_time", "intensity"):
             assert np.array_equal(made[name], expected[names.get(name, name)]), (number, name)
     run = run_tiled(
-        [*pipeline[:-1], {**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}], 30, workers=0, per="tile"
+        [*pipeline[:-1], {**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}],
+        30,
+        workers=0,
+        per="tile",
     )
     assert not run.failures
     got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("t_*.laz"))])
@@ -188,7 +215,8 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
 def _table(path):
     las = laspy.read(path)
     out = np.zeros(
-        len(las), [("t", "f8"), ("x", "i8"), ("y", "i8"), ("z", "i8"), ("h", "f8"), ("c", "u1"), ("r", "f4")]
+        len(las),
+        [("t", "f8"), ("x", "i8"), ("y", "i8"), ("z", "i8"), ("h", "f8"), ("c", "u1"), ("r", "f4")],
     )
     out["t"], out["h"], out["c"], out["r"] = (
         las.gps_time,
@@ -214,19 +242,30 @@ def test_feature_stage_and_pdal_filters(tmp_path, town_file):
             "where": "Z > 62",
         },
         {"type": "filters.assign", "assignment": "UserData[:]=7"},
-        {"type": "writers.las", "filename": str(tmp_path / "a.las"), "forward": "all", "extra_dims": "all"},
+        {
+            "type": "writers.las",
+            "filename": str(tmp_path / "a.las"),
+            "forward": "all",
+            "extra_dims": "all",
+        },
     ]
     untiled = ps.Pipeline(pipeline)
     untiled.execute(arrays=False)
     pipeline[-1] = {**pipeline[-1], "filename": str(tmp_path / "b.las")}
     run = run_tiled(pipeline, 30, workers=0)
     assert not run.failures
-    assert run.summary["dropped"] == len(laspy.read(town_file)) - len(laspy.read(tmp_path / "a.las")) > 0
+    assert (
+        run.summary["dropped"]
+        == len(laspy.read(town_file)) - len(laspy.read(tmp_path / "a.las"))
+        > 0
+    )
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
 
 
 @pytest.mark.parametrize("names", ["old", "old new"])
-def test_flag_bits_of_old_formats_stay_and_are_not_counted(tmp_path, town_file, model_file, write_las, names):
+def test_flag_bits_of_old_formats_stay_and_are_not_counted(
+    tmp_path, town_file, model_file, write_las, names
+):
     """Beside a file of a new format, too: old PDAL reads the flags of one as bits of the class, of the other apart."""
     las = laspy.read(town_file)
     number = np.arange(len(las))
@@ -257,7 +296,11 @@ def test_flag_bits_of_old_formats_stay_and_are_not_counted(tmp_path, town_file, 
 
 
 def _features(neighborhoods, chosen):
-    return {"type": "filters.multiscalefeatures", "neighborhoods": neighborhoods, "feature_set": chosen}
+    return {
+        "type": "filters.multiscalefeatures",
+        "neighborhoods": neighborhoods,
+        "feature_set": chosen,
+    }
 
 
 @pytest.mark.parametrize(
@@ -293,7 +336,9 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las,
     )
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
     if len(stages) == 2 and stages[0].get("tag"):
-        run = run_tiled(job("c.las"), 60, workers=0, most_points=50)  # no room to widen: said, not hidden
+        run = run_tiled(
+            job("c.las"), 60, workers=0, most_points=50
+        )  # no room to widen: said, not hidden
         assert any("may differ" in note for note in run.messages)
         assert any(job.record["short"] for job in run.tiles)
 
@@ -311,11 +356,16 @@ def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):
     x, y, z = xyz.T
     reach = terrain_reach(x, y, np.ones(len(x), bool), wanted, core, 8.0, 0.5)
     near = (x >= 40 - reach) & (x <= 60 + reach) & (y >= 40 - reach) & (y <= 60 + reach)
-    full, part = ps.hag_minima(x, y, z, cell=8.0), ps.hag_minima(x[near], y[near], z[near], cell=8.0)
+    full, part = (
+        ps.hag_minima(x, y, z, cell=8.0),
+        ps.hag_minima(x[near], y[near], z[near], cell=8.0),
+    )
     assert np.array_equal(full[wanted], part[wanted[near]])
     # What a smaller cut believes to need is never less than the truth.
     small = (x >= 38) & (x <= 62) & (y >= 38) & (y <= 62)
-    believed = terrain_reach(x[small], y[small], np.ones(small.sum(), bool), wanted[small], core, 8.0, 0.5)
+    believed = terrain_reach(
+        x[small], y[small], np.ones(small.sum(), bool), wanted[small], core, 8.0, 0.5
+    )
     assert believed >= reach or believed <= 2.0
 
 
@@ -333,7 +383,9 @@ def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):
 )
 def test_global_stages_are_refused(tmp_path, town_file, stage, message):
     with pytest.raises((PipelineError, OptionError), match=message) as caught:
-        run_tiled([str(town_file), stage, {"type": "filters.hag_minima"}, str(tmp_path / "out.laz")], 30)
+        run_tiled(
+            [str(town_file), stage, {"type": "filters.hag_minima"}, str(tmp_path / "out.laz")], 30
+        )
     assert caught.value.cure or "all points" in caught.value.what
 
 
@@ -363,7 +415,10 @@ def test_outputs_need_names(tmp_path, town_file):
     (tmp_path / "deep").mkdir()
     las[:100].write(tmp_path / "deep" / "a.las")
     with pytest.raises(PipelineError, match="the same name"):
-        run_tiled([str(tmp_path / "a.las"), str(tmp_path / "deep" / "a.las"), str(tmp_path / "o_#.las")], 30)
+        run_tiled(
+            [str(tmp_path / "a.las"), str(tmp_path / "deep" / "a.las"), str(tmp_path / "o_#.las")],
+            30,
+        )
     with pytest.raises(PipelineError, match="no file matches"):
         find_sources([{"type": "readers.las", "filename": str(tmp_path / "none*.las")}])
 
@@ -373,7 +428,16 @@ def test_outputs_need_names(tmp_path, town_file):
 
 def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, whole):
     for name, driver in (("b.gpkg", "GPKG"), ("d.geojson", "GeoJSON")):
-        printed(pdal_program, "tindex", "create", tmp_path / name, town_file, "-f", driver, "--fast_boundary")
+        printed(
+            pdal_program,
+            "tindex",
+            "create",
+            tmp_path / name,
+            town_file,
+            "-f",
+            driver,
+            "--fast_boundary",
+        )
         assert locations(str(tmp_path / name)) == [str(town_file)]
         with pytest.raises(StageError, match="cannot be read"):
             locations(str(tmp_path / name), "nothing")
@@ -447,7 +511,9 @@ def test_reports(tmp_path, town_file, model_file):
     assert json.loads((tmp_path / "run.metadata").read_text())["failures"]
     told = json.loads((tmp_path / "r.json").read_text())
     assert told["states"]["failed"] == 0 and told["failures"][0]["what"] == str(broken)
-    assert sum(told["classes"].values()) == told["points"] == len(laspy.read(tmp_path / "c_town.laz"))
+    assert (
+        sum(told["classes"].values()) == told["points"] == len(laspy.read(tmp_path / "c_town.laz"))
+    )
     assert sum(tile["points"] for tile in told["tiles"]) == told["points"]
     text = (tmp_path / "r.html").read_text()
     assert "broken_town.laz" in text and "Ground" in text and f"{told['points']:,}" in text
@@ -455,7 +521,10 @@ def test_reports(tmp_path, town_file, model_file):
     assert main([*words, *names, "--resume"]) == 1
     text = (tmp_path / "r.html").read_text()
     assert f"{len(told['tiles'])} kept from an earlier run" in text and "job.json" in text
-    assert Path(model_file).name in text and f"{told['points']:,} more kept from an earlier run" in text
+    assert (
+        Path(model_file).name in text
+        and f"{told['points']:,} more kept from an earlier run" in text
+    )
 
 
 def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, write_las):
@@ -467,7 +536,9 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
     made = {}
     for number, (name, (kind, scale, offset)) in enumerate(kinds_of.items()):
         xyz = (
-            np.round((rng.uniform(0, 1, (800, 3)) * (30, 30, 4) + (500_000 + 30 * number, 0, 0)) / scale)
+            np.round(
+                (rng.uniform(0, 1, (800, 3)) * (30, 30, 4) + (500_000 + 30 * number, 0, 0)) / scale
+            )
             * scale
         )
         arrays = dict(zip("XYZ", xyz.T, strict=True)) | {"UserData": rng.integers(0, 256, 800)}
@@ -484,9 +555,9 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
     assert not run.failures
     tiles = [laspy.read(path) for path in sorted((tmp_path / "out").glob("*.laz"))]
     assert sum(len(tile.points) for tile in tiles) == 2400 and len(tiles) > 1
-    assert {(tile.header.version.minor, tile.point_format.id, tile.header.scales[0]) for tile in tiles} == {
-        (4, 8, 0.001)
-    }
+    assert {
+        (tile.header.version.minor, tile.point_format.id, tile.header.scales[0]) for tile in tiles
+    } == {(4, 8, 0.001)}
     got = np.concatenate([np.round(np.asarray(tile.x) * 1000) for tile in tiles])
     want = np.concatenate([np.round(arrays["X"] * 1000) for arrays in made.values()])
     assert np.array_equal(np.sort(got), np.sort(want))
@@ -496,7 +567,9 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
 
 
 @pytest.mark.parametrize("at_once", [10_000, 50])
-def test_a_reference_that_stands_after_the_points(tmp_path, random_cloud, write_las, monkeypatch, at_once):
+def test_a_reference_that_stands_after_the_points(
+    tmp_path, random_cloud, write_las, monkeypatch, at_once
+):
     """In feet: a piece without it would be taken for one in meters. Other records are kept too."""
     monkeypatch.setattr("pdal_stages.tiling.outputs.MOST_AT_ONCE", at_once)
     points = dict(zip("XYZ", random_cloud(200, seed=1).T, strict=True))
@@ -506,7 +579,10 @@ def test_a_reference_that_stands_after_the_points(tmp_path, random_cloud, write_
     las.header.global_encoding.wkt, las.evlrs = True, laspy.vlrs.vlrlist.VLRList(records)
     las.write(tmp_path / "in.las")
     made = []
-    for name, run in (("whole", ps.run_pipeline), ("tiles", lambda job: run_tiled(job, 20, workers=0))):
+    for name, run in (
+        ("whole", ps.run_pipeline),
+        ("tiles", lambda job: run_tiled(job, 20, workers=0)),
+    ):
         out = str(tmp_path / f"{name}.las")
         run([str(tmp_path / "in.las"), {"type": "filters.hag_minima", "cell": 5},
              {"type": "writers.las", "filename": out, "forward": "all", "extra_dims": "all"}])  # fmt: skip
@@ -514,7 +590,9 @@ def test_a_reference_that_stands_after_the_points(tmp_path, random_cloud, write_
     heights = [np.asarray(one["HeightAboveGround"]) for one in made]
     assert np.array_equal(*heights) and heights[0].any()
     for one in made:
-        assert b"hello" in {record.record_data_bytes() for record in [*one.vlrs, *(one.evlrs or [])]}
+        assert b"hello" in {
+            record.record_data_bytes() for record in [*one.vlrs, *(one.evlrs or [])]
+        }
 
 
 def test_odd_headers_are_said_of_the_inputs_alone(tmp_path, town_file):
@@ -539,5 +617,8 @@ def test_inputs_that_are_alike_ask_for_nothing(tmp_path, write_las):
 
     paths = [cloud(n, 0.0, (7, 8, 0)) for n in range(2)]
     assert one_format([*paths, str(tmp_path / "none.laz"), "cloud.ply"]) == {}
-    assert one_format([*paths, cloud("near", 9.0, (9, 8, 0))]) == {"scale_x": 0.001, "offset_x": 9.0}
+    assert one_format([*paths, cloud("near", 9.0, (9, 8, 0))]) == {
+        "scale_x": 0.001,
+        "offset_x": 9.0,
+    }
     assert one_format([*paths, cloud("far", 5e8, (5e8, 5e8, 5e8))])["offset_x"] == "auto"

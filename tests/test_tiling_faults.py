@@ -67,7 +67,9 @@ def command(job: Path, stages: list, *flags: str, tile: int = 20, **popen) -> su
     job.write_text(json.dumps(stages))
     words = [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(job)]
     words += ["--tile", str(tile), "--buffer", "0", *flags]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen)
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen
+    )
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +138,9 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, folder, expected):
     run = command(tmp_path / "job.json", stages, "--workers", "0", preexec_fn=limit)
     _, err = run.communicate(timeout=300)
     assert run.returncode == 1 and "the temporary file could not be written" in err
-    assert "Make room on the disk" in err and "Remove it from the inputs" not in err  # which are not to blame
+    assert (
+        "Make room on the disk" in err and "Remove it from the inputs" not in err
+    )  # which are not to blame
     assert [path.name for path in tmp_path.iterdir()] == ["job.json"]
     assert not run_tiled(stages, 20, workers=0, resume=True, buffer=0.0).failures
     check_same(tmp_path, expected)
@@ -207,7 +211,9 @@ def test_resume_does_only_what_changed(tmp_path, expected, folder):
     assert {path.suffix for path in notes} == {".json"}
     for number, path in enumerate(notes):
         data = path.read_bytes()
-        path.write_bytes(data[: len(data) // 2] if number % 2 else b'[{"fingerprint": 3}, null, 1e999]')
+        path.write_bytes(
+            data[: len(data) // 2] if number % 2 else b'[{"fingerprint": 3}, null, 1e999]'
+        )
     assert again()["done"] == 8
     assert {path.name: path.read_bytes() for path in tmp_path.glob("o_*.las")} == first
     path = inputs / "west.las"
@@ -294,7 +300,9 @@ def test_a_straggler_of_an_ended_run_changes_nothing(tmp_path, folder, monkeypat
     """What a cluster's worker still does for a run that was killed: it is refused when its file is to get its name."""
     stages = pipeline(folder, tmp_path / "o_#.laz")
     late = []
-    monkeypatch.setattr(workers, "perform", lambda task: late.append(pickle.dumps(task)) or perform(task))
+    monkeypatch.setattr(
+        workers, "perform", lambda task: late.append(pickle.dumps(task)) or perform(task)
+    )
     assert not run_tiled(stages, 40, workers=0).failures
     late = [task for task in map(pickle.loads, late) if not isinstance(task, partial)]
     monkeypatch.undo()
@@ -319,12 +327,16 @@ def test_the_command_says_what_is_missing(tmp_path, folder, capsys):
 # ---- workers and what they listen to ----------------------------------------------------------------------
 
 
-def test_nothing_listens_and_nothing_is_imported_from_the_current_folder(tmp_path, folder, expected):
+def test_nothing_listens_and_nothing_is_imported_from_the_current_folder(
+    tmp_path, folder, expected
+):
     """Neither the run nor its workers open a port, and modules that lie about are not taken for Python's own."""
     here = tmp_path / "here"
     here.mkdir()
     for name in ("signal", "struct", "numpy", "laspy", "pickle", "pdal_stages"):
-        (here / f"{name}.py").write_text(f"open({str(tmp_path / 'taken')!r}, 'a').write('{name} ')\n")
+        (here / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'taken')!r}, 'a').write('{name} ')\n"
+        )
     look = f"""
 inodes = set()
 for process in (os.getpid(), os.getppid()):
@@ -341,7 +353,9 @@ open({str(tmp_path / "looked")!r}, 'a').write('x')"""
     stages = pipeline(folder, tmp_path / "o_#.laz", python_filter(look))
     (here / "job.json").write_text(json.dumps(stages))
     root = str(Path(__file__).resolve().parents[1])
-    program = f"import sys; sys.path[0] = {root!r}; from pdal_stages.cli import main; sys.exit(main())"
+    program = (
+        f"import sys; sys.path[0] = {root!r}; from pdal_stages.cli import main; sys.exit(main())"
+    )
     words = ["pipeline", "job.json", "--tile", "20", "--buffer", "0", "--workers", str(WORKERS)]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run([sys.executable, "-c", program, *words], cwd=here, env=environment)
@@ -392,7 +406,10 @@ def test_a_name_that_is_not_utf8(tmp_path, folder, capsys):
     [
         (["--report", "job.json"], "the report file is one of the inputs"),
         (["--metadata", "job.json"], "the metadata file is one of the inputs"),
-        (["--report", "r.json", "--metadata", "r.json"], "the report file is the metadata file too"),
+        (
+            ["--report", "r.json", "--metadata", "r.json"],
+            "the report file is the metadata file too",
+        ),
         (["--metadata", "o.laz"], "the metadata file is the output file too"),
     ],
 )
@@ -420,11 +437,15 @@ def test_damaged_results_are_made_anew(tmp_path, folder, expected, monkeypatch):
     data[largest.header_offset + largest.file_size] ^= 1
     result.write_bytes(data)
     os.utime(result, ns=(then, then))
-    for note in result.parent.glob("*.json"):  # of inputs; those of tiles are held against their marks
+    for note in result.parent.glob(
+        "*.json"
+    ):  # of inputs; those of tiles are held against their marks
         if "cells" in (found := json.loads(note.read_text())):
             note.write_text(json.dumps({**found, "count": "x"}))
     run = run_tiled(stages, 20, workers=0, resume=True)
-    assert run.failures and "cannot be read back" in run.failures[0][1]  # found when it is read, not before
+    assert (
+        run.failures and "cannot be read back" in run.failures[0][1]
+    )  # found when it is read, not before
     assert not run_tiled(stages, 20, workers=0, resume=True).failures
     check_same(tmp_path, expected)
 
@@ -490,7 +511,10 @@ def test_a_file_that_pdals_own_stages_read(tmp_path, folder):
         "column": "c",
     }
     stages = pipeline(folder, tmp_path / "o_#.laz", overlay)
-    square = {"type": "Polygon", "coordinates": [[[-1, -1], [99, -1], [99, 99], [-1, 99], [-1, -1]]]}
+    square = {
+        "type": "Polygon",
+        "coordinates": [[[-1, -1], [99, -1], [99, 99], [-1, 99], [-1, -1]]],
+    }
     for code in (5, 6):
         feature = {"type": "Feature", "properties": {"c": code}, "geometry": square}
         polygons.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
@@ -509,7 +533,9 @@ def test_a_file_that_changes_during_the_run_is_told(tmp_path, folder):
     change = f"""if not os.path.exists({str(flag)!r}):
     open({str(flag)!r}, 'w').close()
     os.utime({str(east)!r}, (1, 1))"""
-    run = run_tiled(pipeline(inputs, tmp_path / "o_#.laz", python_filter(change)), 40, workers=0, buffer=0.0)
+    run = run_tiled(
+        pipeline(inputs, tmp_path / "o_#.laz", python_filter(change)), 40, workers=0, buffer=0.0
+    )
     assert [what for what, _ in run.failures] == [str(east)]
     assert "changed during the run" in run.failures[0][1] and "--resume" in run.failures[0][1]
 
@@ -520,7 +546,9 @@ def test_a_file_that_changes_during_the_run_is_told(tmp_path, folder):
 def dask(what: str, folder: Path, *words: str) -> subprocess.Popen:
     command = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--no-dashboard", *words]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen([*command, "--scheduler-file", str(folder / "note.json")], cwd=folder, **quiet)
+    return subprocess.Popen(
+        [*command, "--scheduler-file", str(folder / "note.json")], cwd=folder, **quiet
+    )
 
 
 def test_a_cluster(tmp_path, folder, expected, monkeypatch):
@@ -537,10 +565,16 @@ def test_a_cluster(tmp_path, folder, expected, monkeypatch):
     worker = dask("worker", tmp_path, *alone)
     try:
         until = time.monotonic() + 60
-        while not [n for n in tmp_path.glob("note.json") if n.stat().st_size] and time.monotonic() < until:
+        while (
+            not [n for n in tmp_path.glob("note.json") if n.stat().st_size]
+            and time.monotonic() < until
+        ):
             time.sleep(0.1)
         address = json.loads((tmp_path / "note.json").read_text())["address"]
-        with monkeypatch.context() as patch, pytest.raises(StageError, match="other versions") as caught:
+        with (
+            monkeypatch.context() as patch,
+            pytest.raises(StageError, match="other versions") as caught,
+        ):
             patch.setattr(dask_cluster, "build", lambda: "0.0.9 (0)")
             run_tiled(stages, 20, scheduler=address)
         assert "0.0.9" in str(caught.value) and not list(tmp_path.glob("o_*"))
@@ -549,7 +583,9 @@ def test_a_cluster(tmp_path, folder, expected, monkeypatch):
         check_same(tmp_path, expected)
         flag = tmp_path / "working"
         slow = pipeline(
-            folder, tmp_path / "o_#.laz", python_filter(f"open({str(flag)!r}, 'w').close(); time.sleep(0.3)")
+            folder,
+            tmp_path / "o_#.laz",
+            python_filter(f"open({str(flag)!r}, 'w').close(); time.sleep(0.3)"),
         )
 
         def kill(process: subprocess.Popen) -> None:
@@ -558,7 +594,10 @@ def test_a_cluster(tmp_path, folder, expected, monkeypatch):
             monkeypatch.setattr(dask_cluster, "_WAIT", 1.0)
             process.kill()
 
-        for process, lost in ((worker, "workers of the Dask scheduler are gone"), (scheduler, "any more")):
+        for process, lost in (
+            (worker, "workers of the Dask scheduler are gone"),
+            (scheduler, "any more"),
+        ):
             monkeypatch.setattr(dask_cluster, "_WAIT", 60.0)
             flag.unlink(missing_ok=True)
             threading.Thread(target=kill, args=(process,), daemon=True).start()
@@ -608,5 +647,7 @@ def test_large_tasks_that_no_worker_reads():
                     process.kill()
                     workers.wait([task])
     """
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60
+    )
     assert ended.returncode == 0 and not ended.stderr, ended.stderr

@@ -61,12 +61,19 @@ def survey(tmp_path_factory, write_las):
 
 def in_tiles(paths, stages, folder, **options):
     folder.mkdir(exist_ok=True)
-    writer = {"type": "writers.las", "filename": str(folder / "#.las"), "extra_dims": "all", "forward": "all"}
+    writer = {
+        "type": "writers.las",
+        "filename": str(folder / "#.las"),
+        "extra_dims": "all",
+        "forward": "all",
+    }
     return run_tiled([*paths, *stages, writer], TILE, workers=0, progress=False, **options)
 
 
 def of_files(folder, name):
-    return np.concatenate([np.asarray(laspy.read(folder / f"{f}.las")[name]) for f in ("west", "east")])
+    return np.concatenate(
+        [np.asarray(laspy.read(folder / f"{f}.las")[name]) for f in ("west", "east")]
+    )
 
 
 @pytest.mark.pdal
@@ -135,7 +142,9 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
 
 
 @pytest.mark.pdal
-def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_path, survey, monkeypatch):
+def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(
+    tmp_path, survey, monkeypatch
+):
     real, luckless = run.run_first_round, [(0, 0)]
 
     def failing(context, at, *rest):
@@ -149,7 +158,9 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(tmp_pat
     failed = {job.tile for job in tiles if job.state == "failed"}
     assert (0, 0) in failed and all("no luck" in job.reason for job in tiles if job.tile in failed)
     luckless += [job.tile for job in tiles]
-    assert all("no luck" in job.reason for job in in_tiles(survey, [small], tmp_path / "other").tiles)
+    assert all(
+        "no luck" in job.reason for job in in_tiles(survey, [small], tmp_path / "other").tiles
+    )
 
 
 def blocks_of(points, options, near):
@@ -161,20 +172,34 @@ def blocks_of(points, options, near):
     found = []
     for i in range(int(near[0] // side), int(near[2] // side) + 1):
         for j in range(int(near[1] // side), int(near[3] // side) + 1):
-            box = i * side - around, j * side - around, (i + 1) * side + around, (j + 1) * side + around
+            box = (
+                i * side - around,
+                j * side - around,
+                (i + 1) * side + around,
+                (j + 1) * side + around,
+            )
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
             mine = inside.get((i, j), np.empty((0, 3)))
             found.append(
-                cells_of_block(low[:, seen].T, (i, j), options, [mine[::2], mine[1::2]]).in_parts(256)
+                cells_of_block(low[:, seen].T, (i, j), options, [mine[::2], mine[1::2]]).in_parts(
+                    256
+                )
             )
     return GroundCells.of_blocks(found, len(options.openings))
 
 
 def test_thousands_of_lone_points_are_refused_before_any_of_them_is_worked_on(tmp_path, write_las):
     column, row = np.divmod(np.arange(4100), 64)
-    source = write_las(tmp_path / "in.las", {"X": column * 5000.0, "Y": row * 5000.0, "Z": row * 0.0})
-    made = run_tiled([str(source), HEIGHTS, str(tmp_path / "o_#.las")], 1000, workers=0, progress=False)
-    assert "thousands of points lie alone, far from any other (found 4,100 of" in made.unreadable[str(source)]
+    source = write_las(
+        tmp_path / "in.las", {"X": column * 5000.0, "Y": row * 5000.0, "Z": row * 0.0}
+    )
+    made = run_tiled(
+        [str(source), HEIGHTS, str(tmp_path / "o_#.las")], 1000, workers=0, progress=False
+    )
+    assert (
+        "thousands of points lie alone, far from any other (found 4,100 of"
+        in made.unreadable[str(source)]
+    )
     assert not list(tmp_path.glob("o_*"))
 
 
@@ -197,7 +222,11 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
     whole = filtered_ground(x, y, z, **options)
     made = FilterOptions(cell=cell, window=window, openings=(5, 9))
     u, v = x - origin[0], y - origin[1]
-    for box in ((430, 410, 520, 560), (-10, 630, 60, 710), *([(4000, -3000, 4050, -2950)] if strays else [])):
+    for box in (
+        (430, 410, 520, 560),
+        (-10, 630, 60, 710),
+        *([(4000, -3000, 4050, -2950)] if strays else []),
+    ):
         away = np.maximum(np.maximum(box[0] - u, u - box[2]), np.maximum(box[1] - v, v - box[3]))
         near = away <= 3.0
         wide = 3.0 + made.reach_of_cells * cell
@@ -220,7 +249,9 @@ def test_decks_of_blocks_are_those_of_the_whole():
     from bridge_scenes import SCENES, scan
 
     xyz, _ = scan(SCENES["river"](), 2.0)
-    middle = np.array([xyz[:, 0].mean() - 1024.0, xyz[:, 1].mean() - 2048.0, 0.0])  # where four blocks meet
+    middle = np.array(
+        [xyz[:, 0].mean() - 1024.0, xyz[:, 1].mean() - 2048.0, 0.0]
+    )  # where four blocks meet
     x, y, z = (xyz - middle).T
     use = np.random.default_rng(0).random(len(x)) < 0.95
     options = {"decks": True, "openings": (5,)}
@@ -229,7 +260,11 @@ def test_decks_of_blocks_are_those_of_the_whole():
     made = FilterOptions(openings=(5,), decks=True)
     left = around_blocks(x, y, z, use, made)
     inside = by_block(x, y, z, use, 1.0)
-    parts = [cells_of_block(left, (i, j), made, [inside[i, j]]).in_parts(256) for i in (0, 1) for j in (1, 2)]
+    parts = [
+        cells_of_block(left, (i, j), made, [inside[i, j]]).in_parts(256)
+        for i in (0, 1)
+        for j in (1, 2)
+    ]
     assert all(len(part["decks"]) for part in parts)
     some = filtered_ground(x, y, z, mask=use, cells=GroundCells.of_blocks(parts, 1), **options)
     for key, values in some.items():

@@ -27,12 +27,18 @@ HEIGHTS = {"type": "filters.hag_minima", "cell": 5}
             "HeightAboveGround' is missing",
         ),
         ([HEIGHTS, {**WRITER, "forwrd": "all"}], "line 5", "forwrd"),
-        ([HEIGHTS, {"type": "filters.assign", "assignment": "Nonsense[:]=3"}, WRITER], "line 5", "Nonsense"),
+        (
+            [HEIGHTS, {"type": "filters.assign", "assignment": "Nonsense[:]=3"}, WRITER],
+            "line 5",
+            "Nonsense",
+        ),
         ([HEIGHTS, {"type": "filters.nosuch"}, WRITER], "line 5", "filters.nosuch"),
         ([HEIGHTS, {**WRITER, "minor_version": 9}], "line 5", "minor_version"),
     ],
 )
-def test_it_is_found_before_the_first_tile(tmp_path, monkeypatch, write_las, stages, line, words, dry_run):
+def test_it_is_found_before_the_first_tile(
+    tmp_path, monkeypatch, write_las, stages, line, words, dry_run
+):
     x, y, z = np.random.default_rng(0).uniform(0, 30, (3, 300))
     for name in "ab":
         write_las(tmp_path / f"{name}.las", {"X": x, "Y": y, "Z": z})

@@ -56,14 +56,20 @@ def test_without_wires_there_are_no_towers():
     xyz, codes, height, wire = scene("low voltage along a street")
     assert not found(xyz, height, np.zeros(len(xyz), bool)).any()
     assert not find_towers(xyz, height, wire, codes == 2).any()
-    for few in (np.empty((0, 3)), np.zeros((1, 3)), np.random.default_rng(0).normal(0, 30, (300, 3))):
+    for few in (
+        np.empty((0, 3)),
+        np.zeros((1, 3)),
+        np.random.default_rng(0).normal(0, 30, (300, 3)),
+    ):
         for kind in (np.zeros(len(few), bool), np.ones(len(few), bool)):
             assert not found(few, few[:, 2], kind).any()
 
 
 def test_wires_that_do_not_rise_have_no_support():
     xyz, _, height, wire = scene("low voltage along a street")
-    level = np.where(wire, xyz[:, 2] - height + 8.0, xyz[:, 2])  # no sag: nothing tells where they are held
+    level = np.where(
+        wire, xyz[:, 2] - height + 8.0, xyz[:, 2]
+    )  # no sag: nothing tells where they are held
     assert not found(np.column_stack([xyz[:, :2], level]), np.where(wire, 8.0, height), wire).any()
 
 
@@ -106,5 +112,8 @@ def test_the_stage_gives_towers_their_class():
     tower = found(xyz, height, wire)
     assert np.array_equal(after, np.where(tower, 65, np.where(wire, 14, before)))
     assert points.report.figures["towers"] == tower.sum() > 1000
-    assert points.report.figures["left"]["5"] == (after != before).sum() - (tower & (before != 5)).sum()
+    assert (
+        points.report.figures["left"]["5"]
+        == (after != before).sum() - (tower & (before != 5)).sum()
+    )
     assert stage.halo_m() == lines.REACH + towers.REACH and stage.largest_class() == 65

@@ -44,7 +44,11 @@ def test_train_takes_folders_and_says_an_honest_score_first(tmp_path, write_las,
 @pytest.mark.pdal
 def test_training_by_pipeline_prints_its_score(tmp_path, write_las, run_job):
     write_las(tmp_path / "a.laz", scene(1), point_format=1)
-    writer = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "neighborhoods": "k8"}
+    writer = {
+        "type": "writers.classifiermodel",
+        "filename": str(tmp_path / "m.model"),
+        "neighborhoods": "k8",
+    }
     code, _, err = run_job([tmp_path / "a.laz", {**writer, "count": 100, **QUICK}])
     assert code == 0 and "blocks held out" in err
 
@@ -55,9 +59,13 @@ def test_each_file_is_held_out_whole(tmp_path, write_las, monkeypatch):
     seen = []
     split = foresttraining.split
     monkeypatch.setattr(
-        foresttraining, "split", lambda xy, fold, *more: seen.append((xy, fold)) or split(xy, fold, *more)
+        foresttraining,
+        "split",
+        lambda xy, fold, *more: seen.append((xy, fold)) or split(xy, fold, *more),
     )
-    files = [write_las(tmp_path / f"t{n}.laz", scene(n, 70.0 * n), point_format=1) for n in range(7)]
+    files = [
+        write_las(tmp_path / f"t{n}.laz", scene(n, 70.0 * n), point_format=1) for n in range(7)
+    ]
     assert main(words(tmp_path, *files)) == 0
     xy, fold = seen[0]
     file = np.floor_divide(xy[:, 0], 70.0).astype(int)
@@ -84,7 +92,11 @@ def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, run_job):
     points = scene(3)
     points["PointSourceId"] = (points["X"] // 15 + 40).astype("u2")
     cloud = write_las(tmp_path / "a.laz", points, point_format=1)
-    writer = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "neighborhoods": "k8"}
+    writer = {
+        "type": "writers.classifiermodel",
+        "filename": str(tmp_path / "m.model"),
+        "neighborhoods": "k8",
+    }
     writer |= {"count": 100, "groups": "PointSourceId", **QUICK}
     code, _, err = run_job([cloud, writer])
     assert code == 0 and "PointSourceId held out" in err
@@ -115,20 +127,30 @@ def test_surveys_are_held_out_where_there_are_several(tmp_path):
     options = ps.TrainingOptions("k8", **{**QUICK, "dimensions": ()}, count=200)
     model = ps.train(clouds, options, progress=False)
     found = model.info["accuracy"]["cross_validation"]
-    assert (found["by"], found["folds"]) == ("surveys", 3) and str(model).startswith("surveys held out")
+    assert (found["by"], found["folds"]) == ("surveys", 3) and str(model).startswith(
+        "surveys held out"
+    )
     without = ps.train(
-        clouds, ps.TrainingOptions("k8", **{**QUICK, "dimensions": ()}, count=200, folds=0), progress=False
+        clouds,
+        ps.TrainingOptions("k8", **{**QUICK, "dimensions": ()}, count=200, folds=0),
+        progress=False,
     )
     assert without.info["accuracy"]["cross_validation"] is None
     for one, other in zip(model.passes, without.passes, strict=True):  # the score chooses nothing
         assert all(np.array_equal(a, other.arrays()[key]) for key, a in one.arrays().items())
     model.save(tmp_path / "m.model")
-    assert ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]["by"] == "surveys"
+    assert (
+        ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]["by"] == "surveys"
+    )
 
 
 def test_too_little_ground_for_a_score_is_no_error():
     rng = np.random.default_rng(0)
     xyz = rng.uniform(0, 8, (300, 3))
     options = ps.TrainingOptions("k8", **{**QUICK, "dimensions": ()}, count=50)
-    model = ps.train([ps.TrainingCloud(xyz, np.where(xyz[:, 2] > 4, 6, 2))], options, progress=False)
-    assert model.info["accuracy"]["cross_validation"] is None and str(model).startswith("not scored")
+    model = ps.train(
+        [ps.TrainingCloud(xyz, np.where(xyz[:, 2] > 4, 6, 2))], options, progress=False
+    )
+    assert model.info["accuracy"]["cross_validation"] is None and str(model).startswith(
+        "not scored"
+    )

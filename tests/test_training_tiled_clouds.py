@@ -78,7 +78,9 @@ def test_other_options(tmp_path, more):
     random = np.random.default_rng(5)
     number = random.integers(1, 4, len(cloud)).astype(np.uint8)
     returns = {"ReturnNumber": number, "NumberOfReturns": np.maximum(number, 2)}
-    cloud = replace(cloud, dimensions={**cloud.dimensions, **returns}, mask=random.random(6000) < 0.8)
+    cloud = replace(
+        cloud, dimensions={**cloud.dimensions, **returns}, mask=random.random(6000) < 0.8
+    )
     same_forests(cloud, TrainingOptions(**{**QUICK, **more}), 17.0, tmp_path)
 
 
@@ -86,7 +88,9 @@ def test_neighbors_beyond_the_halo_are_counted(tmp_path):
     """At one point on 40 m2 the fifty nearest lie 25 m around."""
     options = TrainingOptions(**{**QUICK, "neighborhoods": "k50", "thin": 0.01})
     model = train(
-        cut(scene(900, 190.0), 21.0, tmp_path / "raw").clouds(reach(options)), options, progress=False
+        cut(scene(900, 190.0), 21.0, tmp_path / "raw").clouds(reach(options)),
+        options,
+        progress=False,
     )
     assert model.info["training"][SHORT] > 0
 
@@ -100,4 +104,6 @@ def test_tiles_hold_each_point_once_and_what_lies_around(tmp_path):
         low, high = np.floor(own[0, :2] / 8.1) * 8.1, np.floor(own[0, :2] / 8.1) * 8.1 + 8.1
         near = ((cloud.xyz[:, :2] >= low - 10) & (cloud.xyz[:, :2] <= high + 10)).all(axis=1)
         assert np.count_nonzero(near) == len(tile)
-        assert len(tile) == len(np.unique(tile.xyz, axis=0)) and len(tile.dimensions["Flight"]) == len(tile)
+        assert len(tile) == len(np.unique(tile.xyz, axis=0)) and len(
+            tile.dimensions["Flight"]
+        ) == len(tile)

@@ -15,7 +15,17 @@ from pdal_stages.tiling.settings import TilingOptions
 
 pytestmark = pytest.mark.pdal
 
-WORDS = ["--count", "150", "--trees", "4", "--neighborhoods", "s2,k9", "--no-progress", "--classes", "2,5,6"]
+WORDS = [
+    "--count",
+    "150",
+    "--trees",
+    "4",
+    "--neighborhoods",
+    "s2,k9",
+    "--no-progress",
+    "--classes",
+    "2,5,6",
+]
 MADE = functools.cache(lambda: ps.make_town(56.0, 4.0, seed=5, progress=False))
 #: LAS 1.2 and 1.4, as they come; not one scale and offset.
 FORMATS = (1, 6, 6, 3)
@@ -32,12 +42,22 @@ def town(tmp_path_factory, write_las):
         mine = (east * 2 + north) == k
         points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")}
         points |= {
-            "Classification": np.where(random.random(mine.sum()) < 0.02, 7, MADE().classification[mine])
+            "Classification": np.where(
+                random.random(mine.sum()) < 0.02, 7, MADE().classification[mine]
+            )
         }
-        points |= {"ReturnNumber": number[mine], "NumberOfReturns": np.full(mine.sum(), 2, np.uint8)}
+        points |= {
+            "ReturnNumber": number[mine],
+            "NumberOfReturns": np.full(mine.sum(), 2, np.uint8),
+        }
         points |= {"PointSourceId": random.integers(1, 4, mine.sum()).astype(np.uint16)}
         points["Classification"] = points["Classification"].astype(np.uint8)
-        write_las(folder / f"t{k}.laz", points, point_format=point_format, offset=(500_000 + k, 5_400_000, k))
+        write_las(
+            folder / f"t{k}.laz",
+            points,
+            point_format=point_format,
+            offset=(500_000 + k, 5_400_000, k),
+        )
     return folder
 
 
@@ -50,7 +70,9 @@ def both(town, tmp_path, run, *more, files=("",)):
         assert code == 0
         model = ps.load_model(tmp_path / f"{name}.model")
         arrays = [array.tolist() for one in model.passes for array in one.arrays().values()]
-        models.append((arrays, model.classes, model.info["classes"], model.info["training"]["clouds"]))
+        models.append(
+            (arrays, model.classes, model.info["classes"], model.info["training"]["clouds"])
+        )
         said.append(told)
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     return models, said
@@ -111,12 +133,16 @@ def test_surveys_that_do_not_see_each_other(town, tmp_path, run):
 def test_one_file_and_feet(tmp_path, run, write_las):
     pyproj = pytest.importorskip("pyproj")
     xyz = (MADE().xyz - (499_000.0, 5_399_000.0, 0.0)) / 0.3048
-    points = {axis: xyz[:, n] for n, axis in enumerate("XYZ")} | {"Classification": MADE().classification}
+    points = {axis: xyz[:, n] for n, axis in enumerate("XYZ")} | {
+        "Classification": MADE().classification
+    }
     wkt = pyproj.CRS("EPSG:2994").to_wkt("WKT1_GDAL")
     write_las(tmp_path / "feet.laz", points, point_format=6, wkt=wkt)
     words = ["train", tmp_path / "feet.laz", *WORDS]
     assert run(*words, "--model", tmp_path / "whole.model")[0] == 0
-    assert run(*words, "--model", tmp_path / "tiles.model", "--tile", "90", "--workers", "0")[0] == 0
+    assert (
+        run(*words, "--model", tmp_path / "tiles.model", "--tile", "90", "--workers", "0")[0] == 0
+    )
     assert (tmp_path / "whole.model").read_bytes() == (tmp_path / "tiles.model").read_bytes()
 
 
@@ -164,7 +190,9 @@ def corrected(tmp_path_factory, write_las):
     near = np.hypot(xyz[:, 0] - 500_025.0, xyz[:, 1] - 5_400_030.0) < 22.0
     for k in range(4):
         mine = (east * 2 + north) == k
-        points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")} | {"Classification": codes[mine]}
+        points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")} | {
+            "Classification": codes[mine]
+        }
         points["Reliability"] = random.choice([0.5, 0.96, 1.0], mine.sum()).astype(np.float32)
         if k < 3:
             points["Checked"] = near[mine].astype(np.uint8)

@@ -9,12 +9,8 @@ from hypothesis import strategies as st
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.units import Units, parse_wkt, units_of_wkt, utm_code
 
-GEOGCS = (
-    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
-)
-METERS = (
-    f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
-)
+GEOGCS = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
+METERS = f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 FOOT = 0.304800609601219
 FEET = METERS.replace('UNIT["metre",1', f'UNIT["US survey foot",{FOOT}')
 BOTH = f'COMPD_CS["both",{METERS},VERT_CS["NAVD88",VERT_DATUM["x",2005],UNIT["foot",0.3048]]]'
@@ -41,7 +37,10 @@ def test_units_of_references():
     for unit in ("1e-300", "1e300", "0.0000001"):
         with pytest.raises(StageError, match="unit of length"):
             units_of_wkt(LOCAL.format(unit))
-        assert units_of_wkt(LOCAL.format(unit), horizontal="foot", vertical="foot").horizontal == 0.3048
+        assert (
+            units_of_wkt(LOCAL.format(unit), horizontal="foot", vertical="foot").horizontal
+            == 0.3048
+        )
 
 
 @pytest.mark.parametrize(

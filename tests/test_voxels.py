@@ -50,7 +50,9 @@ def test_any_order_and_any_tile(seed, side):
     tile = represent(xyz[near], side, [value[near]])
     kept = np.arange(len(near)) if tile is None else tile.rows
     inside = lambda chosen: {r for r in chosen if core[r]}  # noqa: E731
-    assert {tuple(xyz[r]) for r in inside(near[kept])} == {tuple(xyz[r]) for r in inside(whole.rows)}
+    assert {tuple(xyz[r]) for r in inside(near[kept])} == {
+        tuple(xyz[r]) for r in inside(whole.rows)
+    }
 
 
 def test_points_asked_for():
@@ -93,7 +95,9 @@ def test_members_get_the_same(model, how, tmp_path):
             assert np.array_equal(a[stands][both], b[both])
     points, place = few.members(np.arange(len(few.rows)))
     inside = where[points] & where[stands[place]]
-    assert np.array_equal(found.reliability[points][inside], found.reliability[stands[place]][inside])
+    assert np.array_equal(
+        found.reliability[points][inside], found.reliability[stands[place]][inside]
+    )
     assert found.report.figures["representatives"] == len(few.rows)
     assert found.report.figures["classified"] + len(found.unsure) == where.sum()
     model.save(tmp_path / "m.model")
@@ -133,5 +137,7 @@ def test_features_of_dense_clouds(pdal_module):
     points, place = few.members(np.arange(len(few.rows)))
     plain = compute_features(xyz[few.rows], neighborhoods="s1,k10", feature_set="Linearity")
     inside = xyz[points, 0] < 600_006
-    assert np.array_equal(found["Linearity_k10"][points[inside]], plain["Linearity_k10"][place[inside]])
+    assert np.array_equal(
+        found["Linearity_k10"][points[inside]], plain["Linearity_k10"][place[inside]]
+    )
     assert (found["Linearity_k10"][points[~inside]] == 0).all()

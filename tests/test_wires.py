@@ -30,11 +30,17 @@ def edge(kind, density, seed=0):
         z = np.where((x > 33) & (x < 97) & (y > 33) & (y < 47), 24.0, z)
     elif kind == "cornice":
         house = inside & (y > 30) & (y < 50)
-        z = np.where(house, np.where((y < 31.2) | (y > 48.8), 12.0, 13.5 + 1.2 * (10 - np.abs(y - 40))), z)
+        z = np.where(
+            house, np.where((y < 31.2) | (y > 48.8), 12.0, 13.5 + 1.2 * (10 - np.abs(y - 40))), z
+        )
     else:
-        z = np.where(inside & (y > 30) & (y < 50), 20.0, np.where(inside & (y > 28.6) & (y <= 30), 6.0, z))
+        z = np.where(
+            inside & (y > 30) & (y < 50), 20.0, np.where(inside & (y > 28.6) & (y <= 30), 6.0, z)
+        )
         high = rng.uniform(0, 20, int(70 * 2 * density))  # its wall, hit from aside
-        wall = np.column_stack([rng.uniform(30, 100, len(high)), rng.normal(29.95, 0.03, len(high)), high])
+        wall = np.column_stack(
+            [rng.uniform(30, 100, len(high)), rng.normal(29.95, 0.03, len(high)), high]
+        )
         xyz = np.column_stack([x, y, z + rng.normal(0, 0.05, n)])
         return np.round(np.vstack([xyz, wall]), 3)
     return np.round(np.column_stack([x, y, z + rng.normal(0, 0.05, n)]), 3)
@@ -63,7 +69,11 @@ def scene(seed=0, density=8.0, side=150):
         )  # lowest between the towers
         add(
             np.column_stack(
-                [s, 30 + 0.4 * s + 0.3 * k + rng.normal(0, 0.03, len(s)), z + rng.normal(0, 0.03, len(s))]
+                [
+                    s,
+                    30 + 0.4 * s + 0.3 * k + rng.normal(0, 0.03, len(s)),
+                    z + rng.normal(0, 0.03, len(s)),
+                ]
             ),
             14,
         )
@@ -94,7 +104,9 @@ def test_wires_are_found_and_nothing_else():
     assert not found(xyz[left]).any()
 
 
-@pytest.mark.parametrize(("kind", "density"), [("terrace", 1.0), ("cornice", 1.0), ("balcony", 2.0)])
+@pytest.mark.parametrize(
+    ("kind", "density"), [("terrace", 1.0), ("cornice", 1.0), ("balcony", 2.0)]
+)
 def test_what_hides_the_ground_is_no_wire(kind, density):
     xyz = edge(kind, density)
     assert found(xyz).sum() <= 0.001 * len(xyz)

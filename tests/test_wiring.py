@@ -15,7 +15,12 @@ HAG = {"type": "filters.hag_minima"}
 
 
 def writer(name, *inputs, **more):
-    return {"type": "writers.las", "filename": name, **({"inputs": list(inputs)} if inputs else {}), **more}
+    return {
+        "type": "writers.las",
+        "filename": name,
+        **({"inputs": list(inputs)} if inputs else {}),
+        **more,
+    }
 
 
 def filter_(*inputs, **more):

@@ -51,7 +51,13 @@ def stages(inputs, output, model_file, **writer):
         *map(str, inputs),
         {"type": "filters.hag_minima", "cell": CELL},
         {"type": "filters.modelclassifier", "model": str(model_file)},
-        {"type": "writers.las", "filename": str(output), "forward": "all", "extra_dims": "all", **writer},
+        {
+            "type": "writers.las",
+            "filename": str(output),
+            "forward": "all",
+            "extra_dims": "all",
+            **writer,
+        },
     ]
 
 
@@ -62,13 +68,23 @@ def same_points(a: Path, b: Path) -> None:
     for name in one.points.array.dtype.names:
         different = np.count_nonzero(one.points.array[name] != two.points.array[name])
         assert different == 0, f"{name} differs in {different} of {len(one)} points"
-    for name in ("scales", "offsets", "version", "creation_date", "system_identifier", "global_encoding"):
+    for name in (
+        "scales",
+        "offsets",
+        "version",
+        "creation_date",
+        "system_identifier",
+        "global_encoding",
+    ):
         left, right = getattr(one.header, name), getattr(two.header, name)
         if name == "global_encoding":
             left, right = left.value, right.value
         assert np.all(left == right), name
     assert one.header.point_format.id == two.header.point_format.id
-    texts = [[v.record_data_bytes() for v in las.header.vlrs if v.record_id == 2112] for las in (one, two)]
+    texts = [
+        [v.record_data_bytes() for v in las.header.vlrs if v.record_id == 2112]
+        for las in (one, two)
+    ]
     assert texts[0] == texts[1]
 
 

@@ -18,7 +18,9 @@ from pdal_stages.synthetic.townplan import block_at, plan_town
 class House(NamedTuple):
     """A part of a building under one roof."""
 
-    corners: NDArray  # (4, 2): of the roof, overhang and all, in order; meters, the town's coordinates
+    corners: (
+        NDArray  # (4, 2): of the roof, overhang and all, in order; meters, the town's coordinates
+    )
     eave: float  # its height, absolute
     ridge: float
     walls: NDArray  # (4, 2): corners of the walls
@@ -105,10 +107,17 @@ def true_objects(options: TownOptions) -> TrueObjects:
                 corners = placed(site, _corners(*what))
                 if inside(corners):
                     decks.append(corners)
-    return TrueObjects(houses, trees, np.array(cables).reshape(-1, 2, 3), np.array(decks).reshape(-1, 4, 2))
+    return TrueObjects(
+        houses, trees, np.array(cables).reshape(-1, 2, 3), np.array(decks).reshape(-1, 4, 2)
+    )
 
 
-def _corners(a: float, b: float, turn: float, half_l: float, half_w: float) -> list[tuple[float, float]]:
+def _corners(
+    a: float, b: float, turn: float, half_l: float, half_w: float
+) -> list[tuple[float, float]]:
     c, s = math.cos(turn), math.sin(turn)
     around = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-    return [(a + p * half_l * c - q * half_w * s, b + p * half_l * s + q * half_w * c) for p, q in around]
+    return [
+        (a + p * half_l * c - q * half_w * s, b + p * half_l * s + q * half_w * c)
+        for p, q in around
+    ]

@@ -39,7 +39,11 @@ EXPERIMENT = 3  # raised when runs mean something else than before, so that none
 def names_of(tokens: tuple[str, ...], feature_set: str) -> list[str]:
     """Names of an experiment's features; Z belongs to the measures, once."""
     measures = (*GROUPS["covariance"], *GROUPS["geometric"])
-    wanted = {"measures": measures, "distributions": GROUPS["shapes"], "both": (*measures, *GROUPS["shapes"])}
+    wanted = {
+        "measures": measures,
+        "distributions": GROUPS["shapes"],
+        "both": (*measures, *GROUPS["shapes"]),
+    }
     result = [
         f"{word}_{token}"
         for token in tokens
@@ -83,7 +87,13 @@ def report(runs: list[dict[str, Any]]) -> str:
             ("mf1", "Mean F1"),
         ):
             rows = [
-                [hood, *(spread(values(choose(here, neighborhood=hood, set=one), key)) for one in SETS)]
+                [
+                    hood,
+                    *(
+                        spread(values(choose(here, neighborhood=hood, set=one), key))
+                        for one in SETS
+                    ),
+                ]
                 for hood in NEIGHBORHOODS
             ]
             text.append(f"{words} [%]\n\n" + table(("Neighborhood", *SETS), rows))
@@ -104,7 +114,9 @@ def report(runs: list[dict[str, Any]]) -> str:
         chosen = [run["trees"] for run in here]
         text.append(
             "Trees chosen: "
-            + ", ".join(f"{n} in {chosen.count(n)} of {len(chosen)} forests" for n in sorted(set(chosen)))
+            + ", ".join(
+                f"{n} in {chosen.count(n)} of {len(chosen)} forests" for n in sorted(set(chosen))
+            )
             + "\n"
         )
         text.append(_findings(here))
@@ -148,7 +160,9 @@ def _findings(runs: list[dict[str, Any]]) -> str:
     return "The paper's findings, tested\n\n" + table(head, rows)
 
 
-def run_scene(scene: scenes.Scene, results: Results, seeds: int, threads: int | None) -> list[dict[str, Any]]:
+def run_scene(
+    scene: scenes.Scene, results: Results, seeds: int, threads: int | None
+) -> list[dict[str, Any]]:
     runs = []
     for seed in range(seeds):
         for feature_set in SETS:

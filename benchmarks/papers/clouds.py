@@ -49,4 +49,6 @@ def with_height(cloud: Cloud) -> Cloud:
     """The cloud with HeightAboveGround [W18 3.2]."""
     made = hag_minima(*cloud.xyz.T)
     height = made[0] if isinstance(made, tuple) else made
-    return Cloud(cloud.name, cloud.xyz, cloud.labels, {**cloud.dimensions, "HeightAboveGround": height})
+    return Cloud(
+        cloud.name, cloud.xyz, cloud.labels, {**cloud.dimensions, "HeightAboveGround": height}
+    )

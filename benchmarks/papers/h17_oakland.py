@@ -60,7 +60,11 @@ EVERY = {*TOKENS, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY, *HALVES}
 #: its multiple), the others are departures.
 HEIGHTS = ("range", "range/diameter", "range of c1", "above ground", "none")
 #: Mean precision, mean recall, mean F1 as published.
-PUBLISHED = {"v_k": (82.68, 68.41, 68.44), "v_r": (84.76, 69.29, 70.11), "v_c": (87.34, 72.66, 74.43)}
+PUBLISHED = {
+    "v_k": (82.68, 68.41, 68.44),
+    "v_r": (84.76, 69.29, 70.11),
+    "v_c": (87.34, 72.66, 74.43),
+}
 #: Table 1: points of each class, training and test clouds together, and how many of them are scattered.
 PUBLISHED_SHARES = {
     2: (948_267, 10_535), 5: (281_766, 271_703), 6: (115_825, 24_061), 14: (6_455, 2_105), 15: (9_019, 4_261),
@@ -111,7 +115,9 @@ def load(folder: Path, part: str) -> list[Cloud]:
     return [with_height(cloud.only(np.isin(cloud.labels, list(CLASSES)))) for cloud in clouds]
 
 
-def compute(clouds: list[Cloud], cache: Cache, threads: int | None, needed: set[str] = EVERY) -> Part:
+def compute(
+    clouds: list[Cloud], cache: Cache, threads: int | None, needed: set[str] = EVERY
+) -> Part:
     """The tables of Part that some names of neighborhoods need, cloud by cloud."""
     words = (*SIX, "Radius")
     tokens = {"v_k": ["kopt"], "v_r": ["ropt"], "v_c": ["copt"], "regular": ["copt"]}
@@ -124,12 +130,15 @@ def compute(clouds: list[Cloud], cache: Cache, threads: int | None, needed: set[
     parts: dict[str, list[np.ndarray]] = {}
     for cloud in clouds:
         first, second = (
-            features(cloud, plan, cache, copt_threshold=at, threads=threads) for plan, at in plans.values()
+            features(cloud, plan, cache, copt_threshold=at, threads=threads)
+            for plan, at in plans.values()
         )
         names = list(plans[""][0].names)
         members = np.rint(first[:, names.index("Density_s1")] * (4.0 / 3.0 * np.pi))
         curvature = first[:, names.index("SurfaceVariation_s1")]
-        parts.setdefault("curvature", []).append(np.where(members < LEAST_MEMBERS, 1.0 / 3.0, curvature))
+        parts.setdefault("curvature", []).append(
+            np.where(members < LEAST_MEMBERS, 1.0 / 3.0, curvature)
+        )
         for token, name in (("kopt", "kopt"), ("ropt", "ropt"), ("copt", "regular")):
             if token in wanted:
                 columns = [names.index(f"{word}_{token}") for word in words]
@@ -148,7 +157,9 @@ def compute(clouds: list[Cloud], cache: Cache, threads: int | None, needed: set[
         np.concatenate([cloud.labels for cloud in clouds]),
         np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds]),
         joined.pop("curvature"),
-        np.concatenate([cloud.dimensions["HeightAboveGround"] for cloud in clouds]).astype(np.float32),
+        np.concatenate([cloud.dimensions["HeightAboveGround"] for cloud in clouds]).astype(
+            np.float32
+        ),
         joined.pop("column"),
         joined,
     )
@@ -164,7 +175,8 @@ def by_dimensionality(cloud: Cloud, cache: Cache, threads: int | None) -> dict[s
     radii = radii_of(*ROPT_DEFAULT)
     plan = FeaturePlan.parse([f"s{radius:g}" for radius in radii], (*SIX, "Density"))
     columns = {
-        one: [plan.names.index(f"{one}_{n.suffix}") for n in plan.neighborhoods] for one in (*SIX, "Density")
+        one: [plan.names.index(f"{one}_{n.suffix}") for n in plan.neighborhoods]
+        for one in (*SIX, "Density")
     }
     volume = 4.0 / 3.0 * np.pi * radii**3
 
@@ -190,7 +202,8 @@ def by_dimensionality(cloud: Cloud, cache: Cache, threads: int | None) -> dict[s
         return out
 
     both = cache.array(
-        {"what": "dimensionality twice", "cloud": fingerprint(cloud.xyz), "least": LEAST_MEMBERS}, make
+        {"what": "dimensionality twice", "cloud": fingerprint(cloud.xyz), "least": LEAST_MEMBERS},
+        make,
     )
     names = (BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY)
     return {name: np.array(part) for name, part in zip(names, np.hsplit(both, 2), strict=True)}
@@ -225,11 +238,14 @@ def score(
     """Train on samples of the training cloud, classify every test point."""
     rows = samples(train.labels, sampling, seed)
     chosen = matrix(train, train.table(name, threshold), height)[rows]
-    forest = grow_forest(chosen, train.labels[rows], trees=TREES, depth=depth, seed=seed, threads=threads)
+    forest = grow_forest(
+        chosen, train.labels[rows], trees=TREES, depth=depth, seed=seed, threads=threads
+    )
     found = predict(forest, matrix(test, test.table(name, threshold), height), list(CLASSES))
     result = figures(Accuracy.from_labels(test.labels, found, classes=list(CLASSES)))
     clouds = [
-        _matrix(test.labels[test.cloud == k], found[test.cloud == k]) for k in range(test.cloud[-1] + 1)
+        _matrix(test.labels[test.cloud == k], found[test.cloud == k])
+        for k in range(test.cloud[-1] + 1)
     ]
     return {**result, "clouds": clouds, "over_clouds": over_clouds(clouds)}
 
@@ -248,8 +264,12 @@ def samples(labels: np.ndarray, sampling: str, seed: int) -> np.ndarray:
     random = np.random.default_rng(seed)
     sizes = [min(PAPERS_CLOUD[code], int((labels == code).sum())) for code in CLASSES]
     each = zip(CLASSES, sizes, strict=True)
-    cloud = np.concatenate([random.choice(np.flatnonzero(labels == c), n, replace=False) for c, n in each])
-    return cloud if sampling == "whole" else random.choice(cloud, COUNT * len(CLASSES), replace=False)
+    cloud = np.concatenate(
+        [random.choice(np.flatnonzero(labels == c), n, replace=False) for c, n in each]
+    )
+    return (
+        cloud if sampling == "whole" else random.choice(cloud, COUNT * len(CLASSES), replace=False)
+    )
 
 
 def pooled(train: Part, test: Part) -> tuple[np.ndarray, np.ndarray]:
@@ -260,7 +280,9 @@ def pooled(train: Part, test: Part) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def shares(labels: np.ndarray, curvature: np.ndarray, threshold: float) -> dict[str, dict[str, int]]:
+def shares(
+    labels: np.ndarray, curvature: np.ndarray, threshold: float
+) -> dict[str, dict[str, int]]:
     """Points of each class, and how many of them are scattered."""
     scattered = curvature >= threshold
     return {
@@ -358,7 +380,8 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
     ground = found["shares"]["test"]["2"]["points"]
     rows.append(["v_c published", "2", f"{(1 - PUBLISHED_GROUND) * ground:,.0f}", "–"])
     text.append(
-        "Ground points lost\n\n" + table(("", "Depth", "Called something else", "of these wire"), rows)
+        "Ground points lost\n\n"
+        + table(("", "Depth", "Called something else", "of these wire"), rows)
     )
     rows = []
     for threshold in CURVE:
@@ -367,7 +390,15 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
             some = choose(runs, **{**main, "threshold": threshold}, name="v_c", depth=depth)
             row += [spread(values(some, "oa")), spread(values(some, "mf1")), str(len(some))]
         rows.append(row)
-    head: tuple[str, ...] = ("c_t", "OA, depth 2", "Mean F1", "Seeds", "OA, unlimited", "Mean F1 ", "Seeds ")
+    head: tuple[str, ...] = (
+        "c_t",
+        "OA, depth 2",
+        "Mean F1",
+        "Seeds",
+        "OA, unlimited",
+        "Mean F1 ",
+        "Seeds ",
+    )
     text.append("## Over the curvature threshold (Figure 4)\n\n" + table(head, rows))
     rows = []
     for code, name in CLASSES.items():
@@ -383,7 +414,15 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
                 f"{100 * ours['scattered'] / max(ours['points'], 1):.1f} %",
             ]
         )
-    head = ("Class", "Points, published", "Scattered", "Share", "Points, ours", "Scattered ", "Share ")
+    head = (
+        "Class",
+        "Points, published",
+        "Scattered",
+        "Share",
+        "Points, ours",
+        "Scattered ",
+        "Share ",
+    )
     text.append("## Scattered points (Table 1)\n\n" + table(head, rows))
     rows = []
     for height in HEIGHTS:
@@ -391,18 +430,27 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
             some = choose(runs, **{**main, "height": height}, name=name, depth=None)
             if some:
                 rows.append([height, name, str(len(some)), *_scores(some)])
-    text.append("## Departures from the paper\n\n" + table(("Height difference", "", "Seeds", *SCORES), rows))
+    text.append(
+        "## Departures from the paper\n\n"
+        + table(("Height difference", "", "Seeds", *SCORES), rows)
+    )
     rows = []
     for sampling, height in (("balanced", "range"), ("balanced", "above ground"), *OTHERS):
         for name in PUBLISHED:
             kind = None if sampling == "balanced" else sampling
-            some = choose(runs, **{**main, "sampling": kind, "height": height}, name=name, depth=None)
+            some = choose(
+                runs, **{**main, "sampling": kind, "height": height}, name=name, depth=None
+            )
             if some:
-                rows.append([f"{SAMPLINGS[sampling]}, {height}", name, str(len(some)), *_scores(some)])
+                rows.append(
+                    [f"{SAMPLINGS[sampling]}, {height}", name, str(len(some)), *_scores(some)]
+                )
     for half, words in HALVES.items():
         some = choose(runs, **main, name=half, depth=None)
         if some:
-            rows.append([SAMPLINGS["balanced"], f"{words} for all points", str(len(some)), *_scores(some)])
+            rows.append(
+                [SAMPLINGS["balanced"], f"{words} for all points", str(len(some)), *_scores(some)]
+            )
     text.append(table(("Training", "", "Seeds", *SCORES), rows))
     return "\n".join(text)
 
@@ -424,14 +472,18 @@ def thresholds(train: Part, test: Part) -> dict[str, Any]:
 
 def _key(run: Mapping[str, Any]) -> tuple[Any, ...]:
     """What a run is, whatever came of it."""
-    return tuple(run.get(name) for name in ("name", "seed", "depth", "height", "sampling", "threshold"))
+    return tuple(
+        run.get(name) for name in ("name", "seed", "depth", "height", "sampling", "threshold")
+    )
 
 
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("--clouds", type=int, help="only the first so many test clouds")
     options.add_argument("--curve-seeds", type=int, default=3)
-    options.add_argument("--other-seeds", type=int, default=3, help="of other trainings, heights and halves")
+    options.add_argument(
+        "--other-seeds", type=int, default=3, help="of other trainings, heights and halves"
+    )
     options.add_argument(
         "--earlier", type=Path, help="results of an earlier command: only runs it lacks are made"
     )
@@ -440,7 +492,10 @@ def main() -> None:
         options.error("name the folder of the clouds: --data DIR, or PDAL_STAGES_DATA")
     folder = Path(args.data) / "oakland"
     train_clouds, test_clouds = load(folder, "train"), load(folder, "test")[: args.clouds]
-    context = {"data": fingerprint(*(c.xyz for c in (*train_clouds, *test_clouds))), "experiment": EXPERIMENT}
+    context = {
+        "data": fingerprint(*(c.xyz for c in (*train_clouds, *test_clouds))),
+        "experiment": EXPERIMENT,
+    }
     cache, results = opened(args, "h17", context)
     known = json.loads(args.earlier.read_text()) if args.earlier else {"runs": []}
     parts: list[Part] = []
@@ -448,7 +503,8 @@ def main() -> None:
     def computed(names: set[str]) -> list[Part]:
         if not parts:
             parts.extend(
-                compute(clouds, cache, args.threads, names) for clouds in (train_clouds, test_clouds)
+                compute(clouds, cache, args.threads, names)
+                for clouds in (train_clouds, test_clouds)
             )
         return parts
 
@@ -462,17 +518,23 @@ def main() -> None:
     for seed in range(args.seeds):
         for depth in (None, 2, 3)[: 2 if seed else 3]:
             names = (*TOKENS, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY)
-            todo += [{"name": n, "seed": seed, "depth": depth, "height": "range", **both} for n in names]
+            todo += [
+                {"name": n, "seed": seed, "depth": depth, "height": "range", **both} for n in names
+            ]
     more = {"depth": None, **both}
     for seed in range(args.other_seeds):
-        kinds = [one for one in OTHERS if not (seed and one[0] == "whole")]  # all points: seeds differ little
+        kinds = [
+            one for one in OTHERS if not (seed and one[0] == "whole")
+        ]  # all points: seeds differ little
         todo += [
             {"name": n, "seed": seed, "height": height, "sampling": sampling, **more}
             for sampling, height in kinds
             for n in TOKENS
         ]
         todo += [
-            {"name": n, "seed": seed, "height": height, **more} for height in HEIGHTS[1:] for n in TOKENS
+            {"name": n, "seed": seed, "height": height, **more}
+            for height in HEIGHTS[1:]
+            for n in TOKENS
         ]
         todo += [{"name": n, "seed": seed, "height": "range", **more} for n in HALVES]
     for seed in range(args.curve_seeds):
@@ -488,7 +550,9 @@ def main() -> None:
         if _key(run) in earlier:
             runs.append(earlier[_key(run)])
             continue
-        made = results.get(run, lambda run=run: score(*computed(missing), threads=args.threads, **run))
+        made = results.get(
+            run, lambda run=run: score(*computed(missing), threads=args.threads, **run)
+        )
         runs.append({**run, **made})
     runs += [run for key, run in earlier.items() if key not in set(map(_key, todo))]
     finish(args, runs, "[H17] on Oakland", report(runs, found), found=found)

@@ -67,7 +67,8 @@ class Cache:
             return make()
         text = json.dumps({"code": code_fingerprint(), **key}, sort_keys=True)
         path = (
-            self.folder / f"{key.get('what', 'array')}-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npy"
+            self.folder
+            / f"{key.get('what', 'array')}-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npy"
         )
         if not path.exists():
             value = make()
@@ -91,7 +92,11 @@ def features(
 ) -> np.ndarray:
     """Features of a cloud's points (or of those at `queries`), (m, F) float32, from the cache where it has them."""
     rows = np.arange(len(cloud)) if queries is None else queries
-    given = {name: np.asarray(cloud.dimensions[name])[rows] for name in plan.dimensions if name not in "XYZ"}
+    given = {
+        name: np.asarray(cloud.dimensions[name])[rows]
+        for name in plan.dimensions
+        if name not in "XYZ"
+    }
     key = {
         "what": "features",
         "plan": plan.to_dict(),
@@ -111,7 +116,9 @@ def features(
         label = f"features of {cloud.name}"
         with Progress(len(rows), label) as progress:
             table = engine.table(queries, dimensions=given or None, progress=progress)
-        note(f"{label}: {len(rows):,} x {len(plan.names)} in {time.process_time() - start:.1f} CPU s")
+        note(
+            f"{label}: {len(rows):,} x {len(plan.names)} in {time.process_time() - start:.1f} CPU s"
+        )
         return table.values
 
     return cache.array(key, make)
@@ -146,7 +153,9 @@ def draw(labels: np.ndarray, classes: Sequence[int], count: int, seed: int) -> n
         if not len(here):
             sys.exit(f"class {code} has no training points")
         share, rest = divmod(count, len(here))
-        rows.append(np.concatenate([np.tile(here, share), random.choice(here, rest, replace=False)]))
+        rows.append(
+            np.concatenate([np.tile(here, share), random.choice(here, rest, replace=False)])
+        )
     return np.concatenate(rows)
 
 
@@ -181,12 +190,19 @@ def grow_forest(
 
 
 def search_trees(
-    values: np.ndarray, labels: np.ndarray, counts: Sequence[int], *, seed: int, threads: int | None = None
+    values: np.ndarray,
+    labels: np.ndarray,
+    counts: Sequence[int],
+    *,
+    seed: int,
+    threads: int | None = None,
 ):
     """The forest of as many trees as are right about the most out-of-bag samples; of equals the smallest."""
     from sklearn.ensemble import RandomForestClassifier
 
-    forest = RandomForestClassifier(warm_start=True, oob_score=True, random_state=seed, n_jobs=threads or -1)
+    forest = RandomForestClassifier(
+        warm_start=True, oob_score=True, random_state=seed, n_jobs=threads or -1
+    )
     scores = {}
     for count in sorted(counts):
         forest.n_estimators = count
@@ -196,7 +212,9 @@ def search_trees(
     return forest
 
 
-def predict(forest, values: np.ndarray, classes: Sequence[int], low=None, high=None, chunk: int = 65_536):
+def predict(
+    forest, values: np.ndarray, classes: Sequence[int], low=None, high=None, chunk: int = 65_536
+):
     """Class codes of rows, chunk by chunk (they may lie in a file)."""
     ours = Forest.from_sklearn([tree.tree_ for tree in forest.estimators_], values.shape[1])
     codes = np.asarray(forest.classes_)
@@ -244,7 +262,10 @@ class Results:
     """
 
     def __init__(self, path: Path | None, context: Mapping[str, Any]) -> None:
-        self.path, self.context = path, json.loads(json.dumps({"code": code_fingerprint(), **context}))
+        self.path, self.context = (
+            path,
+            json.loads(json.dumps({"code": code_fingerprint(), **context})),
+        )
         self.done: dict[str, dict[str, Any]] = {}
         if path is not None and path.exists():
             for line in path.read_text().splitlines():
@@ -308,19 +329,25 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return made
 
 
-def opened(args: argparse.Namespace, name: str, context: Mapping[str, Any]) -> tuple[Cache, Results]:
+def opened(
+    args: argparse.Namespace, name: str, context: Mapping[str, Any]
+) -> tuple[Cache, Results]:
     """The cache and results of a command."""
     cache = Cache(args.cache)
     return cache, Results(None if args.cache is None else args.cache / f"{name}.jsonl", context)
 
 
-def finish(args: argparse.Namespace, runs: list[dict[str, Any]], title: str, text: str, **more: Any) -> None:
+def finish(
+    args: argparse.Namespace, runs: list[dict[str, Any]], title: str, text: str, **more: Any
+) -> None:
     """Write results and tables where the user wants them; lists of one run stand on one line."""
     command = Path(sys.argv[0]).name
     made = f"Written by `benchmarks/papers/{command}`; figures in per cent, mean ± deviation over seeds."
     text = f"# {title}\n\n{made}\n\n{text}"
     if args.json:
-        lines = ",\n".join(json.dumps({k: v for k, v in run.items() if k not in BULKY}) for run in runs)
+        lines = ",\n".join(
+            json.dumps({k: v for k, v in run.items() if k not in BULKY}) for run in runs
+        )
         head = json.dumps({"machine": machine(), **more})
         args.json.write_text(f'{head[:-1]},\n"runs": [\n{lines}\n]}}\n')
     if args.tables:

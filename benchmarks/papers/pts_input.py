@@ -56,15 +56,23 @@ def read_pts(paths: Iterable[Path], name: str, columns: str = COLUMNS) -> Cloud:
     by_name = dict(zip(words, whole.T, strict=True))
     labels = by_name.pop("Classification")
     if not (np.isfinite(whole).all() and (labels == np.floor(labels)).all() and labels.min() >= 0):
-        raise StageError("labels must be whole numbers of 0 or more, and all values finite", found=name)
+        raise StageError(
+            "labels must be whole numbers of 0 or more, and all values finite", found=name
+        )
     xyz = np.column_stack([by_name.pop(axis) for axis in "XYZ"])
-    return Cloud(name, xyz, labels.astype(np.int64), {k: np.ascontiguousarray(v) for k, v in by_name.items()})
+    return Cloud(
+        name, xyz, labels.astype(np.int64), {k: np.ascontiguousarray(v) for k, v in by_name.items()}
+    )
 
 
 def write_pts(path: Path, cloud: Cloud) -> None:
     """A cloud in this format; columns it lacks are 1."""
     ones = np.ones(len(cloud))
-    given = {**cloud.dimensions, **dict(zip("XYZ", cloud.xyz.T, strict=True)), "Classification": cloud.labels}
+    given = {
+        **cloud.dimensions,
+        **dict(zip("XYZ", cloud.xyz.T, strict=True)),
+        "Classification": cloud.labels,
+    }
     words = COLUMNS.split()
     form = ["%.3f" if word in "XYZ" else "%d" for word in words]
     np.savetxt(path, np.column_stack([given.get(word, ones) for word in words]), fmt=form)

@@ -56,7 +56,11 @@ class Trainer:
         self.names = names_of(scene)
 
     def run(
-        self, count: int, seed: int, target: tuple[int, ...] | None = None, chosen: list[str] | None = None
+        self,
+        count: int,
+        seed: int,
+        target: tuple[int, ...] | None = None,
+        chosen: list[str] | None = None,
     ) -> dict[str, Any]:
         """Train on `count` samples per class; `target`: these labels as one class against all others."""
         scene, names = self.scene, chosen or self.names
@@ -108,7 +112,9 @@ def report(runs: list[dict[str, Any]]) -> str:
         here = choose(runs, scene=name)
         text.append(f"## {name}\n")
         rows = []
-        for what in dict.fromkeys((run["kind"], run["count"]) for run in here if run["target"] is None):
+        for what in dict.fromkeys(
+            (run["kind"], run["count"]) for run in here if run["target"] is None
+        ):
             some = choose(here, kind=what[0], count=what[1], target=None)
             cells = [spread(values(some, key)) for key in ("oa", "kappa", "mcr", "mcp", "mf1")]
             rows.append([what[0], f"{what[1]:,}", str(some[0]["features"]), str(len(some)), *cells])
@@ -117,10 +123,16 @@ def report(runs: list[dict[str, Any]]) -> str:
         text.append(table(head, rows))
         codes = list(choose(here, kind="all", target=None)[0]["f1"])
         rows = []
-        for what in dict.fromkeys((run["kind"], run["count"]) for run in here if run["target"] is None):
+        for what in dict.fromkeys(
+            (run["kind"], run["count"]) for run in here if run["target"] is None
+        ):
             some = choose(here, kind=what[0], count=what[1], target=None)
-            rows.append([f"{what[0]}, {what[1]:,}", *(spread(values(some, "f1", code)) for code in codes)])
-        text.append("F1 by class\n\n" + table(("", *(class_name(int(code)) for code in codes)), rows))
+            rows.append(
+                [f"{what[0]}, {what[1]:,}", *(spread(values(some, "f1", code)) for code in codes)]
+            )
+        text.append(
+            "F1 by class\n\n" + table(("", *(class_name(int(code)) for code in codes)), rows)
+        )
         text.append(_binary(here))
         text.append(_carriers(here))
     return "\n".join(text)
@@ -128,7 +140,9 @@ def report(runs: list[dict[str, Any]]) -> str:
 
 def _binary(runs: list[dict[str, Any]]) -> str:
     rows = []
-    for target, count in dict.fromkeys((r["target"], r["count"]) for r in runs if r["target"] is not None):
+    for target, count in dict.fromkeys(
+        (r["target"], r["count"]) for r in runs if r["target"] is not None
+    ):
         ours = choose(runs, target=target, count=count)
         multi = choose(runs, target=None, kind="all", count=count)
         codes = [int(code) for code in target.split("+")]
@@ -136,9 +150,15 @@ def _binary(runs: list[dict[str, Any]]) -> str:
         for words, some in (("binary", ours), ("multi-class", multi)):
             if words == "multi-class" and len(codes) > 1:
                 continue  # the multi-class runs have no such class
-            cells = [spread(values(some, key, str(codes[0]))) for key in ("recall", "precision", "f1")]
+            cells = [
+                spread(values(some, key, str(codes[0]))) for key in ("recall", "precision", "f1")
+            ]
             rows.append([f"{label}, {words}", f"{count:,}", str(len(some)), *cells])
-    return table(("Target", "Samples per class", "Seeds", "Recall", "Precision", "F1"), rows) if rows else ""
+    return (
+        table(("Target", "Samples per class", "Seeds", "Recall", "Precision", "F1"), rows)
+        if rows
+        else ""
+    )
 
 
 def _carriers(runs: list[dict[str, Any]]) -> str:
@@ -154,11 +174,14 @@ def _carriers(runs: list[dict[str, Any]]) -> str:
                 share[part(name)] += 100 * value / len(full)
             places.update(part(name) for name in best_tenth(dict(run)))
         rows = [
-            [name, f"{value:.1f} %", f"{places[name] / len(full):.1f}"] for name, value in share.most_common()
+            [name, f"{value:.1f} %", f"{places[name] / len(full):.1f}"]
+            for name, value in share.most_common()
         ]
         text.append(table((label, "Share of importance", "Features in the best tenth"), rows))
     first = list(full[0]["importance"].items())[:15]
-    text.append(table(("Feature (seed 0)", "Importance"), [[n, f"{100 * v:.2f} %"] for n, v in first]))
+    text.append(
+        table(("Feature (seed 0)", "Importance"), [[n, f"{100 * v:.2f} %"] for n, v in first])
+    )
     return "\n".join(text)
 
 
@@ -174,13 +197,17 @@ def run_scene(
 
     few = args.count[0]
     for seed in range(args.seeds):
-        full = get(lambda s=seed: trainer.run(few, s), kind="all", count=few, target=None, seed=seed)
+        full = get(
+            lambda s=seed: trainer.run(few, s), kind="all", count=few, target=None, seed=seed
+        )
         best = best_tenth(full)
         get(
             lambda s=seed, b=best: trainer.run(few, s, chosen=b),
             kind="best tenth", count=few, target=None, seed=seed,
         )  # fmt: skip
-        chance = sorted(np.random.default_rng(seed).choice(trainer.names, len(best), replace=False).tolist())
+        chance = sorted(
+            np.random.default_rng(seed).choice(trainer.names, len(best), replace=False).tolist()
+        )
         get(
             lambda s=seed, c=chance: trainer.run(few, s, chosen=c),
             kind="a tenth by chance", count=few, target=None, seed=seed,
@@ -189,7 +216,11 @@ def run_scene(
         for seed in range(args.seeds if count == few else args.large_seeds):
             if count != few:
                 get(
-                    lambda s=seed, n=count: trainer.run(n, s), kind="all", count=count, target=None, seed=seed
+                    lambda s=seed, n=count: trainer.run(n, s),
+                    kind="all",
+                    count=count,
+                    target=None,
+                    seed=seed,
                 )
             for target in targets:
                 get(
@@ -206,7 +237,10 @@ def main() -> None:
     options.add_argument("--large-seeds", type=int, default=1, help="for all counts but the first")
     options.add_argument("--trees", type=int, default=100)
     options.add_argument(
-        "--target", nargs="+", type=labels, help="classes found by themselves; 5+6: two labels as one class"
+        "--target",
+        nargs="+",
+        type=labels,
+        help="classes found by themselves; 5+6: two labels as one class",
     )
     args = options.parse_args()
     if args.data is None:

@@ -43,10 +43,16 @@ def run(data: Path, survey: str, model: Path, sure: float, folder: Path) -> dict
             matrix += _confusion(survey, file, target)
         right, scored = int(matrix.diagonal().sum()), int(matrix.sum())
         f1 = {
-            code: 200 * int(matrix[code, code]) / max(int(matrix[code].sum() + matrix[:, code].sum()), 1)
+            code: 200
+            * int(matrix[code, code])
+            / max(int(matrix[code].sum() + matrix[:, code].sum()), 1)
             for code in CODES
         }
-        found[name] = {"oa": 100 * right / scored, "f1": f1, "seconds": round(time.process_time() - began, 1)}
+        found[name] = {
+            "oa": 100 * right / scored,
+            "f1": f1,
+            "seconds": round(time.process_time() - began, 1),
+        }
         found["points"] = scored
     return found
 
@@ -55,7 +61,11 @@ def _confusion(survey: str, file: str, target: str) -> np.ndarray:
     known, given, made = SURVEYS[survey], laspy.read(file), laspy.read(target)
     codes = np.asarray(given.classification)
     truth = true_classes(
-        known, np.asarray(given.x), np.asarray(given.y), codes, np.asarray(made["HeightAboveGround"])
+        known,
+        np.asarray(given.x),
+        np.asarray(given.y),
+        codes,
+        np.asarray(made["HeightAboveGround"]),
     )
     truth[np.isin(codes, known.dropped)] = 0
     matrix = np.zeros((256, 256), np.int64)
@@ -77,7 +87,9 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"| {row['survey']} | {row['points']:,} | {one['oa']:.2f} | {two['oa']:.2f} | {two['oa'] - one['oa']:+.2f} | "
             f"{' | '.join(pairs)} | {row['adapting']:.0f} |"
         )
-    before, after = (float(np.mean([row[key]["oa"] for row in rows])) for key in ("before", "after"))
+    before, after = (
+        float(np.mean([row[key]["oa"] for row in rows])) for key in ("before", "after")
+    )
     lines.append(f"| **mean** | | {before:.2f} | {after:.2f} | {after - before:+.2f} | | | |")
     return "\n".join(lines)
 
@@ -96,7 +108,13 @@ def main() -> None:
     for survey in given.surveys:
         with TemporaryDirectory() as folder:
             rows.append(
-                run(given.data, survey, given.models / f"{slug(survey)}.model", given.sure, Path(folder))
+                run(
+                    given.data,
+                    survey,
+                    given.models / f"{slug(survey)}.model",
+                    given.sure,
+                    Path(folder),
+                )
             )
             print(json.dumps(rows[-1]), flush=True)
     print(table(rows))

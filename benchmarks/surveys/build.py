@@ -16,7 +16,9 @@ from surveys import SHIPPED, SURVEYS
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--out", type=Path, required=True, help="the model file")
     options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
@@ -28,7 +30,9 @@ def main() -> None:
     print(model)
     digest = hashlib.sha256(args.out.read_bytes()).hexdigest()
     size = args.out.stat().st_size / 1e6
-    print(f"{args.out}: {size:.2f} MB, sha256 {digest[:16]}, {time.process_time() - started:.0f} CPU s")
+    print(
+        f"{args.out}: {size:.2f} MB, sha256 {digest[:16]}, {time.process_time() - started:.0f} CPU s"
+    )
 
 
 if __name__ == "__main__":

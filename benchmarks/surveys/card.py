@@ -49,7 +49,10 @@ def by_class(runs: list[dict[str, Any]]) -> str:
                 surveys.append(str(len(shares)))
                 total = np.sum(shares, axis=0) if shares else np.zeros((len(NAMES), len(NAMES)))
                 right = total[number, number]
-                cells += [_percent(right, total[:, number].sum()), _percent(right, total[number].sum())]
+                cells += [
+                    _percent(right, total[:, number].sum()),
+                    _percent(right, total[number].sum()),
+                ]
             lines.append(f"| {landscape} ({', '.join(surveys)}) | {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines[:-1])
@@ -81,7 +84,9 @@ def means(runs: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--model", type=Path, required=True)
     options.add_argument("--scores", type=Path, required=True)
     options.add_argument("--rules", type=Path, required=True)

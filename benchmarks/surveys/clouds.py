@@ -105,14 +105,19 @@ class Cloud:
         return float(np.median(number[number > 1]) / 16.0)
 
 
-def published(data: Path, known: LabeledSurvey) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def published(
+    data: Path, known: LabeledSurvey
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """All of a survey's points: (n, 3) coordinates, (n,) the survey's own codes, and the return numbers."""
     parts = [laspy.read(data / name) for name in known.files]
     xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
     codes = np.concatenate([np.asarray(p[known.dimension]) for p in parts]).astype(np.uint8)
     dimensions = {
         name: np.concatenate([np.asarray(p[word]) for p in parts]).astype(np.uint8)
-        for name, word in (("ReturnNumber", "return_number"), ("NumberOfReturns", "number_of_returns"))
+        for name, word in (
+            ("ReturnNumber", "return_number"),
+            ("NumberOfReturns", "number_of_returns"),
+        )
     }
     # Hamburg has a point that is hundreds of kilometers away.
     near = (np.abs(xyz - np.median(xyz, axis=0)) < FAR).all(axis=1)
@@ -174,7 +179,9 @@ def one_return(cloud: Cloud, last: bool) -> Cloud:
     return without_returns(cloud.part(np.flatnonzero(kept), name))
 
 
-def on_slopes(cloud: Cloud, slope: float, seed: int, terraces: bool = False, most: int = 250_000) -> Cloud:
+def on_slopes(
+    cloud: Cloud, slope: float, seed: int, terraces: bool = False, most: int = 250_000
+) -> Cloud:
     """A copy that stands on synthetic terrain: a tilted plane and waves, up to about that slope (rise over run);
     with `terraces`, most of it in steps of 1.5 to 3 m.
 

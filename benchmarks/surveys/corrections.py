@@ -63,7 +63,9 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
     run("classify", raw, before, "--model", model, "--no-progress")
     start = laspy.read(before)
     x, y = np.asarray(start.x), np.asarray(start.y)
-    truth = true_classes(survey, x, y, np.asarray(las.classification), np.asarray(start["HeightAboveGround"]))
+    truth = true_classes(
+        survey, x, y, np.asarray(las.classification), np.asarray(start["HeightAboveGround"])
+    )
     touched = np.zeros(len(x), bool)
     given = [np.asarray(start.classification).copy()]
     done: list[Any] = []
@@ -72,7 +74,9 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
         found = review_files([str(before)])
         shapes = review_layers(found)["patches"].shapes
         seen = shapely.union_all(done)
-        fresh = [k for k, shape in enumerate(shapes) if shape.difference(seen).area > 0.5 * shape.area]
+        fresh = [
+            k for k, shape in enumerate(shapes) if shape.difference(seen).area > 0.5 * shape.area
+        ]
         chosen = fresh[:PATCHES]
         done += [shapes[k] for k in chosen]
         told.append([found.patches.reason[k] for k in chosen])
@@ -83,10 +87,28 @@ def rounds(data: Path, name: str, model: Path, folder: Path) -> dict[str, Any]:
         write_area(area, [shapes[k] for k in chosen], reference_of_file(str(before)).wkt)
         checked = folder / f"checked{number}.laz"
         run(
-            "corrections", checked_file, folder / "after.laz", "--area", area, "--around", 0, "--out", checked
+            "corrections",
+            checked_file,
+            folder / "after.laz",
+            "--area",
+            area,
+            "--around",
+            0,
+            "--out",
+            checked,
         )
         made = folder / f"round{number}.model"
-        run("train", checked, "--base", model, "--classes", "2,5,6", "--model", made, "--no-progress")
+        run(
+            "train",
+            checked,
+            "--base",
+            model,
+            "--classes",
+            "2,5,6",
+            "--model",
+            made,
+            "--no-progress",
+        )
         before, checked_file = folder / f"classified{number}.laz", checked
         run("classify", raw, before, "--model", made, "--no-progress")
         given.append(np.asarray(laspy.read(before).classification).copy())
@@ -115,12 +137,16 @@ def table(rows: list[dict[str, Any]]) -> str:
     ]
     for row in rows:
         scores = " | ".join(f"{value:.2f} %" for value in row["accuracy"])
-        lines.append(f"| {row['survey']} | {100 * row['touched']:.1f} % | {row['scored']:,} | {scores} |")
+        lines.append(
+            f"| {row['survey']} | {100 * row['touched']:.1f} % | {row['scored']:,} | {scores} |"
+        )
     return "\n".join(lines)
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument(
         "--models", type=Path, required=True, help="folder that leave_one_out.py --save filled"

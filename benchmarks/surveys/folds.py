@@ -48,7 +48,9 @@ def features_of(cloud: TrainingCloud) -> npt.NDArray[np.float32]:
 class LeaveOneOut:
     """The copies of all surveys, and models of so many trees a pass without one fold of these."""
 
-    def __init__(self, data: Path, surveys: Iterable[str], folder: Path, trees: int = TREES) -> None:
+    def __init__(
+        self, data: Path, surveys: Iterable[str], folder: Path, trees: int = TREES
+    ) -> None:
         self.trees = trees
         names = sorted(surveys)
         self.folds = sorted({SURVEYS[name].fold for name in names})
@@ -70,7 +72,9 @@ class LeaveOneOut:
         self._pair = cache(self._grown_without)
         self.without_fold = cache(self._without_fold)
 
-    def _grow(self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int) -> Forest:
+    def _grow(
+        self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int
+    ) -> Forest:
         names = ("seed", "min_samples_leaf", "max_samples", "max_features")
         setting = {name: getattr(OPTIONS, name) for name in names}
         weight = self.samples.weight * kept
@@ -144,7 +148,9 @@ class LeaveOneOut:
 
     def _training(self, without: int) -> dict[str, Any]:
         """What a model file says of its training."""
-        used = [cloud for cloud, fold in zip(self.clouds, self.fold_of, strict=True) if fold != without]
+        used = [
+            cloud for cloud, fold in zip(self.clouds, self.fold_of, strict=True) if fold != without
+        ]
         clouds = [{"name": cloud.name, "points": len(cloud.xyz)} for cloud in used]
         samples = int(np.count_nonzero(self.fold != without))
         return {"clouds": clouds, "count": OPTIONS.count, "seed": OPTIONS.seed, "samples": samples}

@@ -43,7 +43,9 @@ def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str,
     known = cloud.truth > 0
     codes = sorted(set(cloud.truth[known].tolist()) | {2, 5, 6})
     result = Accuracy.from_labels(cloud.truth[known], found[known], classes=codes)
-    matrix = [[int(np.count_nonzero((cloud.truth == a) & (found == b))) for b in NAMES] for a in NAMES]
+    matrix = [
+        [int(np.count_nonzero((cloud.truth == a) & (found == b))) for b in NAMES] for a in NAMES
+    ]
     wrong = {
         f"{NAMES[a]} as {NAMES[b]}": matrix[i][j]
         for i, a in enumerate(NAMES)
@@ -58,7 +60,11 @@ def score(model: Model, cloud: Cloud, pictures: Path | None = None) -> dict[str,
         "points": int(known.sum()),
         "density": round(cloud.density, 2),
         "oa": 100 * float(np.mean(found[known] == cloud.truth[known])),
-        "f1": {NAMES[c]: 100 * f for c, f in result.f1.items() if f is not None and (cloud.truth == c).any()},
+        "f1": {
+            NAMES[c]: 100 * f
+            for c, f in result.f1.items()
+            if f is not None and (cloud.truth == c).any()
+        },
         "ground_as_building": 100 * wrong["ground as building"] / int(known.sum()),
         "contradicted": int(np.count_nonzero(gone)),
         "worst": worst,
@@ -92,7 +98,9 @@ def tables(runs: list[dict[str, Any]], samples: list[dict[str, Any]]) -> str:
         "|---|---:|---:|---:|---:|---:|---:|---|",
     ]
     for run in runs:
-        f1 = " | ".join(f"{run['f1'][name]:.1f}" if name in run["f1"] else "-" for name in NAMES.values())
+        f1 = " | ".join(
+            f"{run['f1'][name]:.1f}" if name in run["f1"] else "-" for name in NAMES.values()
+        )
         lines.append(
             f"| {run['cloud']} | {run['density']} | {run['oa']:.1f} | {f1} | {run['ground_as_building']:.2f} % | "
             f"{run['worst']} ({run['share']:.1f} %) |"
@@ -112,7 +120,9 @@ def tables(runs: list[dict[str, Any]], samples: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))

@@ -76,13 +76,17 @@ class Place:
     def shown(self) -> np.ndarray:
         """(n,) points that the picture shows from above."""
         corner = self.of.cloud.xyz[self.row, :2] - SIDE / 2
-        return ((self.of.cloud.xyz[:, :2] >= corner) & (self.of.cloud.xyz[:, :2] < corner + SIDE)).all(axis=1)
+        return (
+            (self.of.cloud.xyz[:, :2] >= corner) & (self.of.cloud.xyz[:, :2] < corner + SIDE)
+        ).all(axis=1)
 
     @property
     def told(self) -> dict[str, str | int]:
         """For JSON."""
         x, y, _ = self.of.cloud.xyz[self.row]
-        truth, given = (NAMES[int(codes[self.row])] for codes in (self.of.cloud.truth, self.of.given))
+        truth, given = (
+            NAMES[int(codes[self.row])] for codes in (self.of.cloud.truth, self.of.given)
+        )
         at = {"survey": self.of.cloud.survey, "x": round(x), "y": round(y), "points": self.points}
         return {**at, "truth": truth, "given": given}
 
@@ -112,7 +116,9 @@ def draw(surveys: list[Classified], random: np.random.Generator) -> list[Place]:
     rows = np.concatenate([of.wrong for of in surveys])
     survey = np.repeat(np.arange(len(surveys)), [len(of.wrong) for of in surveys])
     within = np.concatenate([patches(of) for of in surveys])
-    _, patch, size = np.unique(np.stack([survey, within]), axis=1, return_inverse=True, return_counts=True)
+    _, patch, size = np.unique(
+        np.stack([survey, within]), axis=1, return_inverse=True, return_counts=True
+    )
     patch, out = patch.ravel(), []
     for one in random.choice(len(size), len(size), replace=False, p=size / size.sum()):
         at = random.choice(np.flatnonzero(patch == one))
@@ -138,7 +144,9 @@ def from_above(place: Place, codes: np.ndarray) -> Image.Image:
     pen = ImageDraw.Draw(out)
     for panel in range(2):
         first = panel * (drawn.width - wide)
-        out.paste(drawn.crop((first, 0, first + wide, drawn.height)), (panel * (WIDTH + GAP) + left, top))
+        out.paste(
+            drawn.crop((first, 0, first + wide, drawn.height)), (panel * (WIDTH + GAP) + left, top)
+        )
         x0, middle = panel * (WIDTH + GAP), WIDTH // 2
         pen.line((x0, middle, x0 + 10, middle), INK)
         pen.line((x0 + WIDTH - 10, middle, x0 + WIDTH, middle), INK)
@@ -177,7 +185,8 @@ def picture(number: int, place: Place) -> Image.Image:
     pen.text((0, 0), f"{number}  {told['survey']}: {told['truth']} called {told['given']}", INK)
     out.paste(from_above(place, place.of.given), (0, LINE))
     out.paste(
-        from_above(place, truth).crop((WIDTH + GAP, 0, 2 * WIDTH + GAP, WIDTH)), (2 * (WIDTH + GAP), LINE)
+        from_above(place, truth).crop((WIDTH + GAP, 0, 2 * WIDTH + GAP, WIDTH)),
+        (2 * (WIDTH + GAP), LINE),
     )
     for words, panel, left in (("the model", given, 0), ("the truth", true, half + GAP)):
         out.paste(panel, (left, 2 * LINE + WIDTH))
@@ -217,7 +226,9 @@ def with_words(places: list[Place], file: Path) -> list[dict[str, str | int]]:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--model", type=Path, required=True, help="the shipped model")
     options.add_argument("--models", type=Path, help="folder of models that miss a survey each")
@@ -229,7 +240,9 @@ def main() -> None:
         check(args.data, list(SURVEYS[name].files))
         cloud = load(args.data, name)
         surveys.append(Classified(cloud, model.predict(cloud.xyz, cloud.dimensions).classification))
-        print(f"{name}: {len(surveys[-1].wrong):,} of {len(cloud.xyz):,} points are wrong", flush=True)
+        print(
+            f"{name}: {len(surveys[-1].wrong):,} of {len(cloud.xyz):,} points are wrong", flush=True
+        )
     places = draw(surveys, np.random.default_rng(SEED))
     args.picture.write_bytes(png(sheet(places)))
     args.json.write_text(json.dumps(with_words(places, args.json), indent=1) + "\n")

@@ -18,7 +18,13 @@ from pdal_stages.stages.preparation import PREPARATION
 #: Points per square meter of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)
 #: (slope, points per square meter, whether in terraces) of copies on synthetic terrain.
-SLOPES = ((0.3, 8.0, False), (0.6, 3.0, False), (0.9, 1.0, False), (0.5, 0.3, False), (0.5, 1.0, True))
+SLOPES = (
+    (0.3, 8.0, False),
+    (0.6, 3.0, False),
+    (0.9, 1.0, False),
+    (0.5, 0.3, False),
+    (0.5, 1.0, True),
+)
 #: Points per square meter, at most, of copies that have one return of each pulse, the first or the last.
 ONE_RETURN = (12.0, 3.0)
 #: Height in meters below which a label of something standing is not believed.
@@ -31,7 +37,13 @@ OPTIONS = TrainingOptions(
     neighborhoods="s5,k10,k20,k50",
     feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest,"
     "NormalAgreement_k20,SurfaceVariationMin_k20",
-    dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_17", "returns"),
+    dimensions=(
+        "HeightAboveGround",
+        "Ground",
+        "HeightAboveOpening_5",
+        "HeightAboveOpening_17",
+        "returns",
+    ),
     classes={"2": 2, "5": 5, "6": 6},
     count=80_000,
     trees=24,
@@ -73,7 +85,9 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
     cloud = cloud.taken(strip(cloud.xyz, MOST, number * GOLDEN % 1.0))
     order = np.argsort(hash_of(cloud.xyz.T, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
-    whole = TrainingCloud(cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, survey=cloud.survey)
+    whole = TrainingCloud(
+        cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, survey=cloud.survey
+    )
     usable = np.where(contradicted(cloud), 0, cloud.labels)
     for code in (2, 5, 6):
         mask[order[usable[order] == code][: SURVEYS[cloud.survey].samples]] = True

@@ -77,12 +77,16 @@ def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.
     assert cli.main(["classify", *inputs, target, "--model", str(model), "--no-progress"]) == 0
     found = [laspy.read(folder / "classified" / Path(one).name) for one in inputs]
     label = np.concatenate(codes)
-    height = np.concatenate([np.asarray(las["HeightAboveGround"]) for las in found]).astype(np.float32)
+    height = np.concatenate([np.asarray(las["HeightAboveGround"]) for las in found]).astype(
+        np.float32
+    )
     xyz = np.concatenate([np.column_stack([las.x, las.y, las.z]) for las in found]).astype(float)
     out = {
         "xyz": xyz,
         "codes": np.concatenate([np.asarray(las.classification) for las in found]).astype(np.uint8),
-        "reliability": np.concatenate([np.asarray(las["Reliability"]) for las in found]).astype(np.float32),
+        "reliability": np.concatenate([np.asarray(las["Reliability"]) for las in found]).astype(
+            np.float32
+        ),
         "height": height,
         "label": label,
     }
@@ -92,7 +96,9 @@ def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.
 
 def sureness(surveys: Sequence[Classified]) -> Sureness:
     """How often the models were right where they were how sure, where the labels say what vegetation is."""
-    told = [one for one in surveys if not SURVEYS[one.name].tall and SURVEYS[one.name].tells(VEGETATION)]
+    told = [
+        one for one in surveys if not SURVEYS[one.name].tall and SURVEYS[one.name].tells(VEGETATION)
+    ]
     out = Sureness(
         about=f"{len(told)} surveys ({', '.join(one.name for one in told)}), each classified by a model that had not seen it"
     )
@@ -101,7 +107,12 @@ def sureness(surveys: Sequence[Classified]) -> Sureness:
     weight = points**-0.25 * points.sum() / (points**0.75).sum()
     for one, of_point in zip(told, weight, strict=True):
         known = (one.truth > 0) & np.isin(one.codes, (2, 5, 6))
-        out.add(one.codes[known], one.truth[known], one.reliability[known], np.full(known.sum(), of_point))
+        out.add(
+            one.codes[known],
+            one.truth[known],
+            one.reliability[known],
+            np.full(known.sum(), of_point),
+        )
     return out
 
 
@@ -137,20 +148,29 @@ def _first(cells: ReviewCells, true: np.ndarray) -> float:
     patches = find_patches(cells)
     if not len(patches):
         return 0.0
-    area, held = np.cumsum(patches.area), np.cumsum(np.bincount(patches.of_cell, true, len(patches)))
+    area, held = (
+        np.cumsum(patches.area),
+        np.cumsum(np.bincount(patches.of_cell, true, len(patches))),
+    )
     at = np.interp(FIRST * area[-1], np.append(0.0, area), np.append(0.0, held))
     return float(at / max(held[-1], 1))
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument(
         "--models", type=Path, required=True, help="folder of the models that miss a survey each"
     )
-    options.add_argument("--trees", type=int, default=TREES, help="of a forest of a model that is made")
+    options.add_argument(
+        "--trees", type=int, default=TREES, help="of a forest of a model that is made"
+    )
     options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
-    options.add_argument("--ship", action="store_true", help="write the counts beside the shipped model")
+    options.add_argument(
+        "--ship", action="store_true", help="write the counts beside the shipped model"
+    )
     args = options.parse_args()
     make_models(args.data, args.models, args.surveys, args.trees)
     surveys = []
@@ -158,9 +178,14 @@ def main() -> None:
         "| survey | points judged | wrong | expected | in the first 10 % | at best |\n|---|---:|---:|---:|---:|---:|"
     )
     for name in args.surveys:
-        surveys.append(classified(args.data, name, args.models / f"{slug(name)}.model", args.models))
+        surveys.append(
+            classified(args.data, name, args.models / f"{slug(name)}.model", args.models)
+        )
         points, wrong, expected, found, best = judged(surveys[-1])
-        print(f"| {name} | {points:,} | {wrong:,} | {expected:,.0f} | {found:.0%} | {best:.0%} |", flush=True)
+        print(
+            f"| {name} | {points:,} | {wrong:,} | {expected:,.0f} | {found:.0%} | {best:.0%} |",
+            flush=True,
+        )
     if args.ship:
         target = Path(pdal_stages.__file__).parent / "models" / "standard.sureness.json"
         target.write_text(json.dumps(sureness(surveys).to_dict(), separators=(",", ":")) + "\n")

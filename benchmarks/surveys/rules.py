@@ -85,7 +85,9 @@ def _share(n: int, points: int) -> str:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument(
         "--models", type=Path, required=True, help="folder of the models, each without one survey"

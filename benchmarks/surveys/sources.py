@@ -9,7 +9,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 SOURCES = {
-    row["file"]: row for row in csv.DictReader(Path(__file__).with_suffix(".csv").read_text().splitlines())
+    row["file"]: row
+    for row in csv.DictReader(Path(__file__).with_suffix(".csv").read_text().splitlines())
 }
 
 
@@ -18,7 +19,9 @@ def check(data: Path, files: Iterable[str]) -> None:
     wrong = []
     for name in files:
         path, source = data / name, SOURCES[name]
-        origin = f"github.com/{source['repository']}, commit {source['commit'][:10]}, {source['path']}"
+        origin = (
+            f"github.com/{source['repository']}, commit {source['commit'][:10]}, {source['path']}"
+        )
         if not path.exists():
             wrong.append(f"{path} is missing: it is {origin}")
         elif (found := hashlib.sha256(path.read_bytes()).hexdigest()) != source["sha256"]:
@@ -26,4 +29,6 @@ def check(data: Path, files: Iterable[str]) -> None:
                 f"{path} is another file, sha256 {found[:10]}, not {source['sha256'][:10]}: take {origin}"
             )
     if wrong:
-        raise SystemExit("\n".join([*wrong, f"{len(wrong)} files to be put right; nothing was trained"]))
+        raise SystemExit(
+            "\n".join([*wrong, f"{len(wrong)} files to be put right; nothing was trained"])
+        )

@@ -110,7 +110,12 @@ SURVEYS = {
         returns=False,
     ),
     "hamlet": LabeledSurvey(
-        ("rural/lidarhd_57ppm2.laz",), CLASSES, "French hamlet on a slope", _LIDARHD, FARMLAND, fold=3
+        ("rural/lidarhd_57ppm2.laz",),
+        CLASSES,
+        "French hamlet on a slope",
+        _LIDARHD,
+        FARMLAND,
+        fold=3,
     ),
     "farm": LabeledSurvey(
         ("rural/lidarhd_11ppm2.laz",),
@@ -346,7 +351,11 @@ SURVEYS = {
         samples=FEW,
     ),
     "alps": LabeledSurvey(
-        ("ca/alberta_sample2_test.laz", "ca/alberta_sample3_train.laz", "ca/alberta_sample4_test.laz"),
+        (
+            "ca/alberta_sample2_test.laz",
+            "ca/alberta_sample3_train.laz",
+            "ca/alberta_sample4_test.laz",
+        ),
         {2: VEGETATION},
         "Canadian mountain slopes, scree and stunted trees, labeled by hand",
         _ARTEMIS,

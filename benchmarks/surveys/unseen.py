@@ -26,7 +26,9 @@ def not_trained_on(model: Model) -> list[str]:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--model", type=Path, required=True, help="the model file")
     options.add_argument("--json", type=Path, required=True, help="where the figures go")

@@ -6,7 +6,9 @@ from _common import save, top_view, town
 import pdal_stages as ps
 
 points = town()
-table = ps.compute_features(points.xyz, neighborhoods="s2", feature_set="Linearity,Planarity,Verticality")
+table = ps.compute_features(
+    points.xyz, neighborhoods="s2", feature_set="Linearity,Planarity,Verticality"
+)
 views = [
     top_view(points.x, points.y, points.z, values=table[f"{name}_s2"], width=560)
     for name in ("Linearity", "Planarity", "Verticality")

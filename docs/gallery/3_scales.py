@@ -9,7 +9,12 @@ points = town()
 table = ps.compute_features(points.xyz, neighborhoods="c1,c2,c5", feature_set="SurfaceVariation")
 views = [
     top_view(
-        points.x, points.y, points.z, values=table[f"SurfaceVariation_{token}"], limits=(0, 0.2), width=560
+        points.x,
+        points.y,
+        points.z,
+        values=table[f"SurfaceVariation_{token}"],
+        limits=(0, 0.2),
+        width=560,
     )
     for token in ("c1", "c2", "c5")
 ]

@@ -23,7 +23,9 @@ options = ps.TrainingOptions(
     count=2000,
     trees=50,
 )
-model = ps.train([ps.TrainingCloud(xyz, points.classification[west], dimensions)], options, progress=False)
+model = ps.train(
+    [ps.TrainingCloud(xyz, points.classification[west], dimensions)], options, progress=False
+)
 xyz, dimensions = cloud(east)
 found = model.predict(xyz, dimensions, margin=True)
 truth = points.classification[east].copy()

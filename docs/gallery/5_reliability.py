@@ -11,7 +11,11 @@ height = np.zeros(len(points.x))
 for half in (west, east):
     height[half] = ps.hag_minima(*points.xyz[half].T)
 options = ps.TrainingOptions(
-    neighborhoods="c1,c3,s2", feature_set="covariance,geometric", classes="2,5,6", count=1500, trees=50
+    neighborhoods="c1,c3,s2",
+    feature_set="covariance,geometric",
+    classes="2,5,6",
+    count=1500,
+    trees=50,
 )
 training = ps.TrainingCloud(
     points.xyz[west], points.classification[west], {"HeightAboveGround": height[west]}
@@ -26,4 +30,7 @@ for low, high in ((0.0, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 1.01)):
     print(
         f"reliability {low:.2f} to {min(high, 1):.2f}: {inside.sum():7,} points, {100 * wrong[inside].mean():5.1f} % wrong"
     )
-save("5_reliability", top_view(*points.xyz[east].T, values=found.reliability, limits=(0.4, 1.0), width=900))
+save(
+    "5_reliability",
+    top_view(*points.xyz[east].T, values=found.reliability, limits=(0.4, 1.0), width=900),
+)

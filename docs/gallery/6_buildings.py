@@ -20,7 +20,9 @@ options = ps.TrainingOptions(
     trees=50,
 )
 model = ps.train(
-    [ps.TrainingCloud(learned.xyz, learned.classification, with_height(learned))], options, progress=False
+    [ps.TrainingCloud(learned.xyz, learned.classification, with_height(learned))],
+    options,
+    progress=False,
 )
 found = model.predict(other.xyz, with_height(other)).classification == 6
 true = other.classification == 6

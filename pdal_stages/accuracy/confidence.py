@@ -32,7 +32,9 @@ class Grading:
         return cls(np.zeros(BINS, np.int64), np.zeros(BINS, np.int64), np.zeros(BINS))
 
     @classmethod
-    def from_values(cls, values: npt.ArrayLike, right: npt.ArrayLike, name: str = "reliability") -> Grading:
+    def from_values(
+        cls, values: npt.ArrayLike, right: npt.ArrayLike, name: str = "reliability"
+    ) -> Grading:
         """Grade (n,) confidences by whether the class is right, (n,) bool.
 
         StageError, which calls them `name`, where one is not a number between 0 and 1.
@@ -126,4 +128,8 @@ class Grading:
         out: dict[str, Any] = {"mean": self.mean, "separation": self.separation()}
         if kind == "deciles":
             return {**out, "deciles": self.deciles()}
-        return {**out, "expected_calibration_error": self.expected_calibration_error(), "curve": self.curve()}
+        return {
+            **out,
+            "expected_calibration_error": self.expected_calibration_error(),
+            "curve": self.curve(),
+        }

@@ -78,16 +78,22 @@ class ReviewCells:
         wrong = 1.0 - np.clip(np.nan_to_num(np.asarray(reliability, np.float64)[judged]), 0.0, 1.0)
         one = np.eye(len(GROUPS), dtype=np.int64)[group[judged]]
         place = np.stack([np.full(len(row), file, np.int64), row, column], axis=1)
-        return cls.join([cls(side, place, one, one * np.rint(wrong * _PARTS).astype(np.int64)[:, None])])
+        return cls.join(
+            [cls(side, place, one, one * np.rint(wrong * _PARTS).astype(np.int64)[:, None])]
+        )
 
     @classmethod
     def join(cls, several: Sequence[ReviewCells]) -> ReviewCells:
         """Cells of several parts as one."""
-        place, at = np.unique(np.concatenate([c.place for c in several]), axis=0, return_inverse=True)
+        place, at = np.unique(
+            np.concatenate([c.place for c in several]), axis=0, return_inverse=True
+        )
         added = []
         for name in ("points", "parts"):
             added.append(np.zeros((len(place), len(GROUPS)), np.int64))
-            np.add.at(added[-1], at.reshape(-1), np.concatenate([getattr(c, name) for c in several]))
+            np.add.at(
+                added[-1], at.reshape(-1), np.concatenate([getattr(c, name) for c in several])
+            )
         return cls(several[0].side, place, *added)
 
 
@@ -101,7 +107,9 @@ class Patches:
     area: NDArray[np.float64]  #: square meters of its cells
     points: NDArray[np.int64]
     file: NDArray[np.int64]
-    at: NDArray[np.float64]  #: (n, 2) x and y of the middle of the cell with most errors expected, meters
+    at: NDArray[
+        np.float64
+    ]  #: (n, 2) x and y of the middle of the cell with most errors expected, meters
     #: of which class most of the expected errors are, and how sure the model is of its points
     reason: list[str]
 
@@ -115,7 +123,9 @@ def find_patches(cells: ReviewCells) -> Patches:
     The hot cells of a block are seen at a glance, so they are one patch, and the rest another.
     """
     total = cells.errors.sum(axis=1)
-    hot = (total > 0) & (total >= np.quantile(total, 1.0 - HOT)) if len(total) else np.zeros(0, bool)
+    hot = (
+        (total > 0) & (total >= np.quantile(total, 1.0 - HOT)) if len(total) else np.zeros(0, bool)
+    )
     file, row, column = cells.place.T
     across = max(1, round(BLOCK / cells.side))
     block = np.stack([file, row // across, column // across, hot], axis=1)

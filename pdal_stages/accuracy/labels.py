@@ -27,7 +27,9 @@ def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
     if a.ndim != 1:
         raise StageError(f"the {what} must be one label per point", found=f"shape {a.shape}")
     if a.size and a.dtype.kind not in "iuf":
-        raise StageError(f"the {what} is not a list of class codes", found=f"values of type {a.dtype}")
+        raise StageError(
+            f"the {what} is not a list of class codes", found=f"values of type {a.dtype}"
+        )
     bad = (a < 0) | (a > MAX_LABEL) if a.size else np.zeros(0, bool)
     if a.dtype.kind == "f":
         bad |= a != np.floor(a)
@@ -65,7 +67,9 @@ def code_list(codes: Iterable[Any], option: str) -> list[int]:
 
 def class_names(codes: Iterable[int], given: Mapping[Any, str] | None) -> dict[int, str]:
     """The names of codes: those given, whose keys may be text, then ASPRS's own."""
-    own = dict(zip(code_list(given, "names"), map(str, given.values()), strict=True)) if given else {}
+    own = (
+        dict(zip(code_list(given, "names"), map(str, given.values()), strict=True)) if given else {}
+    )
     return {code: own.get(code) or class_name(code) for code in sorted(set(codes))}
 
 
@@ -87,7 +91,9 @@ class Merge:
         for key, value in (mapping or {}).items():
             if not isinstance(value, list | tuple | set | np.ndarray):
                 raise StageError(
-                    "'merge' maps a class to a list of classes", found=repr(value), cure="As in {5: [3, 4]}"
+                    "'merge' maps a class to a list of classes",
+                    found=repr(value),
+                    cure="As in {5: [3, 4]}",
                 )
             (target,), sources = code_list([key], "merge"), code_list(value, "merge")
             for source in sources:

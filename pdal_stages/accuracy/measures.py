@@ -27,7 +27,16 @@ import numpy.typing as npt
 from ..base.errors import StageError
 from ..base.las import UNINFORMATIVE, class_name
 from .confidence import Grading
-from .labels import CHUNK, Merge, as_codes, class_names, code_list, pair_counts, regroup, same_length
+from .labels import (
+    CHUNK,
+    Merge,
+    as_codes,
+    class_names,
+    code_list,
+    pair_counts,
+    regroup,
+    same_length,
+)
 from .text import table
 
 FORMAT = "pdal-stages accuracy"
@@ -60,7 +69,9 @@ class Accuracy:
     classes: tuple[int, ...]  #: codes of the matrix's rows: the classes of the reference, ascending
     #: of the columns after those: classes that were predicted but are not in the reference
     extra: tuple[int, ...]
-    matrix: npt.NDArray[np.int64]  #: (K, K + E) points; rows are the reference, columns the prediction
+    matrix: npt.NDArray[
+        np.int64
+    ]  #: (K, K + E) points; rows are the reference, columns the prediction
     names: Mapping[int, str] = field(default_factory=dict)
     #: reference points that were not compared, by their reference class before any merge
     left_out: Mapping[int, int] = field(default_factory=dict)
@@ -129,13 +140,20 @@ class Accuracy:
         if not allow_empty and not kept.any():
             listed = ", ".join(f"{code}: {n:,}" for code, n in list(points.items())[:12])
             raise StageError(
-                "no point to compare: every reference point is left out" if left else "no point to compare",
-                found=f"reference classes {listed}{', ...' * (len(points) > 12)}" if points else "0 points",
+                "no point to compare: every reference point is left out"
+                if left
+                else "no point to compare",
+                found=f"reference classes {listed}{', ...' * (len(points) > 12)}"
+                if points
+                else "0 points",
                 cure="Name classes the reference has, or ignore fewer" if left else None,
             )
         counts = counts[kept]
         given_to = counts.any(axis=0)
-        of_rows, of_columns = merged.target_of[found[kept]], merged.target_of[found_predicted[given_to]]
+        of_rows, of_columns = (
+            merged.target_of[found[kept]],
+            merged.target_of[found_predicted[given_to]],
+        )
         columns, matrix = regroup(rows, (counts[:, given_to], of_rows, of_columns))
 
         compared = np.isin(np.arange(len(merged.target_of)), found[kept])
@@ -200,7 +218,9 @@ class Accuracy:
         graded: dict[str, Grading | None] = {}
         for key in ("reliability", "margin"):
             parts = [
-                getattr(one, key) for one in (self, other) if one.points or getattr(one, key) is not None
+                getattr(one, key)
+                for one in (self, other)
+                if one.points or getattr(one, key) is not None
             ]
             graded[key] = None if None in parts or not parts else sum(parts[1:], parts[0])
         return Accuracy(
@@ -345,7 +365,10 @@ class Accuracy:
                 "by_class": {str(c): n for c, n in self.left_out.items()},
             },
             "merged": {str(c): t for c, t in sorted(self.merged.items())},
-            "predicted_outside_reference": {"points": self.extra_points, "classes": described(self.extra)},
+            "predicted_outside_reference": {
+                "points": self.extra_points,
+                "classes": described(self.extra),
+            },
             "overall_accuracy": self.overall_accuracy,
             "kappa": self.kappa,
             "mean_class_recall": self.mean_class_recall,

@@ -22,10 +22,18 @@ def summary(accuracy: Any) -> dict[str, Any]:
 def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
     """A line for each file, the worst first."""
     rows = [(name, summary(one)) for name, one in zip(names, each, strict=True)]
-    rows.sort(key=lambda row: (row[1]["overall_accuracy"] is None, row[1]["overall_accuracy"] or 0.0, row[0]))
+    rows.sort(
+        key=lambda row: (
+            row[1]["overall_accuracy"] is None,
+            row[1]["overall_accuracy"] or 0.0,
+            row[0],
+        )
+    )
     header = ["", "File", "Points", "Accuracy %", "Kappa %", "Mean F1 %"]
     shares = ("overall_accuracy", "kappa", "mean_f1")
-    lines = [["", name, f"{d['points']:,}", *(percent(d[key]) for key in shares)] for name, d in rows]
+    lines = [
+        ["", name, f"{d['points']:,}", *(percent(d[key]) for key in shares)] for name, d in rows
+    ]
     return _aligned(header, lines) + "\n"
 
 
@@ -48,14 +56,18 @@ def _headline(d: Mapping[str, Any], name: Callable[[int], str]) -> str:
         lines.append(f"{label:<22}{percent(d[key]):>14}{' %' if d[key] is not None else ''}")
     left, outside = d["left_out"], d["predicted_outside_reference"]
     if left["points"]:
-        which = ", ".join(f"{code} {name(int(code))}: {n:,}" for code, n in left["by_class"].items())
+        which = ", ".join(
+            f"{code} {name(int(code))}: {n:,}" for code, n in left["by_class"].items()
+        )
         lines.append(f"{'Left out':<22}{left['points']:>14,}   (reference class {which})")
     if d["merged"]:
         pairs = ", ".join(f"{code} as {target}" for code, target in d["merged"].items())
         lines.append(f"{'Merged':<22}{pairs:>14}")
     if outside["classes"]:
         which = ", ".join(f"{c['code']} {c['name']}" for c in outside["classes"])
-        lines.append(f"{'Outside the classes':<22}{outside['points']:>14,}   (counted as errors: {which})")
+        lines.append(
+            f"{'Outside the classes':<22}{outside['points']:>14,}   (counted as errors: {which})"
+        )
     return "\n".join(lines)
 
 
@@ -71,25 +83,36 @@ def _classes(d: Mapping[str, Any]) -> str:
 
 def _confusion(d: Mapping[str, Any]) -> str:
     known = len(d["rows"])
-    header = ["", "Reference", *(f"{c['code']}{'*' * (i >= known)}" for i, c in enumerate(d["columns"]))]
+    header = [
+        "",
+        "Reference",
+        *(f"{c['code']}{'*' * (i >= known)}" for i, c in enumerate(d["columns"])),
+    ]
     rows = [
         [str(c["code"]), c["name"], *map(percent, values)]
         for c, values in zip(d["rows"], d["by_reference"], strict=True)
     ]
     text = "Confusion: rows reference, columns prediction, % of the reference class; the diagonal is recall\n"
-    return text + _aligned(header, rows) + "\n* not a class of the reference" * (len(d["columns"]) > known)
+    return (
+        text
+        + _aligned(header, rows)
+        + "\n* not a class of the reference" * (len(d["columns"]) > known)
+    )
 
 
 def _confidence(d: Mapping[str, Any]) -> list[str]:
     lines = []
     if d["reliability"]:
-        mean, error = (percent(d["reliability"][key]) for key in ("mean", "expected_calibration_error"))
+        mean, error = (
+            percent(d["reliability"][key]) for key in ("mean", "expected_calibration_error")
+        )
         lines.append(f"Reliability: mean {mean} %, expected calibration error {error} %")
     if d["margin"]:
         groups = d["margin"]["deciles"]
         total = sum(g["points"] for g in groups)
         (least, wrong), (most, wrong_of_most) = (
-            (percent(g["points"] / total, 0), percent(g["share_wrong"])) for g in (groups[0], groups[-1])
+            (percent(g["points"] / total, 0), percent(g["share_wrong"]))
+            for g in (groups[0], groups[-1])
         )
         lines.append(
             f"Margin: of the {least} % least certain points {wrong} % are wrong, of the {most} % most certain "
@@ -104,7 +127,8 @@ def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = []
     for row in [header, *rows]:
         cells = [
-            c.ljust(w) if i == 1 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))
+            c.ljust(w) if i == 1 else c.rjust(w)
+            for i, (c, w) in enumerate(zip(row, widths, strict=True))
         ]
         lines.append((" ".join(cells[:2]) + "  " + "  ".join(cells[2:])).rstrip())
     lines.insert(1, "-" * max(map(len, lines)))

@@ -13,7 +13,14 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError, StageError
 from ..base.resources import map_blocks, resolve_threads
-from ..classifier.algorithms import ArrayRule, Column, InputPlan, PredictRequest, gather, with_returns
+from ..classifier.algorithms import (
+    ArrayRule,
+    Column,
+    InputPlan,
+    PredictRequest,
+    gather,
+    with_returns,
+)
 from .circles import Circles, halo_m
 from .configuration import Configuration, parse_configuration
 from .geometry import Pyramid, build, scramble
@@ -54,19 +61,36 @@ class AlsNet:
         """Made from what a model file says of a pass, everything checked."""
         names, parameters = entry["feature_names"], entry["parameters"]
         n_features, n_classes = len(names), len(codes)
-        wanted, entries = {"configuration", "spacing", "inputs", "weights"}, parameters.get("inputs")
+        wanted, entries = (
+            {"configuration", "spacing", "inputs", "weights"},
+            parameters.get("inputs"),
+        )
         listed = isinstance(entries, list) and all(isinstance(one, Mapping) for one in entries)
         if set(parameters) != wanted or not listed:
-            raise ModelError("the network's parameters are not right", found=sorted(map(str, parameters))[:6])
+            raise ModelError(
+                "the network's parameters are not right", found=sorted(map(str, parameters))[:6]
+            )
         configuration = parse_configuration(parameters["configuration"])
         spacing = checks.number("the network's spacing", parameters["spacing"], 1e-3, 1e6)
-        if [one.get("name") for one in entries] != names or names != entry["dimensions"] or entry["context"]:
-            raise ModelError("the network's inputs are not the model's dimensions", found=repr(names)[:80])
-        mean = tuple(checks.number("an input's mean", one.get("mean"), -1e12, 1e12) for one in entries)
-        scale = tuple(checks.number("an input's scale", one.get("scale"), 1e-12, 1e12) for one in entries)
+        if (
+            [one.get("name") for one in entries] != names
+            or names != entry["dimensions"]
+            or entry["context"]
+        ):
+            raise ModelError(
+                "the network's inputs are not the model's dimensions", found=repr(names)[:80]
+            )
+        mean = tuple(
+            checks.number("an input's mean", one.get("mean"), -1e12, 1e12) for one in entries
+        )
+        scale = tuple(
+            checks.number("an input's scale", one.get("scale"), 1e-12, 1e12) for one in entries
+        )
         needed = configuration.memory_mb(n_features)
         if needed > MOST_MB:
-            raise ModelError("a batch of the network would need too much memory", found=f"{needed:,.0f} MB")
+            raise ModelError(
+                "a batch of the network would need too much memory", found=f"{needed:,.0f} MB"
+            )
         check(arrays, configuration, n_features, n_classes)
         return cls(dict(arrays), configuration, tuple(names), mean, scale, spacing, n_classes)
 
@@ -168,7 +192,9 @@ class AlsNet:
                 if progress is not None:
                     progress.update(new)
         if not count.all():
-            raise StageError("a point is in no batch; this is a bug", found=int(np.count_nonzero(count == 0)))
+            raise StageError(
+                "a point is in no batch; this is a bug", found=int(np.count_nonzero(count == 0))
+            )
         counted = {
             "batches": len(numbers),
             "batches_per_point": {"mean": round(float(count.mean()), 2), "least": int(count.min())},

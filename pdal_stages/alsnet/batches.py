@@ -13,7 +13,9 @@ from ..classifier.sampling import Folds
 from .circles import REACH, Circles
 
 
-def side_by_side(clouds: Sequence[npt.NDArray[np.float64]], spacing: float) -> npt.NDArray[np.float64]:
+def side_by_side(
+    clouds: Sequence[npt.NDArray[np.float64]], spacing: float
+) -> npt.NDArray[np.float64]:
     """All clouds as one, moved along x by whole spacings until no batch can hold points of two."""
     out: list[npt.NDArray[np.float64]] = []
     right = None
@@ -35,7 +37,9 @@ def spread(histogram: npt.NDArray[Any]) -> float:
     return float(np.std(histogram / total) * 100.0) if total else float("inf")
 
 
-def choose(circles: Circles, labels: npt.NDArray[Any], n_classes: int, threshold: float) -> list[int]:
+def choose(
+    circles: Circles, labels: npt.NDArray[Any], n_classes: int, threshold: float
+) -> list[int]:
     """Batches whose classes are mixed; see ``NetworkOptions.histogram_threshold``.
 
     Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels (n,) are class
@@ -70,7 +74,9 @@ def covering(circles: Circles, wanted: npt.NDArray[np.bool_]) -> list[int]:
     """Circles that hold every wanted point at least once, those with most of them first."""
     left, out = wanted.copy(), []
     numbers = circles.needed(np.flatnonzero(wanted)).tolist()
-    for number in sorted(numbers, key=lambda number: -np.count_nonzero(wanted[circles.members(number)])):
+    for number in sorted(
+        numbers, key=lambda number: -np.count_nonzero(wanted[circles.members(number)])
+    ):
         members = circles.members(number)
         if left[members].any():
             left[members] = False
@@ -97,7 +103,9 @@ def augmented(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
     """A batch turned about z, shaken and thinned: from coordinates (n, 3) around its center to (m, 3), and the rows kept."""
     share = 1.0 - random.uniform(0.0, THIN)
-    kept = np.sort(random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))])
+    kept = np.sort(
+        random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))]
+    )
     angle = random.uniform(0.0, 2.0 * math.pi)
     c, s = math.cos(angle), math.sin(angle)
     out = xyz[kept] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

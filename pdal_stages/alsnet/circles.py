@@ -122,7 +122,9 @@ class Circles:
     def _place(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
         """Centers and sizes."""
         found: list[tuple[float, float, int]] = []
-        waiting = [(0, *part) for part in _parts(np.arange(len(self._xy)), self._xy, self.spacing)][::-1]
+        waiting = [(0, *part) for part in _parts(np.arange(len(self._xy)), self._xy, self.spacing)][
+            ::-1
+        ]
         while waiting:
             level, cell, at = waiting.pop()
             side = self.spacing / 2.0**level

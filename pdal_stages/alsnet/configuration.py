@@ -31,10 +31,16 @@ class Level(Settings):
     """One level of set abstraction and the feature propagation back from it."""
 
     centers: int = setting(MISSING, "integer", "Points kept by farthest point sampling", 1, 10**7)
-    radius: float = setting(MISSING, "number", "Radius of the ball around each center, meters", 1e-3, 1e4)
+    radius: float = setting(
+        MISSING, "number", "Radius of the ball around each center, meters", 1e-3, 1e4
+    )
     samples: int = setting(MISSING, "integer", "Points taken from a ball", 1, 1024)
-    mlp: tuple[int, ...] = setting(MISSING, "numbers", "Layer widths before max pooling", check=_widths)
-    up: tuple[int, ...] = setting(MISSING, "numbers", "Layer widths after interpolation", check=_widths)
+    mlp: tuple[int, ...] = setting(
+        MISSING, "numbers", "Layer widths before max pooling", check=_widths
+    )
+    up: tuple[int, ...] = setting(
+        MISSING, "numbers", "Layer widths after interpolation", check=_widths
+    )
 
 
 @dataclass(frozen=True)
@@ -42,10 +48,14 @@ class Configuration(Settings):
     """A whole network, but for the number of inputs and classes."""
 
     name: str
-    points: int = setting(MISSING, "integer", "Points of a batch: the nearest around a grid point", 16, 10**7)
+    points: int = setting(
+        MISSING, "integer", "Points of a batch: the nearest around a grid point", 16, 10**7
+    )
     levels: tuple[Level, ...] = ()
     head: tuple[int, ...] = setting((128,), "numbers", "Layer widths before dropout", check=_widths)
-    dropout: float = setting(0.5, "number", "Share of the head's outputs left out in training", 0.0, 0.95)
+    dropout: float = setting(
+        0.5, "number", "Share of the head's outputs left out in training", 0.0, 0.95
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,7 +99,8 @@ class Configuration(Settings):
     def memory_mb(self, inputs: int) -> float:
         """Megabytes one batch takes at most where the network is applied, counted from the sizes of its arrays."""
         most = max(
-            rows * (before + 2 * after + 3 * below) for _, rows, before, after, below in self._linear(inputs)
+            rows * (before + 2 * after + 3 * below)
+            for _, rows, before, after, below in self._linear(inputs)
         )
         centers, balls = self.points, 0.0
         for level in self.levels:
@@ -123,7 +134,9 @@ def parse_configuration(
     elif isinstance(given, Mapping):
         made = _from_mapping(given)
     else:
-        raise OptionError("a network configuration must be a name or a mapping", found=repr(given)[:60])
+        raise OptionError(
+            "a network configuration must be a name or a mapping", found=repr(given)[:60]
+        )
     return made if points is None else replace(made, points=points)
 
 
@@ -197,29 +210,49 @@ class NetworkOptions(Settings):
 
     configuration: Any = "small"  #: the name of one of :data:`CONFIGURATIONS`, or one of your own
     points: int | None = None  #: of a batch, instead of the configuration's
-    spacing: float | None = setting(None, "number", "Spacing of batches, m; default: four a point", 0.01, 1e5)
-    coordinates: str = setting("Z", "string", "Coordinates used as inputs", choices=("", "Z", "XYZ"))
-    epochs: int = setting(60, "integer", "Maximum number of epochs; each sees every chosen batch", 1, 100_000)
+    spacing: float | None = setting(
+        None, "number", "Spacing of batches, m; default: four a point", 0.01, 1e5
+    )
+    coordinates: str = setting(
+        "Z", "string", "Coordinates used as inputs", choices=("", "Z", "XYZ")
+    )
+    epochs: int = setting(
+        60, "integer", "Maximum number of epochs; each sees every chosen batch", 1, 100_000
+    )
     batches_per_step: int = setting(2, "integer", "Batches per optimizer step", 1, 1024)
-    learning_rate: float = setting(0.002, "number", "Initial learning rate; falls to 1 % of it", 1e-8, 10.0)
+    learning_rate: float = setting(
+        0.002, "number", "Initial learning rate; falls to 1 % of it", 1e-8, 10.0
+    )
     #: 1 (none) [WM19], 1 / sqrt(share) or 1 / share (balanced)
     class_weights: str = setting(
         "sqrt", "string", "Class weights in the loss", choices=("none", "sqrt", "balanced")
     )
     #: batches above it are nearly all of one class and not trained on [WM19: 20 %]; 100: all are
-    histogram_threshold: float = setting(20.0, "number", "Maximum spread of class shares, %", 0.0, 100.0)
-    augment: bool = setting(True, "boolean", "Rotate, shift, jitter and thin each batch, anew in each epoch")
-    validation: float = setting(0.2, "number", "Share of ground held out to choose the epoch", 0.0, 0.5)
+    histogram_threshold: float = setting(
+        20.0, "number", "Maximum spread of class shares, %", 0.0, 100.0
+    )
+    augment: bool = setting(
+        True, "boolean", "Rotate, shift, jitter and thin each batch, anew in each epoch"
+    )
+    validation: float = setting(
+        0.2, "number", "Share of ground held out to choose the epoch", 0.0, 0.5
+    )
     block_size: float = setting(25.0, "number", "Side of the blocks held out, meters", 0.1, 1e6)
-    patience: int = setting(20, "integer", "Maximum epochs without a better mean F1; 0: no limit", 0, 100_000)
-    checkpoint: str | None = setting(None, "filename", "Written each epoch; resumed from", check=_file)
+    patience: int = setting(
+        20, "integer", "Maximum epochs without a better mean F1; 0: no limit", 0, 100_000
+    )
+    checkpoint: str | None = setting(
+        None, "filename", "Written each epoch; resumed from", check=_file
+    )
     #: classes it shares keep their weights, others start afresh
     start_from: str | None = setting(None, "filename", "Model file to start from", check=_file)
     device: str = setting("auto", "string", "Device to train on", choices=("auto", "cpu", "cuda"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "configuration", parse_configuration(self.configuration, self.points))
+        object.__setattr__(
+            self, "configuration", parse_configuration(self.configuration, self.points)
+        )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> NetworkOptions:

@@ -20,7 +20,9 @@ from .configuration import Configuration
 BUCKET = 64
 
 
-def farthest_points(xyz: npt.NDArray[np.float64], count: int, start: int = 0) -> npt.NDArray[np.int64]:
+def farthest_points(
+    xyz: npt.NDArray[np.float64], count: int, start: int = 0
+) -> npt.NDArray[np.int64]:
     """Farthest point sampling, exact: each of `count` points is the one farthest from those chosen before, from `start` on.
 
     Indices come in the order they were chosen, each once (points that coincide included). Points are kept in buckets, in
@@ -31,7 +33,9 @@ def farthest_points(xyz: npt.NDArray[np.float64], count: int, start: int = 0) ->
     if not 0 < count <= n or not 0 <= start < n:
         raise ValueError(f"{count} of {n} points from {start}")
     order = cKDTree(xyz, leafsize=8).indices
-    return _farthest(np.ascontiguousarray(xyz[order]), order, count, int(np.flatnonzero(order == start)[0]))
+    return _farthest(
+        np.ascontiguousarray(xyz[order]), order, count, int(np.flatnonzero(order == start)[0])
+    )
 
 
 @njit
@@ -121,7 +125,9 @@ class Step:
     groups: npt.NDArray[np.int32]  #: (m, samples) points of each ball, as rows of the finer level
     #: (m, samples, 3) their coordinates from the ball's center, divided by the radius
     offsets: npt.NDArray[np.float32]
-    near: npt.NDArray[np.int32]  #: (n, 3) for each point of the finer level, three rows of the coarser one
+    near: npt.NDArray[
+        np.int32
+    ]  #: (n, 3) for each point of the finer level, three rows of the coarser one
     weights: npt.NDArray[np.float32]  #: (n, 3) of those; they sum to 1
 
 

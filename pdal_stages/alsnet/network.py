@@ -63,13 +63,17 @@ class Network(nn.Module):
         with torch.no_grad():
             for name, parts in self._parts():
                 array = torch.from_numpy(np.array(weights[name], dtype=np.float32))
-                for part, values in zip(parts, array.split([p.shape[1] for p in parts], dim=1), strict=True):
+                for part, values in zip(
+                    parts, array.split([p.shape[1] for p in parts], dim=1), strict=True
+                ):
                     part.copy_(values)
         return self
 
     def dump(self) -> Weights:
         """The weights as arrays, in the order of ``Configuration.shapes``."""
-        return {name: torch.cat(parts, dim=1).detach().cpu().numpy() for name, parts in self._parts()}
+        return {
+            name: torch.cat(parts, dim=1).detach().cpu().numpy() for name, parts in self._parts()
+        }
 
 
 def tensors(pyramid: Pyramid, device: str = "cpu") -> Pyramid:

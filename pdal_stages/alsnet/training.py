@@ -56,7 +56,8 @@ def inputs(options: TrainingOptions) -> tuple[str, ...]:
     names = tuple(dict.fromkeys([*options.alsnet.coordinates, *options.dimensions]))
     if not names:
         raise OptionError(
-            "a network needs at least one input", cure="Name a dimension, or set 'coordinates' to Z or XYZ"
+            "a network needs at least one input",
+            cure="Name a dimension, or set 'coordinates' to Z or XYZ",
         )
     return names
 
@@ -69,7 +70,9 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     known, position, before = session.labeled, session.position, torch.get_num_threads()
     try:
         torch.set_num_threads(session.threads)
-        with torch.random.fork_rng(devices=[torch.cuda.current_device()] if session.device == "cuda" else []):
+        with torch.random.fork_rng(
+            devices=[torch.cuda.current_device()] if session.device == "cuda" else []
+        ):
             net = session.run(progress)
     finally:
         torch.set_num_threads(before)
@@ -101,7 +104,9 @@ class _Session:
         for cloud, xyz in zip(clouds, self.clouds, strict=True):
             there = with_returns(names, xyz, cloud.dimensions, self.threads)
             each.append(gather(names, there, len(xyz), where=cloud.name))
-        values = {name: np.concatenate([own[name] for own in each]).astype(np.float64) for name in each[0]}
+        values = {
+            name: np.concatenate([own[name] for own in each]).astype(np.float64) for name in each[0]
+        }
         cuda = torch.cuda.is_available()
         if options.device == "cuda" and not cuda:
             raise DependencyError(
@@ -126,7 +131,9 @@ class _Session:
         self.xyz = batches.side_by_side(self.clouds, self.spacing)
         self.columns = scaled(self.xyz, values, names, self.mean, self.scale)
         self.circles = Circles(self.xyz, points, self.spacing, self.columns)
-        held = batches.hold_out(np.concatenate(self.clouds), position, options.validation, options.block_size)
+        held = batches.hold_out(
+            np.concatenate(self.clouds), position, options.validation, options.block_size
+        )
         self.train_labels = np.where(held, -1, position).astype(np.int64)
         self.held_labels = np.where(held, position, -1).astype(np.int64)
         count = np.bincount(self.train_labels[self.train_labels >= 0], minlength=self.n_classes)
@@ -142,7 +149,9 @@ class _Session:
         start = fresh(options.configuration, len(names), self.n_classes, self.seed)
         if source is not None:
             start = _transfer(source, start, classes)
-        self.network = Network(options.configuration, len(names), self.n_classes).load(start).to(self.device)
+        self.network = (
+            Network(options.configuration, len(names), self.n_classes).load(start).to(self.device)
+        )
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=options.learning_rate)
         weight = batches.class_weights(count, options.class_weights)
         self.weight = torch.tensor(weight, dtype=torch.float32, device=self.device)
@@ -166,13 +175,23 @@ class _Session:
                     row |= self._validate(bar)
                     bar.label += f", held out mean F1 {100 * _score(row):.1f} %"
                 self.curve.append(row)
-                if not self.held_batches or not self.best_epoch or _score(row) > _score(self._best_row()):
+                if (
+                    not self.held_batches
+                    or not self.best_epoch
+                    or _score(row) > _score(self._best_row())
+                ):
                     self.best, self.best_epoch = self.network.dump(), epoch + 1
                 if options.checkpoint:
                     self._save(options.checkpoint)
         check(self.best, options.configuration, len(self.inputs), self.n_classes)
         return AlsNet(
-            self.best, options.configuration, self.inputs, self.mean, self.scale, self.spacing, self.n_classes
+            self.best,
+            options.configuration,
+            self.inputs,
+            self.mean,
+            self.scale,
+            self.spacing,
+            self.n_classes,
         )
 
     def _best_row(self) -> dict[str, Any]:
@@ -180,7 +199,9 @@ class _Session:
 
     def _patience_is_over(self) -> bool:
         patience = self.options.patience
-        return bool(patience and self.held_batches and len(self.curve) - self.best_epoch >= patience)
+        return bool(
+            patience and self.held_batches and len(self.curve) - self.best_epoch >= patience
+        )
 
     def _epoch(self, epoch: int, bar: Progress) -> float:
         """Train on every chosen batch once; the mean loss."""
@@ -191,15 +212,21 @@ class _Session:
         self.torch.manual_seed(int(np.random.default_rng([self.seed, epoch, 1]).integers(2**62)))
         phase = min(epoch / options.epochs, 1.0)
         for group in self.optimizer.param_groups:
-            group["lr"] = options.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * phase)))
+            group["lr"] = options.learning_rate * (
+                0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * phase))
+            )
         self.network.train()
         total, weight = 0.0, 0
 
         def prepare(numbers: list[int]):
             made = [self._augmented(self.chosen[k], epoch) for k in numbers]
-            return stack([pyramid for pyramid, _ in made]), np.concatenate([labels for _, labels in made])
+            return stack([pyramid for pyramid, _ in made]), np.concatenate(
+                [labels for _, labels in made]
+            )
 
-        for numbers, (pyramid, labels) in zip(steps, map_blocks(prepare, steps, self.threads), strict=True):
+        for numbers, (pyramid, labels) in zip(
+            steps, map_blocks(prepare, steps, self.threads), strict=True
+        ):
             known = int(np.count_nonzero(labels >= 0))
             if known and len(labels) > 1:
                 total += self._step(pyramid, labels) * known
@@ -222,7 +249,9 @@ class _Session:
 
     def _pyramid(self, members, center, change: Any = None):
         configuration = self.options.configuration
-        return make_pyramid(self.xyz, self.columns, members, center, self.inputs, configuration, change)
+        return make_pyramid(
+            self.xyz, self.columns, members, center, self.inputs, configuration, change
+        )
 
     def _step(self, pyramid, labels: npt.NDArray[np.int64]) -> float:
         from .network import tensors
@@ -230,7 +259,9 @@ class _Session:
         torch = self.torch
         scores = self.network(tensors(pyramid, self.device))
         target = torch.from_numpy(labels).to(self.device)
-        loss = torch.nn.functional.cross_entropy(scores, target, weight=self.weight, ignore_index=-1)
+        loss = torch.nn.functional.cross_entropy(
+            scores, target, weight=self.weight, ignore_index=-1
+        )
         value = float(loss.detach())
         if not math.isfinite(value):
             raise ModelError(
@@ -327,7 +358,11 @@ class _Session:
             options.pop(own)
         start, best = self.options.start_from, self._best_row()
         return {
-            "network": {**options, "spacing": self.spacing, "start_from": start and os.path.basename(start)},
+            "network": {
+                **options,
+                "spacing": self.spacing,
+                "start_from": start and os.path.basename(start),
+            },
             "batches": {"all": len(self.circles), "chosen": len(self.chosen)},
             "epochs": len(self.curve),
             "best_epoch": self.best_epoch,

@@ -41,13 +41,19 @@ def check(
     """Refuse, as a ModelError, arrays that are missing, unknown, of other shapes, not finite, or of negative variance."""
     shapes = configuration.shapes(inputs, classes)
     if odd := sorted(set(weights) ^ set(shapes)):
-        raise ModelError("the network's arrays are not those of its configuration", found=repr(odd[0])[:60])
+        raise ModelError(
+            "the network's arrays are not those of its configuration", found=repr(odd[0])[:60]
+        )
     for name, shape in shapes.items():
         array = weights[name]
         if array.shape != shape:
-            raise ModelError(f"the network's array '{name}' must be {shape}", found=f"shape {array.shape}")
+            raise ModelError(
+                f"the network's array '{name}' must be {shape}", found=f"shape {array.shape}"
+            )
         if not np.isfinite(array).all() or (name != "scores" and array[:, -1].min() < 0.0):
-            raise ModelError(f"the network's array '{name}' must be finite, with variances of 0 or more")
+            raise ModelError(
+                f"the network's array '{name}' must be finite, with variances of 0 or more"
+            )
 
 
 def forward(
@@ -86,7 +92,9 @@ def forward(
 class Folded:
     """A network for applying: weights that :func:`check` accepts, batch normalization folded into the linear layers."""
 
-    def __init__(self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration) -> None:
+    def __init__(
+        self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration
+    ) -> None:
         self.configuration = configuration
         self._layers: dict[str, tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]] = {}
         for name, array in weights.items():
@@ -96,7 +104,10 @@ class Folded:
             scale, shift, mean, variance = array[:, -4:].astype(np.float64).T
             factor = scale / np.sqrt(variance + EPSILON)
             matrix = (array[:, :-4] * factor[:, None]).astype(np.float32)
-            self._layers[name] = (np.ascontiguousarray(matrix.T), (shift - mean * factor).astype(np.float32))
+            self._layers[name] = (
+                np.ascontiguousarray(matrix.T),
+                (shift - mean * factor).astype(np.float32),
+            )
 
     def _layer(self, name: str, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         matrix, bias = self._layers[name]

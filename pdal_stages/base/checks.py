@@ -12,7 +12,9 @@ import numpy as np
 from .errors import OptionError, suggest
 
 
-def whole(what: str, value: Any, low: int | None = None, high: int | None = None, *, unit: str = "") -> int:
+def whole(
+    what: str, value: Any, low: int | None = None, high: int | None = None, *, unit: str = ""
+) -> int:
     """A whole number within bounds, both included; 2.0 is one, too.
 
     Parameters
@@ -27,7 +29,9 @@ def whole(what: str, value: Any, low: int | None = None, high: int | None = None
     """
     found = finite(value)
     if found is None or found != int(found) or not _within(found, low, high):
-        raise OptionError(f"{what} must be a whole number{bounds(low, high, unit=unit)}", found=_shown(value))
+        raise OptionError(
+            f"{what} must be a whole number{bounds(low, high, unit=unit)}", found=_shown(value)
+        )
     return int(found)
 
 
@@ -43,7 +47,9 @@ def number(
     """A finite number within bounds, both included; the lower one not with `above`. See :func:`whole`."""
     found = finite(value)
     if found is None or not _within(found, low, high) or (above and found == low):
-        raise OptionError(f"{what} must be a number{bounds(low, high, above, unit)}", found=_shown(value))
+        raise OptionError(
+            f"{what} must be a number{bounds(low, high, above, unit)}", found=_shown(value)
+        )
     return float(found)
 
 
@@ -123,7 +129,9 @@ def strict_json(text: str | bytes) -> Any:
     RecursionError
         If it is nested too deeply.
     """
-    return json.loads(text, parse_constant=refuse_constant, parse_float=_finite, object_pairs_hook=_unique)
+    return json.loads(
+        text, parse_constant=refuse_constant, parse_float=_finite, object_pairs_hook=_unique
+    )
 
 
 def refuse_constant(word: str) -> None:

@@ -52,7 +52,9 @@ class StageError(Exception):
         return self
 
     def __reduce__(self):  # keeps the keyword arguments across process borders (Dask)
-        return partial(type(self), self.what, where=self.where, found=self.found, cure=self.cure), ()
+        return partial(
+            type(self), self.what, where=self.where, found=self.found, cure=self.cure
+        ), ()
 
 
 def _sentence(text: str) -> str:

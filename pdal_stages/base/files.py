@@ -58,7 +58,9 @@ def kind_of(path: str | os.PathLike) -> str:
             return kind
     if head.startswith(b"PK\x03\x04"):
         first = head[30 : 30 + int.from_bytes(head[26:28], "little")]
-        return {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}.get(first, "a zip archive")
+        return {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}.get(
+            first, "a zip archive"
+        )
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if text.startswith((b"<!doctype html", b"<html")):
         return HTML
@@ -87,24 +89,36 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         write-protected file, a file of another kind.
     """
     if not os.fspath(path) or "\0" in os.fspath(path):
-        raise StageError(f"the {what} file has no name", found=ascii(path), cure="Is a shell variable unset?")
+        raise StageError(
+            f"the {what} file has no name", found=ascii(path), cure="Is a shell variable unset?"
+        )
     if is_stream(path):
         mode = os.stat(path).st_mode
         if not os.access(path, os.W_OK) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
-            raise StageError(f"the {what} file is a device that cannot be written to", found=str(path))
+            raise StageError(
+                f"the {what} file is a device that cannot be written to", found=str(path)
+            )
         return
     real = Path(os.path.realpath(path))
     if len(real.name.encode(errors="surrogateescape")) > _LONGEST_NAME:
-        raise StageError(f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path))
+        raise StageError(
+            f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path)
+        )
     if not real.parent.is_dir():
         found = str(real.parent)
-        raise StageError(f"the folder of the {what} file does not exist", found=found, cure="Create it first")
+        raise StageError(
+            f"the folder of the {what} file does not exist", found=found, cure="Create it first"
+        )
     if real.is_symlink():
         raise StageError(f"the {what} file is a link that leads to itself", found=str(path))
     if real.is_dir():
-        raise StageError(f"the {what} file names a folder", found=str(path), cure="Give a file name")
+        raise StageError(
+            f"the {what} file names a folder", found=str(path), cure="Give a file name"
+        )
     if not os.access(real.parent, os.W_OK):
-        raise StageError(f"the folder of the {what} file cannot be written to", found=str(real.parent))
+        raise StageError(
+            f"the folder of the {what} file cannot be written to", found=str(real.parent)
+        )
     if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
         cure = "Give another name, or change its mode"
         raise StageError(f"the {what} file is write-protected", found=str(path), cure=cure)
@@ -154,7 +168,9 @@ def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]
         hit = (identity and read.get(identity)) or _numbered(real, names)
         if hit is not None:
             raise StageError(
-                f"the {output.what} file is one of the inputs", found=str(hit), cure="Give it another name"
+                f"the {output.what} file is one of the inputs",
+                found=str(hit),
+                cure="Give it another name",
             )
         one = identity or real
         if one in seen:
@@ -182,7 +198,9 @@ def _numbered(output: Path, inputs: list[Path]) -> Path | None:
         return None
     before, _, after = output.name.partition("#")
     pattern = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}")
-    return next((p for p in inputs if p.parent == output.parent and pattern.fullmatch(p.name)), None)
+    return next(
+        (p for p in inputs if p.parent == output.parent and pattern.fullmatch(p.name)), None
+    )
 
 
 #: How the hidden folders' names begin.
@@ -212,7 +230,9 @@ def write_json(path: str | os.PathLike, value: Any, what: str = "output", indent
 
 @contextlib.contextmanager
 def whole_files(
-    *paths: str | os.PathLike, what: str = "output", check: Callable[[Path, Path, int], None] | None = None
+    *paths: str | os.PathLike,
+    what: str = "output",
+    check: Callable[[Path, Path, int], None] | None = None,
 ) -> Iterator[list[Path]]:
     """Give files to write to; on leaving, all of them get their names, or after an exception none.
 
@@ -290,7 +310,9 @@ class _Place:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        parent = Path(tempfile.gettempdir()) if is_stream(path) else Path(os.path.realpath(path)).parent
+        parent = (
+            Path(tempfile.gettempdir()) if is_stream(path) else Path(os.path.realpath(path)).parent
+        )
         if str(parent) not in _swept:
             _swept.add(str(parent))
             sweep(parent)
@@ -367,7 +389,9 @@ def sweep(folder: str | os.PathLike) -> None:
 
 
 def _remove_dead(folder: Path) -> None:
-    lock = os.open(folder, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_DIRECTORY", 0))
+    lock = os.open(
+        folder, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_DIRECTORY", 0)
+    )
     try:
         if os.fstat(lock).st_uid == os.geteuid() and try_lock(lock):
             shutil.rmtree(folder, ignore_errors=True)

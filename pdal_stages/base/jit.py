@@ -63,7 +63,9 @@ class Kernel:
                 if hasattr(file, "_source_stamp"):
                     file._source_stamp = "-".join(sorted(_sources(self)))
                     file.load, file.save = (_careful(file, act) for act in (file.load, file.save))
-                    made._cache.load_overload = partial(_load, made._cache, made._cache.load_overload)
+                    made._cache.load_overload = partial(
+                        _load, made._cache, made._cache.load_overload
+                    )
                     _refuse_shared(file._cache_path)
                 self._dispatcher = made
             return self._dispatcher
@@ -78,7 +80,14 @@ def njit(function: Callable | None = None, **options):
     """``numba.njit`` with the package's defaults. Use as ``@njit`` or ``@njit(...)``."""
     if function is None:
         return lambda f: njit(f, **options)
-    made = {"nogil": True, "cache": True, "no_cfunc_wrapper": True, "_nrt": True, **_ERRORS, **options}
+    made = {
+        "nogil": True,
+        "cache": True,
+        "no_cfunc_wrapper": True,
+        "_nrt": True,
+        **_ERRORS,
+        **options,
+    }
     return Kernel(function, made)
 
 

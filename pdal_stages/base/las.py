@@ -202,7 +202,11 @@ def supersede_copc(path: str | os.PathLike) -> None:
     if not named_las(path):
         return
     copc = list(records_of(path, b"copc"))
-    roots = [struct.unpack_from("<Q", data, 40)[0] for r, data in copc if r.number == 1 and len(data) >= 48]
+    roots = [
+        struct.unpack_from("<Q", data, 40)[0]
+        for r, data in copc
+        if r.number == 1 and len(data) >= 48
+    ]
     if any(r.after and 0 <= roots[-1] - r.data < r.length for r, _ in copc if roots):
         return
     with open(path, "r+b") as file:
@@ -218,14 +222,19 @@ def check_texts(path: str | os.PathLike) -> None:
         return
     with open(path, "rb") as file:
         head = file.read(90)
-        texts = [("system identifier", _text(head[26:58])), ("generating software", _text(head[58:]))]
+        texts = [
+            ("system identifier", _text(head[26:58])),
+            ("generating software", _text(head[58:])),
+        ]
         for record in islice(records(file, header), min(header.records, 1000)):
             texts += [("description of a record", record.title), ("user of a record", record.user)]
     for what, text in texts:
         try:
             text.decode()
         except UnicodeDecodeError:
-            what = f"the {what} in the LAS file is not UTF-8, which PDAL's filters.python cannot take"
+            what = (
+                f"the {what} in the LAS file is not UTF-8, which PDAL's filters.python cannot take"
+            )
             cure = f"Rewrite the file first: pdal translate {path} clean.laz"
             raise PipelineError(what, where=str(path), found=str(text)[1:], cure=cure) from None
 
@@ -258,7 +267,18 @@ def geotiff_code(path: str | os.PathLike) -> str:
 
 
 #: PDAL's names of the types of extra dimensions, by number, 1 to 10 (LAS 1.4 R15, table 24).
-_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float", "double")
+_TYPES = (
+    "uint8",
+    "int8",
+    "uint16",
+    "int16",
+    "uint32",
+    "int32",
+    "uint64",
+    "int64",
+    "float",
+    "double",
+)
 
 
 def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
@@ -276,7 +296,9 @@ def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
         kind, options = data[start + 2], data[start + 3]
         name = _text(data[start + 4 : start + 36]).decode("utf-8", "replace")
         if name and 1 <= kind <= len(_TYPES):
-            found[name] = "double" if options & 0x18 else _TYPES[kind - 1]  # with a scale or an offset
+            found[name] = (
+                "double" if options & 0x18 else _TYPES[kind - 1]
+            )  # with a scale or an offset
     return found
 
 
@@ -301,7 +323,10 @@ def class_color(code: int) -> tuple[int, int, int]:
 
 
 def by_height(
-    codes: NDArray[np.uint8], chosen: NDArray[np.bool_], height: NDArray, limits: tuple[float, float]
+    codes: NDArray[np.uint8],
+    chosen: NDArray[np.bool_],
+    height: NDArray,
+    limits: tuple[float, float],
 ) -> None:
     """Reclassify the chosen points of high vegetation as low or medium by height in meters, in place."""
     high = chosen & (codes == HIGH)

@@ -52,11 +52,15 @@ def check_readable(path: str | os.PathLike) -> str | None:
             raise StageError("not a LAS file", where=where, found=found, cure=DAMAGED)
         with open(path, "rb") as file:
             wrong = _wrong_header(header, size) or _wrong_records(file, header, size)
-            wrong = wrong or (_wrong_chunks if header.compressed else _wrong_count)(file, header, size)
+            wrong = wrong or (_wrong_chunks if header.compressed else _wrong_count)(
+                file, header, size
+            )
     except OSError as error:
         raise StageError("the file cannot be read", where=where, found=error) from None
     if wrong:
-        raise StageError(f"the LAS file is damaged: {wrong[0]}", where=where, found=wrong[1], cure=DAMAGED)
+        raise StageError(
+            f"the LAS file is damaged: {wrong[0]}", where=where, found=wrong[1], cure=DAMAGED
+        )
     if without := WAVES.get(header.point_format):
         raise StageError(
             "PDAL does not read points with waveforms",
@@ -88,7 +92,12 @@ def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) 
     if header is None or not header.count or not header.boxed:
         return None
     room = [_BOX_STEPS * scale for scale in header.scales[:2]] * 2
-    over = (header.box[0] - lie[0], header.box[1] - lie[1], lie[2] - header.box[2], lie[3] - header.box[3])
+    over = (
+        header.box[0] - lie[0],
+        header.box[1] - lie[1],
+        lie[2] - header.box[2],
+        lie[3] - header.box[3],
+    )
     if all(far <= most for far, most in zip(over, room, strict=True)):
         return None
     say = "x {0:.12g} to {2:.12g}, y {1:.12g} to {3:.12g}"
@@ -99,7 +108,10 @@ def beyond_box(path: str | os.PathLike, lie: tuple[float, float, float, float]) 
 
 
 def check_complete(
-    path: str | os.PathLike, name: str | os.PathLike, writer: Mapping[str, Any], count: int | None = None
+    path: str | os.PathLike,
+    name: str | os.PathLike,
+    writer: Mapping[str, Any],
+    count: int | None = None,
 ) -> None:
     """Refuse a file that was not written completely.
 
@@ -160,7 +172,9 @@ def _largest_file() -> float:
 
 def _end_of_points(header: LasHeader, size: int) -> int:
     """The end of the point data: the offset of what follows, or the size of the file."""
-    after = [header.after] * bool(header.records_after) + [header.waveforms] * bool(header.waveforms)
+    after = [header.after] * bool(header.records_after) + [header.waveforms] * bool(
+        header.waveforms
+    )
     return min([size, *(place for place in after if place >= header.offset)])
 
 
@@ -175,7 +189,9 @@ def _wrong_header(header: LasHeader, size: int) -> Wrong | None:
         found = f"{header.point_bytes} bytes, format {header.point_format} has {least}"
         return "its points are shorter than their format", found
     if header.header_bytes < _HEADER_BYTES[header.minor]:
-        found = f"{header.header_bytes} bytes, LAS 1.{header.minor} has {_HEADER_BYTES[header.minor]}"
+        found = (
+            f"{header.header_bytes} bytes, LAS 1.{header.minor} has {_HEADER_BYTES[header.minor]}"
+        )
         return "its header is too short", found
     if header.header_bytes > min(header.offset, size):
         found = f"header of {header.header_bytes} bytes, points at {header.offset}"
@@ -235,7 +251,9 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
     table, begin = int.from_bytes(place, "little", signed=True), header.offset + 8
     inside = len(place) == 8 and begin <= table <= size - 8
     if not header.count:
-        end = table - 8 if inside else _end_of_points(header, size)  # an empty file may have 8 bytes
+        end = (
+            table - 8 if inside else _end_of_points(header, size)
+        )  # an empty file may have 8 bytes
         return _none_counted(end - begin) if end > begin else None
     if not inside:
         return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"
@@ -266,9 +284,14 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
     except EOFError:
         return "it is cut short", f"its table of {number:,} chunks does not end"
     if sum(sizes) != room:
-        return "its chunks do not fill the file", f"{sum(sizes):,} bytes in chunks, {room:,} bytes there"
+        return (
+            "its chunks do not fill the file",
+            f"{sum(sizes):,} bytes in chunks, {room:,} bytes there",
+        )
     held = sum(counts) if varies else number * of_chunk
-    if not varies and header.point_format >= 6 and number:  # whose chunks begin with a point and their count
+    if (
+        not varies and header.point_format >= 6 and number
+    ):  # whose chunks begin with a point and their count
         file.seek(table - sizes[-1] + header.point_bytes)
         held += int.from_bytes(file.read(4), "little") - of_chunk
     exact = varies or header.point_format >= 6
@@ -284,7 +307,9 @@ def _decoded(table: bytes, varies: bool) -> tuple[list[int], list[int]]:
     """The bytes of each chunk, and its points where they vary; EOFError where the table is truncated."""
     import lazrs
 
-    if any(table[4:8]) and table[8:12] == b"\xff" * 4:  # which no encoder writes, and where lazrs panics
+    if (
+        any(table[4:8]) and table[8:12] == b"\xff" * 4
+    ):  # which no encoder writes, and where lazrs panics
         raise EOFError
     try:
         coding = lazrs.LazVlr.new_for_compression(0, 0, varies)
@@ -292,4 +317,6 @@ def _decoded(table: bytes, varies: bool) -> tuple[list[int], list[int]]:
     except lazrs.LazrsError:
         raise EOFError from None
     # The numbers have 32 bits; lazrs takes the upper half of them for negative ones.
-    return [size % 2**32 for _, size in entries], [points % 2**32 for points, _ in entries] if varies else []
+    return [size % 2**32 for _, size in entries], [
+        points % 2**32 for points, _ in entries
+    ] if varies else []

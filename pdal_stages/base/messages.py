@@ -78,7 +78,9 @@ class Progress(AbstractContextManager):
 
     delay = 2.0
 
-    def __init__(self, total: int, label: str, unit: str = "points", *, enabled: bool | None = None) -> None:
+    def __init__(
+        self, total: int, label: str, unit: str = "points", *, enabled: bool | None = None
+    ) -> None:
         self.total, self.label, self.unit = int(total), label, unit
         # filters.python redirects sys.stdout, never stderr: stderr is always the user's.
         self.stream = cast(Any, sys.__stderr__)
@@ -112,7 +114,9 @@ class Progress(AbstractContextManager):
         text += f", {rate:,.0f} {self.unit}/s" if rate >= 10 else f", {rate:.2g} {self.unit}/s"
         if end:
             text += f", {seconds:.1f} s"
-        elif self.total and 100 * self.count >= self.total:  # before, it is mostly what starting took
+        elif (
+            self.total and 100 * self.count >= self.total
+        ):  # before, it is mostly what starting took
             text += f", {duration(max(self.total - self.count, 0) / rate)} left"
         try:
             self.stream.write(f"\r{text}\x1b[K" if self._terminal else f"{text}\n")
@@ -226,7 +230,9 @@ class RunLog(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:
         """Report it once; the run goes on without its log."""
         self._failed = True
-        self._stderr.write(f"pdal-stages: the log cannot be written any more: {sys.exc_info()[1]}\n")
+        self._stderr.write(
+            f"pdal-stages: the log cannot be written any more: {sys.exc_info()[1]}\n"
+        )
 
 
 class LoggedStream(PlainStream):

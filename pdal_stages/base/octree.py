@@ -45,7 +45,9 @@ def check_copc(path: str | os.PathLike) -> None:
         # Its cube holds all points, but for what programs round.
         beyond = [abs(one - middle) for one, middle in zip(header.box, (x, y, x, y), strict=True)]
         if not (half > 0 and max(beyond) <= 1.01 * half and math.isfinite(z) and spacing > 0):
-            raise ValueError(f"a cube of {2 * half:g} around {x:g}, {y:g}, {z:g}, points {spacing:g} apart")
+            raise ValueError(
+                f"a cube of {2 * half:g} around {x:g}, {y:g}, {z:g}, points {spacing:g} apart"
+            )
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
 
@@ -61,8 +63,12 @@ def check_copc(path: str | os.PathLike) -> None:
             file.seek(header.offset)
             table = int.from_bytes(file.read(8), "little")
             place = header.offset + 8  # chunks follow each other from here to their table
-            for count, (offset, inside) in sorted((n for n in nodes.values() if n[0]), key=lambda n: n[1]):
-                file.seek(place + header.point_bytes)  # a chunk begins with a point and their number
+            for count, (offset, inside) in sorted(
+                (n for n in nodes.values() if n[0]), key=lambda n: n[1]
+            ):
+                file.seek(
+                    place + header.point_bytes
+                )  # a chunk begins with a point and their number
                 counted = int.from_bytes(file.read(4), "little")
                 if offset != place or not 0 < inside <= table - place or counted != count:
                     raise ValueError(f"{count:,} points in {inside:,} bytes at {offset:,}")
@@ -83,7 +89,9 @@ def read_ept(path: str) -> dict[str, Any]:
     import urllib.request
 
     try:
-        with urllib.request.urlopen(path, timeout=60) if "://" in path else open(path, "rb") as file:
+        with (
+            urllib.request.urlopen(path, timeout=60) if "://" in path else open(path, "rb") as file
+        ):
             found = strict_json(file.read(_LARGEST))
         x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
         left, low, _, right, high, _ = map(float, found["bounds"])
@@ -149,7 +157,11 @@ def _walk(root: Any, entries: Callable[[Any], Entries]) -> Nodes:
         first, page = waiting.pop()
         for key, count, place in entries(page):
             level, *at = key
-            if not 0 <= level <= _DEEPEST or not all(0 <= one < 1 << level for one in at) or count < -1:
+            if (
+                not 0 <= level <= _DEEPEST
+                or not all(0 <= one < 1 << level for one in at)
+                or count < -1
+            ):
                 raise ValueError(f"node {key} of {count:,} points")
             if count == -1:
                 waiting.append((key, place))

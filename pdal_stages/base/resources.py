@@ -46,8 +46,12 @@ def available_threads() -> int:
 def _quota(folder: str = "/sys/fs/cgroup") -> Iterator[int]:
     """The cores that a cgroup's quota is worth, where there is one."""
     for files in _QUOTAS:
-        with contextlib.suppress(OSError, ValueError, ArithmeticError):  # no such file; "max": no bound
-            quota, period = (int(word) for file in files for word in Path(folder, file).read_text().split())
+        with contextlib.suppress(
+            OSError, ValueError, ArithmeticError
+        ):  # no such file; "max": no bound
+            quota, period = (
+                int(word) for file in files for word in Path(folder, file).read_text().split()
+            )
             if quota > 0:
                 yield math.ceil(quota / period)
 
@@ -60,7 +64,10 @@ def resolve_threads(threads: int | None) -> int:
 
 
 def map_blocks(
-    function: Callable[[Any], Any], blocks: Sequence[Any], threads: int | None = None, ahead: int = 2
+    function: Callable[[Any], Any],
+    blocks: Sequence[Any],
+    threads: int | None = None,
+    ahead: int = 2,
 ) -> Iterator[Any]:
     """Yield ``function(block)`` for every block, in order, computed by several `threads`; it should release the GIL.
 
@@ -101,9 +108,13 @@ def parse_size(text: str) -> int:
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
     size = 0.0
     if match is not None:
-        size = float(match[1]) * (1024 if match[3] else 1000) ** " KMGT".index(match[2].upper() or " ")
+        size = float(match[1]) * (1024 if match[3] else 1000) ** " KMGT".index(
+            match[2].upper() or " "
+        )
     if size < _FEWEST:
-        raise OptionError("an amount of memory is a number and a unit", found=text, cure="For example 4GB")
+        raise OptionError(
+            "an amount of memory is a number and a unit", found=text, cure="For example 4GB"
+        )
     return int(size)
 
 
@@ -126,7 +137,9 @@ def give_back(array: np.ndarray) -> None:
     last = (begin + array.nbytes) // mmap.PAGESIZE * mmap.PAGESIZE
     if last > first:
         libc = ctypes.CDLL(None)
-        libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), ctypes.c_int(mmap.MADV_DONTNEED))
+        libc.madvise(
+            ctypes.c_void_p(first), ctypes.c_size_t(last - first), ctypes.c_int(mmap.MADV_DONTNEED)
+        )
 
 
 def _available() -> int:

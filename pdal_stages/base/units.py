@@ -99,7 +99,9 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
     if geodetic is None:
         return
     system = geodetic.find("CS")  # WKT 2 has one keyword for both
-    centered = geodetic.keyword == "GEOCCS" or (system is not None and system.name.lower() == "cartesian")
+    centered = geodetic.keyword == "GEOCCS" or (
+        system is not None and system.name.lower() == "cartesian"
+    )
     zone = utm_code(*place, root.name) if place is not None and not centered else None
     code = f"EPSG:{zone or 'CODE'}"
     what = "the UTM zone of the points; or use the national grid of the area"
@@ -118,7 +120,12 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
 
 def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float) -> None:
     """Refuse points without a reference, a thousand or more, whose bounding box looks like degrees."""
-    if count >= 1000 and max(-x0, x1) <= 180.0 and max(-y0, y1) <= 90.0 and max(x1 - x0, y1 - y0) < 0.2:
+    if (
+        count >= 1000
+        and max(-x0, x1) <= 180.0
+        and max(-y0, y1) <= 90.0
+        and max(x1 - x0, y1 - y0) < 0.2
+    ):
         code = utm_code(x0, y0) or "CODE"
         raise StageError(
             "the coordinates look like degrees, and there is no spatial reference that says otherwise",
@@ -174,7 +181,9 @@ class WktNode:
 
     def code(self) -> str:
         """The authority's code of this element, as ``EPSG:25832``; empty where it has none."""
-        codes = [c.values[:2] for c in self.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]]
+        codes = [
+            c.values[:2] for c in self.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]
+        ]
         return ":".join(codes[-1]) if codes else ""
 
 

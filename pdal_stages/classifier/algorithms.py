@@ -89,7 +89,9 @@ class PredictRequest:
     memory_mb: float = 256.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
-    report: Report = field(default_factory=Report)  #: what is counted, complete when all blocks are read
+    report: Report = field(
+        default_factory=Report
+    )  #: what is counted, complete when all blocks are read
 
     @property
     def count(self) -> int:
@@ -106,7 +108,9 @@ class PredictionOptions(Settings):
     probabilities: bool = False  #: whether to return them
     margin: bool = False
     #: points less reliable do not get the winning class, and are counted
-    reject_below: float | None = setting(None, "number", "Points with a lower Reliability are rejected", 0, 1)
+    reject_below: float | None = setting(
+        None, "number", "Points with a lower Reliability are rejected", 0, 1
+    )
     rejected_code: int | None = setting(
         None, "integer", "Class code for rejected points; by default they keep theirs", 0, 255
     )
@@ -146,7 +150,9 @@ def trainer(name: str) -> Any:
 def required(names: Iterable[str]) -> tuple[str, ...]:
     """Dimensions the cloud must have for these dimension features."""
     return tuple(
-        dict.fromkeys(name for name in names if name not in COORDINATES and returns.parse(name) is None)
+        dict.fromkeys(
+            name for name in names if name not in COORDINATES and returns.parse(name) is None
+        )
     )
 
 

@@ -21,7 +21,14 @@ MAX_CODE = 255
 # Words people use where ASPRS has another.
 _WORDS = {
     **{name.lower(): code for code, name in NAMES.items()},
-    **{"other": 1, "low vegetation": 3, "medium vegetation": 4, "vegetation": 5, "tree": 5, "trees": 5},
+    **{
+        "other": 1,
+        "low vegetation": 3,
+        "medium vegetation": 4,
+        "vegetation": 5,
+        "tree": 5,
+        "trees": 5,
+    },
     **{"buildings": 6, "roof": 6, "facade": 6, "noise": 7, "road": 11, "wire": 14, "wires": 14},
     **{"power line": 14, "pole": 15, "tower": 15, "bridge": 17},
 }
@@ -61,7 +68,9 @@ class ClassMap:
             try:
                 spec = json.loads(spec) if spec.strip()[:1] in ("{", "[") else _labels(spec)
             except ValueError as error:
-                raise OptionError("'classes' is not valid JSON", found=str(error), cure=_CURE) from None
+                raise OptionError(
+                    "'classes' is not valid JSON", found=str(error), cure=_CURE
+                ) from None
         if spec is None:
             spec = [label for label in sorted(set(map(int, found))) if label not in left_out]
             if any(label > MAX_CODE for label in spec):
@@ -95,12 +104,16 @@ class ClassMap:
         """One class against all the others, which become `background`."""
         if target not in self.codes:
             raise OptionError(
-                "'target' is not one of the classes", found=target, cure=f"Choose one of {list(self.codes)}"
+                "'target' is not one of the classes",
+                found=target,
+                cure=f"Choose one of {list(self.codes)}",
             )
         if background == target:
             raise OptionError("'background' and 'target' are the same code", found=target)
         i = self.codes.index(target)
-        rest = tuple(sorted(label for k, part in enumerate(self.labels) if k != i for label in part))
+        rest = tuple(
+            sorted(label for k, part in enumerate(self.labels) if k != i for label in part)
+        )
         if not rest:
             raise OptionError(
                 "nothing is left for the background: 'classes' names the target only", cure=_CURE
@@ -131,7 +144,9 @@ def _labels(text: Any) -> tuple[int, ...]:
             )
         first, last = int(span[1]), int(span[2] or span[1])
         if last < first or last > MAX_LABEL:
-            raise OptionError("'classes' has an invalid label range", found=part.strip(), cure=_CURE)
+            raise OptionError(
+                "'classes' has an invalid label range", found=part.strip(), cure=_CURE
+            )
         labels.extend(range(first, last + 1))
     return tuple(dict.fromkeys(labels))
 
@@ -148,7 +163,9 @@ def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | Non
     """(code, name) that a mapping's value means; None for dropped."""
     if isinstance(value, Mapping):
         if "code" not in value or set(value) - {"code", "name"}:
-            raise OptionError("a class is written with 'code' and 'name'", found=dict(value), cure=_CURE)
+            raise OptionError(
+                "a class is written with 'code' and 'name'", found=dict(value), cure=_CURE
+            )
         return _code(value["code"], "code"), str(value["name"]) if value.get("name") else None
     if value is not None and not isinstance(value, str):
         return _code(value, "code"), None

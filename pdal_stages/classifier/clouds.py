@@ -44,7 +44,9 @@ class TrainingCloud:
     mask: npt.ArrayLike | None = None
     survey: str = ""  #: the survey it belongs to; by default one of its own, called as it is
     copy: str = ""  #: which of the survey's copies it is, where there are several
-    own: npt.ArrayLike | None = None  #: (n,) bool, of a tile its own points; the others are only neighbors
+    own: npt.ArrayLike | None = (
+        None  #: (n,) bool, of a tile its own points; the others are only neighbors
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
@@ -79,7 +81,9 @@ class TrainingCloud:
     def having(self, arrays: Mapping[str, npt.NDArray[Any]], **more: Any) -> TrainingCloud:
         """The same cloud of other points, of which this is known."""
         dimensions = {name[2:]: values for name, values in arrays.items() if name.startswith("d/")}
-        known: dict[str, Any] = {name: arrays.get(name) for name in ("xyz", "labels", "mask", "own")}
+        known: dict[str, Any] = {
+            name: arrays.get(name) for name in ("xyz", "labels", "mask", "own")
+        }
         return replace(self, dimensions=dimensions, **known, **more)
 
     def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
@@ -241,7 +245,9 @@ class Labeled:
         **more: Any,
     ) -> dict[str, Any]:
         """What a manifest says: `counts` of each class's samples, `importances` of each pass, `crossed` is the score."""
-        classes = zip(self.classes.codes, self.classes.names, self.classes.labels, counts, strict=True)
+        classes = zip(
+            self.classes.codes, self.classes.names, self.classes.labels, counts, strict=True
+        )
         return {
             "strategy": options.strategy,
             "target": options.target,
@@ -309,5 +315,7 @@ def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
     for number, cloud in enumerate(clouds):
         key = number if cloud.own is None else (cloud.name, cloud.survey, cloud.copy)
         found.setdefault(key, []).append(density(cloud.xyz))
-    there = [one for each in found.values() if (one := float(np.median(each)))]  # empty ones do not count
+    there = [
+        one for each in found.values() if (one := float(np.median(each)))
+    ]  # empty ones do not count
     return {"low": min(there, default=0.0), "high": max(there, default=0.0)}

@@ -36,7 +36,9 @@ OWN = "own"
 class Context:
     """Which features of the surroundings a pass reads; OptionError for a token that is not one."""
 
-    tokens: tuple[str, ...]  #: ``own``, or a word of :data:`CELLS` and a side: ``box1``, ``columnvotes8``
+    tokens: tuple[
+        str, ...
+    ]  #: ``own``, or a word of :data:`CELLS` and a side: ``box1``, ``columnvotes8``
 
     def __post_init__(self) -> None:
         self.scales  # noqa: B018  refused when it is made
@@ -77,11 +79,16 @@ class Context:
     def names(self, codes: Sequence[int]) -> tuple[str, ...]:
         """Columns, token by token, in each the classes of these codes: ``Probability_2_box0_5``."""
         return tuple(
-            f"Probability_{code}_{token.replace('.', '_')}" for token in self.tokens for code in codes
+            f"Probability_{code}_{token.replace('.', '_')}"
+            for token in self.tokens
+            for code in codes
         )
 
     def columns_of(
-        self, xyz: npt.NDArray[np.float64], shares: npt.NDArray[np.uint16], threads: int | None = None
+        self,
+        xyz: npt.NDArray[np.float64],
+        shares: npt.NDArray[np.uint16],
+        threads: int | None = None,
     ) -> Callable[[npt.NDArray[np.int64]], npt.NDArray[np.float32]]:
         """A function that gives the columns of some of these points.
 

@@ -40,7 +40,9 @@ class Features:
         for part in self.plan.layout:
             token = part.neighborhood.token
             if part.shapes and token not in there:
-                raise ModelError("the model lacks the thresholds of shape distributions", found=token)
+                raise ModelError(
+                    "the model lacks the thresholds of shape distributions", found=token
+                )
             if part.neighborhood.kind == "copt" and self.copt_threshold is None:
                 raise ModelError("the model lacks the curvature threshold of copt")
 
@@ -93,13 +95,19 @@ class Blend:
         good = made.codes == list(codes) and len(made.factors or labeled) == len(labeled)
         good &= all(sorted(set(one)) == list(one) for one in (made.before, labeled))
         if not good or (target is not None and (target not in labeled or len(labeled) != 2)):
-            raise ModelError("a refined forest's classes do not fit each other", found=str(said)[:100])
+            raise ModelError(
+                "a refined forest's classes do not fit each other", found=str(said)[:100]
+            )
         return made
 
     def to_dict(self) -> dict[str, Any]:
         """As a manifest has it."""
         said = {"before": list(self.before), "labeled": list(self.labeled), "trusted": self.trusted}
-        return said | ({"factors": list(self.factors)} if self.factors else {}) | {"target": self.target}
+        return (
+            said
+            | ({"factors": list(self.factors)} if self.factors else {})
+            | {"target": self.target}
+        )
 
     @property
     def codes(self) -> list[int]:
@@ -142,7 +150,9 @@ def trust(labels: int) -> float:
     return labels / (labels + EVEN)
 
 
-def weighed(p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64]:
+def weighed(
+    p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None
+) -> npt.NDArray[np.float64]:
     """Probabilities (b, classes), each class's multiplied by its factor; None leaves them as they are."""
     if factors is None:
         return p
@@ -161,7 +171,10 @@ def on_top(
     entries = {one["code"]: one for one in info["classes"]}
     unseen = {"available": 0, "samples": 0, "duplicates": 0}
     inherited = {one["code"]: {"labels": one["labels"]} for one in base.info["classes"]}
-    scores = [{**one, "codes": codes} for codes, one in zip(base.codes_of, base.info["passes"], strict=True)]
+    scores = [
+        {**one, "codes": codes}
+        for codes, one in zip(base.codes_of, base.info["passes"], strict=True)
+    ]
     if base.factors is not None:
         scores[-1]["factors"] = base.factors.tolist()
     densities, before = info["densities"], base.info.get("densities")
@@ -174,7 +187,13 @@ def on_top(
         "target": None,
         "background": None,
         "classes": [
-            {**unseen, **inherited.get(code, {}), **entries.get(code, {}), "code": code, "name": names[code]}
+            {
+                **unseen,
+                **inherited.get(code, {}),
+                **entries.get(code, {}),
+                "code": code,
+                "name": names[code],
+            }
             for code in codes
         ],
         "priors": None,
@@ -223,7 +242,11 @@ class FeatureForest:
         made = cls(features, forest, context, blend)
         names, expected = entry["feature_names"], [column.name for column in made.columns(codes)]
         if expected != names or list(made.plan.dimensions) != entry["dimensions"]:
-            odd = [f"'{a}' where '{b}' belongs" for a, b in zip(names, expected, strict=False) if a != b]
+            odd = [
+                f"'{a}' where '{b}' belongs"
+                for a, b in zip(names, expected, strict=False)
+                if a != b
+            ]
             raise ModelError(
                 "the model's features, or their order, are not those its neighborhoods give in this release",
                 found=odd[0] if odd else f"{len(names)} features, {len(expected)} belong",
@@ -234,7 +257,8 @@ class FeatureForest:
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """What a model file says of it beside its arrays."""
         return {
-            "parameters": self.forest.parameters() | ({} if self.blend is None else self.blend.to_dict()),
+            "parameters": self.forest.parameters()
+            | ({} if self.blend is None else self.blend.to_dict()),
             "feature_names": [column.name for column in self.columns(codes)],
             "dimensions": list(self.plan.dimensions),
             "context": [] if self.context is None else list(self.context.tokens),
@@ -280,7 +304,9 @@ class FeatureForest:
         grown = self.forest.predict_proba(values)
         if self.blend is None or self.context is None:
             return grown
-        return self.blend(self.context.own(values[:, len(self.plan.names) :], len(self.blend.before)), grown)
+        return self.blend(
+            self.context.own(values[:, len(self.plan.names) :], len(self.blend.before)), grown
+        )
 
 
 class CloudFeatures:
@@ -291,7 +317,9 @@ class CloudFeatures:
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
         self._dimensions = with_returns(names, request.xyz, request.dimensions, request.threads)
-        gather(names, self._dimensions, len(request.xyz), request.rows)  # says what is wrong with them
+        gather(
+            names, self._dimensions, len(request.xyz), request.rows
+        )  # says what is wrong with them
 
     def blocks(
         self,
@@ -324,7 +352,9 @@ class CloudFeatures:
             progress=progress,
             apply=apply,
         )
-        few = {token: k for token, k in self._engine.report.figures["fewer_than_three"].items() if k}
+        few = {
+            token: k for token, k in self._engine.report.figures["fewer_than_three"].items() if k
+        }
         if few:
             report.figures.setdefault("fewer_than_three", {}).update(few)
         report.beyond_halo.update(self._engine.report.beyond_halo)

@@ -58,7 +58,12 @@ class Forest:
     def __post_init__(self) -> None:
         sizes, count = self.tree_sizes, len(self.feature)
         shapes = ", ".join(f"{name} {getattr(self, name).shape}" for name in self.rules)
-        if not len(sizes) or not count or len(self.threshold) != count or self.leaf_counts.ndim != 2:
+        if (
+            not len(sizes)
+            or not count
+            or len(self.threshold) != count
+            or self.leaf_counts.ndim != 2
+        ):
             raise ModelError("the forest's arrays do not fit each other", found=shapes)
         if int(sizes.min()) < 1 or int(sizes.sum(dtype=np.int64)) != count:
             raise ModelError("the trees' sizes do not add up to the nodes", found=shapes)
@@ -108,7 +113,9 @@ class Forest:
         )
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], n_features: int, n_classes: int) -> Forest:
+    def from_arrays(
+        cls, arrays: Mapping[str, npt.NDArray[Any]], n_features: int, n_classes: int
+    ) -> Forest:
         """A forest from a model file's arrays; everything about them is checked."""
         if arrays["leaf_counts"].shape[1] != n_classes:
             raise ModelError(
@@ -136,7 +143,8 @@ class Forest:
         values = np.ascontiguousarray(values, dtype=np.float32)
         if values.ndim != 2 or values.shape[1] != self.n_features:
             raise ModelError(
-                f"the model takes {self.n_features} features per point", found=f"shape {values.shape}"
+                f"the model takes {self.n_features} features per point",
+                found=f"shape {values.shape}",
             )
         out = np.zeros((len(values), self.n_classes))
         walk(values, self.tree_sizes, self._nodes, self._shares, out)  # type: ignore[attr-defined]
@@ -245,7 +253,9 @@ def _laid_out(
             raise ModelError(what, found=f"tree {tree[first]}, node {node[first]}")
 
     split = feature >= 0
-    refuse((feature < -1) | (feature >= n_features), "a node asks for a feature that does not exist")
+    refuse(
+        (feature < -1) | (feature >= n_features), "a node asks for a feature that does not exist"
+    )
     refuse(split & ~np.isfinite(threshold), "a threshold is not a finite number")
     splits = np.concatenate(([0], np.cumsum(split)))  # before each node, in all trees
     before = splits[:-1] - splits[start][tree]
@@ -270,7 +280,9 @@ def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.N
     exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]
     counts = np.rint(exact)
     if tree.n_outputs != 1 or np.abs(counts - exact).max(initial=0) > 1e-3 or counts.max() >= 2**32:
-        raise ModelError("these trees were not grown with whole-number sample weights and one output")
+        raise ModelError(
+            "these trees were not grown with whole-number sample weights and one output"
+        )
     left, right = tree.children_left, tree.children_right
     levels = [np.zeros(1, np.int64)]
     while len(splits := levels[-1][left[levels[-1]] >= 0]):

@@ -50,7 +50,9 @@ def own_options(given: Any) -> None:
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
     """Dimensions used as features, by the forest or by the model it is built on."""
     own = feature_plan(options).dimensions
-    return own if options.base is None else tuple(dict.fromkeys([*own, *options.base.plan.dimensions]))
+    return (
+        own if options.base is None else tuple(dict.fromkeys([*own, *options.base.plan.dimensions]))
+    )
 
 
 def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
@@ -61,7 +63,9 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
 class _ForestTraining:
     """Samples of labeled clouds and what is computed of them."""
 
-    def __init__(self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> None:
+    def __init__(
+        self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool
+    ) -> None:
         self.clouds, self.options, self.base = clouds, options, options.base
         self.progress = partial(Progress, enabled=progress)
         if options.groups and required((options.groups,)) != (options.groups,):
@@ -70,7 +74,9 @@ class _ForestTraining:
                 found=options.groups,
             )
         for cloud in clouds if options.groups else ():  # before any work: it may be missing
-            gather((options.groups,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name)
+            gather(
+                (options.groups,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name
+            )
         self.labeled = label_classes(clouds, options, progress)
         self.codes = self.labeled.classes.codes
         self.surveys = [cloud.survey for cloud in clouds]
@@ -87,7 +93,9 @@ class _ForestTraining:
         self.stands_for = weight * frequent[self.samples.label]
         factors = frequent**options.prior_weight
         self.factors = factors / factors.max() if options.prior_weight else None
-        self.short = 0  # samples of tiles whose nearest neighbors lie beyond the halo of their features
+        self.short = (
+            0  # samples of tiles whose nearest neighbors lie beyond the halo of their features
+        )
         plan = feature_plan(options)
         used = [clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
         bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
@@ -140,7 +148,9 @@ class _ForestTraining:
                     self.short += max(request.report.beyond_halo.values(), default=0)
         bad = ~np.isfinite(values).all(axis=0)
         if bad.any():
-            raise DimensionError(f"the feature {names[int(bad.argmax())]} is not finite for some samples")
+            raise DimensionError(
+                f"the feature {names[int(bad.argmax())]} is not finite for some samples"
+            )
         return values
 
     def _blends(self) -> Sequence[Blend | None]:
@@ -149,11 +159,16 @@ class _ForestTraining:
         out: list[Blend] = []
         if self.base is None:
             return [None] * o.passes
-        before, trusted = self.base.codes.tolist(), trust(int(np.bincount(self.samples.label).min()))
+        before, trusted = (
+            self.base.codes.tolist(),
+            trust(int(np.bincount(self.samples.label).min())),
+        )
         for _ in range(o.passes):
             out.append(Blend(tuple(before), tuple(self.codes), trusted, o.target))
             before = out[-1].codes
-        if o.passes > 1 and self.factors is not None:  # a few labels say nothing of how frequent a class is
+        if (
+            o.passes > 1 and self.factors is not None
+        ):  # a few labels say nothing of how frequent a class is
             out[-1] = replace(out[-1], factors=tuple(self.factors.tolist()))
         return out
 
@@ -163,7 +178,9 @@ class _ForestTraining:
         validation, notes = self._validate()
         forests, importances = self._passes()
         priors = (
-            None if self.factors is None else {"weight": o.prior_weight, "factors": self.factors.tolist()}
+            None
+            if self.factors is None
+            else {"weight": o.prior_weight, "factors": self.factors.tolist()}
         )
         training = {
             "count": o.count,
@@ -178,7 +195,9 @@ class _ForestTraining:
         }
         counts = map(self.samples.counts, range(len(self.codes)))
         packages = ("numpy", "scikit-learn", "numba")
-        info = self.labeled.described(o, counts, training, importances, packages, validation, priors=priors)
+        info = self.labeled.described(
+            o, counts, training, importances, packages, validation, priors=priors
+        )
         if validation is not None and self.sureness.right:
             info["sureness"] = self.sureness.to_dict()
         names = dict(zip(self.codes, self.labeled.classes.names, strict=True))
@@ -195,7 +214,11 @@ class _ForestTraining:
         return self.codes if blend is None else blend.codes
 
     def _grow(
-        self, values: npt.NDArray[np.float32], weight: npt.NDArray[np.int64], trees: int, bar: Progress
+        self,
+        values: npt.NDArray[np.float32],
+        weight: npt.NDArray[np.int64],
+        trees: int,
+        bar: Progress,
     ) -> tuple[Forest, npt.NDArray[np.float64]]:
         return grow_forest(values, self.samples.label, weight, trees, progress=bar, **self.setting)
 
@@ -241,7 +264,9 @@ class _ForestTraining:
         asked = {"groups": o.groups} if o.groups else {}
         for by in (["groups" if o.groups else "surveys"] if len(names) > 1 else []) + ["blocks"]:
             self.sureness = Sureness(about=f"{by} held out, forests of {self.fold_trees} trees")
-            here = 0.0 if by == "surveys" else gap  # which do not see each other, whatever their coordinates
+            here = (
+                0.0 if by == "surveys" else gap
+            )  # which do not see each other, whatever their coordinates
             try:
                 if by == "blocks":
                     blocks = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK)
@@ -304,8 +329,12 @@ class _ForestTraining:
         held_out: list[list[FeatureForest]] = []
         values, folds = self.first, None
         if o.passes > 1:
-            folds = Folds.of_ground(self.xy, samples.label, samples.weight, self.surveys, PASS_FOLDS)
-            fold = samples.take(lambda number: folds.points(self.clouds[number].xyz, self.surveys[number]))
+            folds = Folds.of_ground(
+                self.xy, samples.label, samples.weight, self.surveys, PASS_FOLDS
+            )
+            fold = samples.take(
+                lambda number: folds.points(self.clouds[number].xyz, self.surveys[number])
+            )
         for number in range(o.passes):
             if number:
                 # Ground beside a fold is not left out as for the score: the forests miss the fold's samples already,
@@ -324,7 +353,10 @@ class _ForestTraining:
         return FeatureForest(self.features, forest, self.reads[number], self.blends[number])
 
     def _around(
-        self, number: int, held_out: Sequence[Sequence[FeatureForest]] = (), folds: Folds | None = None
+        self,
+        number: int,
+        held_out: Sequence[Sequence[FeatureForest]] = (),
+        folds: Folds | None = None,
     ) -> npt.NDArray[np.float32]:
         """(samples, columns): what a pass reads of those before, a base's and forests that have not seen the samples."""
         o, context = self.options, self.reads[number]
@@ -343,8 +375,12 @@ class _ForestTraining:
                 if folds is not None:
                     fold = folds.points(cloud.xyz, self.surveys[place])
                     each = (FoldForests(forests, fold) for forests in held_out)
-                    mine = [WeightedPass(one, len(self._codes_after(k))) for k, one in enumerate(each)]
-                request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar)
+                    mine = [
+                        WeightedPass(one, len(self._codes_after(k))) for k, one in enumerate(each)
+                    ]
+                request = PredictRequest(
+                    cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar
+                )
                 out[at] = sample_context([*base, *mine], request, context)
         return out
 
@@ -372,5 +408,7 @@ class _ForestTraining:
         return {"held_by_base": out} if out else {}
 
 
-def _beside(values: npt.NDArray[np.float32], more: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _beside(
+    values: npt.NDArray[np.float32], more: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:
     return np.asfortranarray(np.concatenate([values, more], axis=1))

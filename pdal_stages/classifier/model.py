@@ -130,7 +130,9 @@ class Model:
         """What the model file says beside its arrays."""
         passes = [
             {"algorithm": one.name, **one.to_file(codes), **scores}
-            for one, codes, scores in zip(self.passes, self.codes_of, self.info["passes"], strict=True)
+            for one, codes, scores in zip(
+                self.passes, self.codes_of, self.info["passes"], strict=True
+            )
         ]
         return {**self.info, "passes": passes}
 
@@ -176,21 +178,34 @@ class Model:
         xyz = check_xyz(xyz)
         n = len(xyz)
         given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads)
-        asked = np.ones(n, np.bool_) if where is None else _checked("where", where, n, "b", "true or false")
+        asked = (
+            np.ones(n, np.bool_)
+            if where is None
+            else _checked("where", where, n, "b", "true or false")
+        )
         there, ignored = None, 0
-        if ignore is not None and (gone := _checked("ignore", ignore, n, "b", "true or false")).any():
+        if (
+            ignore is not None
+            and (gone := _checked("ignore", ignore, n, "b", "true or false")).any()
+        ):
             there, ignored = np.flatnonzero(~gone), int(np.count_nonzero(gone))
             asked = asked & ~gone
         rows = None if asked.all() else np.flatnonzero(asked)
         codes, factors = self.codes, self.factors
         now = (
-            None if current is None else _checked("current", current, n, "iu", "class code").astype(np.uint8)
+            None
+            if current is None
+            else _checked("current", current, n, "iu", "class code").astype(np.uint8)
         )
         out: dict[str, npt.NDArray[Any]] = {
             "classification": np.zeros(n, np.uint8) if now is None else now.copy(),
             "reliability": np.zeros(n, np.float32),
             **({"margin": np.zeros(n, np.float32)} if how.margin else {}),
-            **({"probabilities": np.zeros((n, len(codes)), np.float32)} if how.probabilities else {}),
+            **(
+                {"probabilities": np.zeros((n, len(codes)), np.float32)}
+                if how.probabilities
+                else {}
+            ),
         }
         values = known(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
@@ -241,7 +256,9 @@ class Model:
                 "rejected": len(unsure),
                 "outside_where": n - ignored - count,
                 **({"ignored": ignored} if ignored else {}),
-                "classes": {str(code): int(number[code]) for code in np.flatnonzero(number).tolist()},
+                "classes": {
+                    str(code): int(number[code]) for code in np.flatnonzero(number).tolist()
+                },
             }
         )
         report.merge(request.report)
@@ -261,7 +278,9 @@ class Model:
             return given
         usable = None if ignore is None else ~np.asarray(ignore, bool)
         made = preparation_module().made_of_coordinates(preparation, xyz, usable, threads)
-        if made.keys() & given.keys() and made.keys() & set(missing):  # heights of two kinds would be mixed
+        if made.keys() & given.keys() and made.keys() & set(
+            missing
+        ):  # heights of two kinds would be mixed
             raise DimensionError(
                 f"the dimension {missing[0]} is missing",
                 found=", ".join(given),
@@ -273,7 +292,9 @@ class Model:
     @property
     def _cell(self) -> float | None:
         """Of the grid that its features are computed by; None where it has none."""
-        return next((one.features.plan.cell for one in self.passes if one.features is not None), None)
+        return next(
+            (one.features.plan.cell for one in self.passes if one.features is not None), None
+        )
 
     def _report_density(self, report: Report, found: float, count: int) -> None:
         """How dense the cloud is; a warning where that is not what the model was trained for."""
@@ -372,12 +393,16 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
     check_side(manifest.get("voxel") or 0.0)
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(classes):
-        raise ModelError("the manifest's priors must have one factor per class", found=len(priors["factors"]))
+        raise ModelError(
+            "the manifest's priors must have one factor per class", found=len(priors["factors"])
+        )
     passes, before = [], codes
     for number, entry in enumerate(manifest["passes"]):
         own = entry.get("codes") or codes
         if sorted(set(own)) != own or len(entry.get("factors") or own) != len(own):
-            raise ModelError("a pass's classes must ascend, each once, with one factor each", found=own[:10])
+            raise ModelError(
+                "a pass's classes must ascend, each once, with one factor each", found=own[:10]
+            )
         made = algorithm(entry["algorithm"]).from_file(entry, arrays[number], own)
         if number and made.classes_before(own) != before:
             raise ModelError(
@@ -385,16 +410,22 @@ def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
             )
         before = own
         if (number > 0) != bool(entry["context"]):
-            raise ModelError("every pass but the first must read context", found=f"pass {number + 1}")
+            raise ModelError(
+                "every pass but the first must read context", found=f"pass {number + 1}"
+            )
         importances = entry["importances"]
         if importances is not None and len(importances) != len(entry["feature_names"]):
             raise ModelError(
                 "the manifest's importances must have one value per feature", found=len(importances)
             )
         passes.append(made)
-    info = {key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")}
+    info = {
+        key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")
+    }
     scores = ("importances", "codes", "factors")
-    info["passes"] = [{key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]]
+    info["passes"] = [
+        {key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]
+    ]
     if before != codes:
         raise ModelError("the last pass has other classes than the model", found=before[:10])
     return Model(tuple(passes), classes, info)
@@ -408,5 +439,7 @@ def _checked(name: str, given: npt.ArrayLike, n: int, kinds: str, what: str) -> 
             f"'{name}' must be one {what} per point", found=f"{array.dtype} of shape {array.shape}"
         )
     if n and kinds != "b" and (array.min() < 0 or array.max() > 255):
-        raise OptionError(f"'{name}' must be one {what} per point", found=f"{array.min()} to {array.max()}")
+        raise OptionError(
+            f"'{name}' must be one {what} per point", found=f"{array.min()} to {array.max()}"
+        )
     return array

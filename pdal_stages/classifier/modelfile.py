@@ -73,7 +73,9 @@ def digest_of(name: str) -> str:
 
 
 def write(
-    path: str | os.PathLike, manifest: Mapping[str, Any], passes: Sequence[Mapping[str, npt.NDArray[Any]]]
+    path: str | os.PathLike,
+    manifest: Mapping[str, Any],
+    passes: Sequence[Mapping[str, npt.NDArray[Any]]],
 ) -> None:
     """Write a model file; an existing one stays as it was until the new one is complete.
 
@@ -141,10 +143,14 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
         raise error.at(str(path)) from error.__cause__
     except _BAD as error:  # RecursionError is a RuntimeError
         text = f"{type(error).__name__}: {error}"[:200]
-        raise ModelError("the model file cannot be read", where=str(path), found=text, cure=CURE) from error
+        raise ModelError(
+            "the model file cannot be read", where=str(path), found=text, cure=CURE
+        ) from error
 
 
-def _read(archive: zipfile.ZipFile, size: int, rules_of, own: bool) -> tuple[dict[str, Any], Arrays]:
+def _read(
+    archive: zipfile.ZipFile, size: int, rules_of, own: bool
+) -> tuple[dict[str, Any], Arrays]:
     members = {info.filename: info for info in archive.infolist()}
     if len(members) != len(archive.infolist()):
         raise ModelError("the model file has a member twice")
@@ -157,26 +163,37 @@ def _read(archive: zipfile.ZipFile, size: int, rules_of, own: bool) -> tuple[dic
     if MANIFEST not in members:
         raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}")
     if members[MANIFEST].file_size > MANIFEST_LIMIT:
-        raise ModelError("the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes")
+        raise ModelError(
+            "the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes"
+        )
     manifest = parse(_unpack(archive, members[MANIFEST]), own)
     rules = [rules_of(one["algorithm"]) for one in manifest["passes"]]
     table = manifest["arrays"]
     expected = {MANIFEST, *(entry["file"] for entry in table.values())}
     if len(expected) != 1 + len(table) or expected != set(members):
         odd = sorted(expected ^ set(members))
-        raise ModelError("the members and the manifest's list of arrays differ", found=odd[:3] or None)
+        raise ModelError(
+            "the members and the manifest's list of arrays differ", found=odd[:3] or None
+        )
     arrays: Arrays = [{} for _ in rules]
     for label, entry in table.items():
         number, name = int(label[0]) - 1, label[2:]
         known = rules[number].items() if number < len(rules) else ()
         rule = next((one for pattern, one in known if fnmatchcase(name, pattern)), None)
         if rule is None:
-            raise ModelError("the model file has an array its passes do not know", found=repr(label))
+            raise ModelError(
+                "the model file has an array its passes do not know", found=repr(label)
+            )
         data = _unpack(archive, members[entry["file"]])
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise ModelError(f"the array '{name}' is not the one that was stored", found="another SHA-256")
+            raise ModelError(
+                f"the array '{name}' is not the one that was stored", found="another SHA-256"
+            )
         array = from_bytes(data, rule, name)
-        if list(array.shape) != entry["shape"] or array.dtype.newbyteorder("<").str != entry["dtype"]:
+        if (
+            list(array.shape) != entry["shape"]
+            or array.dtype.newbyteorder("<").str != entry["dtype"]
+        ):
             raise ModelError(
                 f"the array '{name}' is not what the manifest says", found=f"shape {array.shape}"
             )
@@ -192,7 +209,9 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     if info.flag_bits & 0x1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ModelError("a member has an unsupported compression", found=repr(info.filename))
     with archive.open(info) as stream:
-        data = stream.read(info.file_size + 1)  # never more than was declared; the CRC is checked at the end
+        data = stream.read(
+            info.file_size + 1
+        )  # never more than was declared; the CRC is checked at the end
         if len(data) != info.file_size or stream.read(1):
             raise ModelError("a member has another size than declared", found=repr(info.filename))
     return data
@@ -201,7 +220,9 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 def to_bytes(array: npt.NDArray[Any]) -> bytes:
     """The array as ``.npy`` bytes (version 1.0, little-endian, C order)."""
     out = io.BytesIO()
-    np.save(out, array.astype(array.dtype.newbyteorder("<"), order="C", copy=False), allow_pickle=False)
+    np.save(
+        out, array.astype(array.dtype.newbyteorder("<"), order="C", copy=False), allow_pickle=False
+    )
     return out.getvalue()
 
 
@@ -224,7 +245,9 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
         if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != rest:
             raise ValueError(f"{rest:,} bytes of values for shape {shape}")
     except (ValueError, RecursionError, MemoryError) as error:
-        raise ModelError(f"the array '{name}' is not what a model has", found=str(error)[:120]) from None
+        raise ModelError(
+            f"the array '{name}' is not what a model has", found=str(error)[:120]
+        ) from None
     values = np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
     return values.astype(dtype.newbyteorder("="), copy=False)
 
@@ -259,7 +282,9 @@ def validate(manifest: Mapping[str, Any]) -> None:
         raise ModelError("the manifest is nested too deeply", cure=CURE) from None
     if error is not None:
         place = "/".join(str(part)[:60] for part in error.absolute_path) or "(the whole)"
-        raise ModelError(f"the manifest is not valid at {place}", found=error.message[:200], cure=CURE)
+        raise ModelError(
+            f"the manifest is not valid at {place}", found=error.message[:200], cure=CURE
+        )
 
 
 @lru_cache

@@ -82,7 +82,9 @@ class WeightedPass(NamedTuple):
 
 
 def predict(
-    passes: Sequence[WeightedPass], request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
+    passes: Sequence[WeightedPass],
+    request: PredictRequest,
+    finish: Callable[[npt.NDArray[np.float64]], Any],
 ) -> Iterator[tuple[Any, Any]]:
     """Classify by some passes: (rows, what `finish` made of them) block by block.
 
@@ -93,7 +95,9 @@ def predict(
     if len(passes) == 1 and last.features is None:
         yield from last.predict(request, finish)
         return
-    yield from PassRun(passes, request).blocks(lambda read, rows: finish(last.probabilities(read, rows)))
+    yield from PassRun(passes, request).blocks(
+        lambda read, rows: finish(last.probabilities(read, rows))
+    )
 
 
 def sample_context(
@@ -113,7 +117,11 @@ class PassRun:
 
     def __init__(self, passes: Sequence[WeightedPass], request: PredictRequest) -> None:
         members = [each.classifier for each in passes]
-        self._members, self._request, self._factors = members, request, [each.factors for each in passes]
+        self._members, self._request, self._factors = (
+            members,
+            request,
+            [each.factors for each in passes],
+        )
         wanted = [request.rows]  # of each pass
         for one in members[:0:-1]:
             wanted.insert(0, around(request.xyz, wanted[0], one.context))
@@ -125,7 +133,9 @@ class PassRun:
         for one in members:
             # One for passes that read the same features, so that these are computed once.
             same = (
-                f for f in self._features if f is not None and f.features.to_dict() == one.features.to_dict()
+                f
+                for f in self._features
+                if f is not None and f.features.to_dict() == one.features.to_dict()
             )
             found = None if one.features is None else next(same, None)
             if found is None and one.features is not None:
@@ -144,7 +154,9 @@ class PassRun:
         if self._features[0] is None:
             self._ask_algorithm()
             first = 1
-        held: dict[int, dict[Any, list[Any]]] = {}  # band -> features -> (rows, values) of its blocks
+        held: dict[
+            int, dict[Any, list[Any]]
+        ] = {}  # band -> features -> (rows, values) of its blocks
         for step in range(len(bands) + number):
             for place in range(first, number):
                 if not 0 <= step - place < len(bands):
@@ -166,7 +178,9 @@ class PassRun:
         rows = None if self._wanted[0] is None else np.flatnonzero(self._wanted[0])
         inner = replace(self._request, rows=rows, progress=None, grid=None)
         every = np.arange(len(inner.xyz))
-        for rows, result in self._members[0].predict(inner, lambda p: count_shares(weighed(p, factors))):
+        for rows, result in self._members[0].predict(
+            inner, lambda p: count_shares(weighed(p, factors))
+        ):
             self._shares[0][self._strips.places(every[rows])] = result
 
     def _handing_on(self, place: int) -> Callable[..., npt.NDArray[np.uint16]]:
@@ -231,7 +245,9 @@ class Strips:
     ) -> None:
         number = cell_numbers(xyz[:, 1] if rows is None else xyz[rows, 1], width)
         self._order: npt.NDArray[np.int64] | None = None
-        if rows is not None or (number[1:] < number[:-1]).any():  # else they follow each other already
+        if (
+            rows is not None or (number[1:] < number[:-1]).any()
+        ):  # else they follow each other already
             order = np.argsort(number, kind="stable")
             number = number[order]
             self._order = order if rows is None else rows[order]

@@ -102,14 +102,18 @@ def draw_samples(
             progress.update(len(position))
     available = there.sum(axis=0)
     if not available.all():
-        raise OptionError("a class has no samples", found=f"class position {int(np.argmin(available))}")
+        raise OptionError(
+            "a class has no samples", found=f"class position {int(np.argmin(available))}"
+        )
     count = min(count, int(available.max()))
     alone = np.count_nonzero(there.any(axis=1)) == 1
     parts = []
     for position in range(n_classes):
         quota = share_out(there[:, position], count)
         for group in np.flatnonzero(quota):
-            random = [seed, position] if alone else [seed, position, crc32(str(names[group]).encode())]
+            random = (
+                [seed, position] if alone else [seed, position, crc32(str(names[group]).encode())]
+            )
             limit = np.uint64(min(1.0, MOST / there[group, position]) * (2.0**64 - 2048.0))
             keys, rows, where = [], [], []
             for number in np.flatnonzero(of_cloud == group).tolist():
@@ -126,7 +130,9 @@ def draw_samples(
             order = np.lexsort((found["hash"], found["cell"]))
             place, weight = spread(len(order), int(quota[group]), np.random.default_rng(random))
             chosen = order[place]
-            parts.append((cloud[chosen], row[chosen], np.full(len(chosen), position, np.int16), weight))
+            parts.append(
+                (cloud[chosen], row[chosen], np.full(len(chosen), position, np.int16), weight)
+            )
     cloud, row, label, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Samples(cloud, row, label, weight, tuple(available.tolist()))
 
@@ -275,7 +281,9 @@ def split(
     train = ~held
     if gap > 0 and held.any():
         others = np.flatnonzero(train)
-        distance, _ = cKDTree(xy[held]).query(xy[others], distance_upper_bound=np.nextafter(gap, np.inf))
+        distance, _ = cKDTree(xy[held]).query(
+            xy[others], distance_upper_bound=np.nextafter(gap, np.inf)
+        )
         train[others[distance <= gap]] = False
     return train, np.flatnonzero(held)
 
@@ -285,4 +293,7 @@ def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, An
     accuracy = Accuracy.from_confusion(matrix, codes)
     found = summary(accuracy)
     del found["points"]
-    return {**found, "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class}}
+    return {
+        **found,
+        "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class},
+    }

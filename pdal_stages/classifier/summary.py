@@ -77,15 +77,26 @@ def text(info: Mapping[str, Any]) -> str:
             info["strategy"] == "binary",
             f"binary, target {info['target']}, background {info['background']}",
         ),
-        ("densities", info.get("densities"), f"{range_text(info.get('densities') or {})} points/m2"),
+        (
+            "densities",
+            info.get("densities"),
+            f"{range_text(info.get('densities') or {})} points/m2",
+        ),
         ("voxel", info.get("voxel"), "{0:g} m, which one point stands for"),
         ("on top of", info.get("base"), "{0[name]}, the passes before (SHA-256 {0[sha256]})"),
         *(("trained on", c, "{0[name]}, {0[points]:,} points") for c in clouds[:_CLOUDS]),
         ("", len(clouds[_CLOUDS:]), "and {0:,} more (--showjson lists them)"),
-        ("labels", info.get("teacher"), "what {0[name]} is sure of ({0[sure]:g} and more); no person's"),
+        (
+            "labels",
+            info.get("teacher"),
+            "what {0[name]} is sure of ({0[sure]:g} and more); no person's",
+        ),
     ]
     lines += [f"{name:<15}{said.format(value)}" for name, value, said in rows if value]
-    lines += ["", f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 held out':>13}"]
+    lines += [
+        "",
+        f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 held out':>13}",
+    ]
     f1 = held_out(info).get("f1") or {}
     for entry in info["classes"]:
         name = entry["name"]
@@ -97,14 +108,18 @@ def text(info: Mapping[str, Any]) -> str:
     lines.append("")
     for number, one in passes:
         for by in ("neighborhood", "group", "feature") if "importances" in one else ():
-            top = ", ".join(f"{k} {100 * v:.1f} %" for k, v in list(one["importances"][by].items())[:10])
+            top = ", ".join(
+                f"{k} {100 * v:.1f} %" for k, v in list(one["importances"][by].items())[:10]
+            )
             lines.append(f"pass {number}: " * several + f"importance by {by:<13}{top}")
     return "\n".join(lines)
 
 
 def range_text(densities: Mapping[str, float]) -> str:
     """``0.3 to 46``, or one number where both are alike."""
-    return " to ".join(dict.fromkeys(f"{densities[one]:.3g}" for one in ("low", "high") if densities))
+    return " to ".join(
+        dict.fromkeys(f"{densities[one]:.3g}" for one in ("low", "high") if densities)
+    )
 
 
 def _in_one_line(value: Any) -> Any:

@@ -36,7 +36,9 @@ class Limit(NamedTuple):
 class Sureness:
     """Points by the class a model gave them and its reliability; weights are as the points lie."""
 
-    right: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)  #: (BINS,) of each class
+    right: dict[int, npt.NDArray[np.float64]] = field(
+        default_factory=dict
+    )  #: (BINS,) of each class
     wrong: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
     about: str = ""  #: where they were counted
 
@@ -48,7 +50,9 @@ class Sureness:
         weight: npt.NDArray[np.floating] | None = None,
     ) -> None:
         """Count points: (n,) classes given, true classes, reliabilities, and how much each counts."""
-        place = np.clip(np.floor(np.asarray(reliability, np.float64) * BINS), 0, BINS - 1).astype(np.int64)
+        place = np.clip(np.floor(np.asarray(reliability, np.float64) * BINS), 0, BINS - 1).astype(
+            np.int64
+        )
         for code in np.unique(given).tolist():
             for table, chosen in ((self.right, given == true), (self.wrong, given != true)):
                 mine = (given == code) & chosen
@@ -67,12 +71,18 @@ class Sureness:
                 out[code] = Limit(2.0, 0.0, float(np.max(right / np.maximum(all_, 1e-12))))
                 continue
             first = int(np.flatnonzero(good)[0])
-            out[code] = Limit(first / BINS, float(all_[first] / all_[0]), float(right[first] / all_[first]))
+            out[code] = Limit(
+                first / BINS, float(all_[first] / all_[0]), float(right[first] / all_[first])
+            )
         return out
 
     def points(self, codes: Iterable[int]) -> float:
         """The points that were given these classes."""
-        return sum(float((self.right[code] + self.wrong[code]).sum()) for code in codes if code in self.right)
+        return sum(
+            float((self.right[code] + self.wrong[code]).sum())
+            for code in codes
+            if code in self.right
+        )
 
     def kept(self, limits: Mapping[int, Limit]) -> float:
         """The share of all points that keep their class."""
@@ -84,7 +94,8 @@ class Sureness:
         tables = {"right": self.right, "wrong": self.wrong}
         classes = {
             str(code): {
-                name: [float(f"{value:.4g}") for value in table[code]] for name, table in tables.items()
+                name: [float(f"{value:.4g}") for value in table[code]]
+                for name, table in tables.items()
             }
             for code in sorted(self.right)
         }
@@ -99,7 +110,11 @@ class Sureness:
             for code, counted in said["classes"].items():
                 for table, name in ((made.right, "right"), (made.wrong, "wrong")):
                     table[int(code)] = values = np.array(counted[name], np.float64)
-                    if values.shape != (BINS,) or not (values >= 0).all() or not np.isfinite(values).all():
+                    if (
+                        values.shape != (BINS,)
+                        or not (values >= 0).all()
+                        or not np.isfinite(values).all()
+                    ):
                         raise ValueError(name)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(
@@ -123,7 +138,9 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
         try:
             return Sureness.from_dict(strict_json(beside.read_bytes()))
         except (OSError, ValueError, RecursionError) as error:
-            raise ModelError("the file beside the model is damaged", where=str(beside), found=error) from None
+            raise ModelError(
+                "the file beside the model is damaged", where=str(beside), found=error
+            ) from None
     cure = "Train it with folds (the default), on labels that lie in more than one place"
     if info.get("teacher"):
         cure = "Its labels are another model's answers; take a model that was scored on a person's labels"

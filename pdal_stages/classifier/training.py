@@ -13,7 +13,13 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..features.index import check_xyz
-from .algorithms import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS, preparation_module, required, trainer
+from .algorithms import (
+    DEFAULT_DIMENSIONS,
+    OPTIONAL_DIMENSIONS,
+    preparation_module,
+    required,
+    trainer,
+)
 from .clouds import TrainingCloud, prepared, spooled
 from .context import Context
 from .model import Model
@@ -71,7 +77,11 @@ def train(
         sources = [TrainingCloud(xyz, labels, dimensions)]
     with tempfile.TemporaryDirectory(prefix="pdal-stages-") as temporary:
         each = prepared(sources, options)
-        made = list(each) if isinstance(sources, list | tuple) else spooled(each, folder or Path(temporary))
+        made = (
+            list(each)
+            if isinstance(sources, list | tuple)
+            else spooled(each, folder or Path(temporary))
+        )
         made = [one for one in made if one.points]
         if not made:
             left_out = ", ".join(map(str, options.ignore))
@@ -101,7 +111,11 @@ def _prepared(
     if tuple(options.dimensions) == DEFAULT_DIMENSIONS:
         more = trainer(options.algorithm).optional_inputs
         options = replace(
-            options, dimensions=(*DEFAULT_DIMENSIONS, *(name for name in OPTIONAL_DIMENSIONS if name in more))
+            options,
+            dimensions=(
+                *DEFAULT_DIMENSIONS,
+                *(name for name in OPTIONAL_DIMENSIONS if name in more),
+            ),
         )
     preparation = preparation_module().preparation_of(required(options.inputs))
     usable = ~np.isin(np.asarray(labels), options.ignore)

@@ -70,9 +70,15 @@ class TrainingOptions(Settings):
         1, "integer", "Code given to all other classes with the binary strategy", 0, 255
     )
     count: int = setting(
-        40_000, "integer", "Samples per class; smaller classes are filled up with duplicates", 1, 10**8
+        40_000,
+        "integer",
+        "Samples per class; smaller classes are filled up with duplicates",
+        1,
+        10**8,
     )
-    seed: int = setting(0, "integer", "Seed for sampling, trees and shape distributions", 0, 2**31 - 1)
+    seed: int = setting(
+        0, "integer", "Seed for sampling, trees and shape distributions", 0, 2**31 - 1
+    )
     trees: int = setting(50, "integer", "Number of trees", 1, 10_000)
     min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", 1, 10**6)
     max_samples: float | None = setting(
@@ -150,7 +156,9 @@ class TrainingOptions(Settings):
         "mapping",
         'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
     )
-    threads: int | None = setting(None, "integer", "Threads to use; by default every available core")
+    threads: int | None = setting(
+        None, "integer", "Threads to use; by default every available core"
+    )
     memory_mb: float = setting(
         512.0,
         "number",
@@ -166,7 +174,9 @@ class TrainingOptions(Settings):
 
         super().__post_init__()
         if not isinstance(self.groups, str):
-            raise OptionError("'groups' must be the name of a dimension", found=repr(self.groups)[:60])
+            raise OptionError(
+                "'groups' must be the name of a dimension", found=repr(self.groups)[:60]
+            )
         check_side(self.voxel)
         if self.folds == 1:
             raise OptionError("'folds' must be 0 or at least 2", found=1)
@@ -180,7 +190,9 @@ class TrainingOptions(Settings):
         if base is not None:
             if (passes := getattr(base, "passes", None)) is None:
                 raise OptionError(
-                    "'base' must be a model", found=type(base).__name__, cure="Load it with load_model"
+                    "'base' must be a model",
+                    found=type(base).__name__,
+                    cure="Load it with load_model",
                 )
             if len(passes) > MOST_PASSES:
                 raise OptionError(
@@ -190,7 +202,9 @@ class TrainingOptions(Settings):
                 )
             if self.algorithm != "random_forest":
                 raise OptionError(
-                    "only a forest is built on a 'base'", found=self.algorithm, cure="Leave 'algorithm' out"
+                    "only a forest is built on a 'base'",
+                    found=self.algorithm,
+                    cure="Leave 'algorithm' out",
                 )
             if self.passes == 1:
                 object.__setattr__(self, "voxel", base.voxel)
@@ -200,7 +214,9 @@ class TrainingOptions(Settings):
                 "several passes need a context", found="an empty list", cure="Leave 'context' out"
             )
         if base is not None and OWN not in self.context:
-            raise OptionError(f"with a 'base', 'context' must have '{OWN}'", found=", ".join(self.context))
+            raise OptionError(
+                f"with a 'base', 'context' must have '{OWN}'", found=", ".join(self.context)
+            )
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
@@ -215,16 +231,23 @@ class TrainingOptions(Settings):
             )
         put("dimensions", checks.names)
         thin = [self.thin] if isinstance(self.thin, int | float) else self.thin
-        put("thin", lambda what, _: tuple(checks.number(what, one, 0, 10**6, above=True) for one in thin))
+        put(
+            "thin",
+            lambda what, _: tuple(checks.number(what, one, 0, 10**6, above=True) for one in thin),
+        )
         ignore = [self.ignore] if isinstance(self.ignore, int) else self.ignore
-        put("ignore", lambda what, _: tuple(checks.whole(what, one, 0, MAX_LABEL) for one in ignore))
+        put(
+            "ignore", lambda what, _: tuple(checks.whole(what, one, 0, MAX_LABEL) for one in ignore)
+        )
         resolve_threads(self.threads)
 
     def _check_algorithm(self) -> None:
         checks.one_of("'algorithm'", self.algorithm, ALGORITHMS)
         for name in ALGORITHMS:  # an algorithm's own options stand under its name
             if name != self.algorithm and getattr(self, name, None):
-                raise OptionError(f"'{name}' applies only to algorithm '{name}'", found=self.algorithm)
+                raise OptionError(
+                    f"'{name}' applies only to algorithm '{name}'", found=self.algorithm
+                )
         own = trainer(self.algorithm).own_options(getattr(self, self.algorithm, None))
         if own is not None:
             object.__setattr__(self, self.algorithm, own)

@@ -42,10 +42,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None:
         # OpenBLAS's threads spin while waiting and gain almost nothing.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        gc.set_threshold(300_000)  # imports alone create so many objects that Python collects over and over
+        gc.set_threshold(
+            300_000
+        )  # imports alone create so many objects that Python collects over and over
         atexit.register(gc.freeze)  # nor is there anything to collect when the process ends
     streams = sys.stdout, sys.stderr
-    for stream in streams:  # characters that the locale lacks are escaped, rather than ending the run
+    for (
+        stream
+    ) in streams:  # characters that the locale lacks are escaped, rather than ending the run
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
             # Line by line, so that messages and results keep their order in a file as well.
             stream.reconfigure(errors="backslashreplace", line_buffering=True)  # type: ignore[union-attr]
@@ -115,12 +119,20 @@ def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
             parser.commands[command].error(lacking)
     options, unknown = parser.commands[command].parse_known_intermixed_args(rest)
     if unknown:
-        near = suggest(unknown[0].partition("=")[0], parser.commands[command]._option_string_actions)
-        parser.commands[command].error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
+        near = suggest(
+            unknown[0].partition("=")[0], parser.commands[command]._option_string_actions
+        )
+        parser.commands[command].error(
+            f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". ")
+        )
     if overrides and not options.takes_overrides:
         raise StageError(f"'{command}' takes no stage options", found=overrides[0].flag)
     options.command = command
-    options.overrides, options.arguments, options.is_program = overrides, list(arguments), is_program
+    options.overrides, options.arguments, options.is_program = (
+        overrides,
+        list(arguments),
+        is_program,
+    )
     return options
 
 
@@ -130,7 +142,9 @@ def _refuse_little_room() -> None:
         import resource
 
         if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < 2**30:
-            raise StageError("too little memory", found=f"ulimit -v {limit // 1024}", cure="Allow 1 GB")
+            raise StageError(
+                "too little memory", found=f"ulimit -v {limit // 1024}", cure="Allow 1 GB"
+            )
 
 
 def _unforeseen(error: Exception) -> StageError:
@@ -152,7 +166,8 @@ def _unforeseen(error: Exception) -> StageError:
             "another NumPy or Python must be installed again",
         )
     return StageError(
-        f"internal error: {type(error).__name__}: {error}", cure="Run with --debug and report what it prints"
+        f"internal error: {type(error).__name__}: {error}",
+        cure="Run with --debug and report what it prints",
     )
 
 
@@ -233,5 +248,10 @@ def takes_options(takes: Callable, stage: str, *names: str) -> None:
             default, choices = option.shown_default.replace(",", ", "), option.choices or None
             what = (option.help + f" (default: {default})" * bool(default)).replace("%", "%%")
             value = None if choices else option.name.split("_")[-1].upper()
-            how = {"type": kinds.get(option.kind), "choices": choices, "help": what, "metavar": value}
+            how = {
+                "type": kinds.get(option.kind),
+                "choices": choices,
+                "help": what,
+                "metavar": value,
+            }
             takes(f"--{option.name.replace('_', '-')}", **how)

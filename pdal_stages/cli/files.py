@@ -18,7 +18,13 @@ def add_commands(parser: Parser) -> None:
     takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
     takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
     takes_options(takes, "writers.objects", *_OF_OBJECTS)
-    takes("--workers", type=int, default=1, metavar="N", help="Files to read at the same time (default: 1)")
+    takes(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="Files to read at the same time (default: 1)",
+    )
     takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
     what = "List the places that a person should check, worst first"
@@ -28,11 +34,31 @@ def add_commands(parser: Parser) -> None:
     takes("--html", metavar="FILE", help="Web page to write (default: beside the vector file)")
     takes("--json", metavar="FILE", help="Write figures to a JSON file")
     takes(
-        "--share", type=float, default=0.95, metavar="SHARE", help="Share of expected errors to cover (0.95)"
+        "--share",
+        type=float,
+        default=0.95,
+        metavar="SHARE",
+        help="Share of expected errors to cover (0.95)",
     )
-    takes("--cell", type=float, default=0.0, metavar="METERS", help="Side of the cells (default: by density)")
-    takes("--workers", type=int, default=1, metavar="N", help="Files to read at the same time (default: 1)")
-    takes("--model", default="standard", help="Model for files without Reliability (default: standard)")
+    takes(
+        "--cell",
+        type=float,
+        default=0.0,
+        metavar="METERS",
+        help="Side of the cells (default: by density)",
+    )
+    takes(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="Files to read at the same time (default: 1)",
+    )
+    takes(
+        "--model",
+        default="standard",
+        help="Model for files without Reliability (default: standard)",
+    )
 
     what = "Mark points that a person corrected or confirmed, to train on"
     takes = parser.command("corrections", _corrections, what)
@@ -41,7 +67,13 @@ def add_commands(parser: Parser) -> None:
     takes("--out", required=True, metavar="FILE", help="File to write: new classes, and Checked")
     area = "Polygons in which all points were checked; of review's file, those with 'done' 1"
     takes("--area", action="append", default=[], metavar="FILE", help=area)
-    takes("--around", type=float, default=1.0, metavar="METERS", help="Radius checked around changes (1)")
+    takes(
+        "--around",
+        type=float,
+        default=1.0,
+        metavar="METERS",
+        help="Radius checked around changes (1)",
+    )
 
 
 def _objects(options: argparse.Namespace) -> None:
@@ -65,6 +97,10 @@ def _review(options: argparse.Namespace) -> None:
 def _corrections(options: argparse.Namespace) -> None:
     from ..pipeline.correcting import write_corrections
 
-    told = write_corrections(options.before, options.out, options.after or "", options.area, options.around)
+    told = write_corrections(
+        options.before, options.out, options.after or "", options.area, options.around
+    )
     print("\n".join(told))
-    print(f"written to {options.out}; next: pdal-stages train --base MODEL {options.out} --model NEW")
+    print(
+        f"written to {options.out}; next: pdal-stages train --base MODEL {options.out} --model NEW"
+    )

@@ -30,13 +30,17 @@ def add_commands(parser: Parser) -> None:
     takes("stage", help="One of ours or PDAL's, e.g. filters.hag_minima")
     takes("--showjson", action="store_true", help="As JSON Schema")
 
-    takes = parser.command("commands", partial(_commands, parser), "List commands with their arguments")
+    takes = parser.command(
+        "commands", partial(_commands, parser), "List commands with their arguments"
+    )
     told = "As JSON, with stages, models and classes, for programs that build dialogs"
     takes("--showjson", action="store_true", help=told)
 
     parser.command("doctor", _doctor, "Check what is installed, and say how to get what is missing")
 
-    parser.command("plugin", _plugin, "Build our stages into PDAL itself, for all programs that use it")
+    parser.command(
+        "plugin", _plugin, "Build our stages into PDAL itself, for all programs that use it"
+    )
     command = parser.commands["plugin"]
     what = command.add_mutually_exclusive_group(required=True)
     what.add_argument("--install", action="store_true", help="Compile them, beside filters.python")
@@ -45,14 +49,27 @@ def add_commands(parser: Parser) -> None:
     folder = "Another folder; PDAL_DRIVER_PATH must name it and the folder of filters.python"
     command.add_argument("--folder", type=Path, metavar="DIR", help=folder)
 
-    takes = parser.command("demo", _demo, "Make a town, train on one half, classify the other", logged=True)
-    takes("folder", nargs="?", default="pdal-stages-demo", help="Folder for the results (pdal-stages-demo)")
+    takes = parser.command(
+        "demo", _demo, "Make a town, train on one half, classify the other", logged=True
+    )
+    takes(
+        "folder",
+        nargs="?",
+        default="pdal-stages-demo",
+        help="Folder for the results (pdal-stages-demo)",
+    )
     takes("--size", type=float, default=200.0, help="Side of the town in meters (200)")
     takes("--density", type=float, default=7.0, help="Points per square meter (7)")
     takes("--seed", type=int, default=1, help="Another number gives another town (1)")
 
-    takes = parser.command("warmup", _warmup, "Compile the kernels now, so that later runs do not wait")
-    takes("--all", action="store_true", help="Also the kernels of kopt, ropt, copt and shape distributions")
+    takes = parser.command(
+        "warmup", _warmup, "Compile the kernels now, so that later runs do not wait"
+    )
+    takes(
+        "--all",
+        action="store_true",
+        help="Also the kernels of kopt, ropt, copt and shape distributions",
+    )
 
 
 def _drivers(options: argparse.Namespace) -> None:
@@ -61,7 +78,10 @@ def _drivers(options: argparse.Namespace) -> None:
 
     ours = {name: stage.summary for name, stage in stage_types().items()}
     if options.showjson:
-        listed = [{"name": n, "description": text, "link": "", "extensions": []} for n, text in ours.items()]
+        listed = [
+            {"name": n, "description": text, "link": "", "extensions": []}
+            for n, text in ours.items()
+        ]
         if not options.ours:  # with our plugin, PDAL lists ours as well
             theirs = json.loads(ask_program("--drivers", "--showjson"))
             listed += [entry for entry in theirs if entry["name"] not in ours]
@@ -104,7 +124,10 @@ def _options(options: argparse.Namespace) -> None:
         text, default = option.help, option.shown_default
         if option.choices:
             text += f" (one of: {', '.join(map(str, option.choices))})"
-        print(f"  {option.name}" + ("  (required)" if option.required else f" [{default}]" * bool(default)))
+        print(
+            f"  {option.name}"
+            + ("  (required)" if option.required else f" [{default}]" * bool(default))
+        )
         print(textwrap.indent(textwrap.fill(text, 74), " " * 6) + "\n")
 
 
@@ -132,7 +155,9 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
         "format": _FORMAT,
         "version": __version__,
         "models": list(shipped()),
-        "classes": {str(code): {"name": name, "color": class_color(code)} for code, name in NAMES.items()},
+        "classes": {
+            str(code): {"name": name, "color": class_color(code)} for code, name in NAMES.items()
+        },
         "commands": {
             name: {
                 "help": parser.description,
@@ -149,7 +174,11 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
                 "help": stage.summary,
                 "options": [
                     asdict(one)
-                    | {"default": one.typed_default if isinstance(one.default, tuple) else one.default}
+                    | {
+                        "default": one.typed_default
+                        if isinstance(one.default, tuple)
+                        else one.default
+                    }
                     for one in stage.all_options()
                 ],
             }
@@ -166,7 +195,9 @@ def _argument(action: argparse.Action) -> dict[str, Any]:
     default = bool(action.default) if switch else action.default
     return {
         "name": action.dest,
-        "flag": max(action.option_strings, key=len, default="") if not switch else action.option_strings[0],
+        "flag": max(action.option_strings, key=len, default="")
+        if not switch
+        else action.option_strings[0],
         "off": next((one for one in action.option_strings if one.startswith("--no-")), ""),
         "kind": kind,
         "help": (action.help or "").replace("%%", "%"),

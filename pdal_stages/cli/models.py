@@ -25,7 +25,9 @@ def add_commands(parser: Parser) -> None:
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("--model", required=True, help="Model file to write")
     takes_options(takes, "writers.classifiermodel", *_OF_TRAINING)
-    surveys = "Files that belong to one survey, e.g. north=north/*.laz; any other file counts as a survey"
+    surveys = (
+        "Files that belong to one survey, e.g. north=north/*.laz; any other file counts as a survey"
+    )
     takes("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
 
     tiles.add_sizes(parser.commands["train"])
@@ -33,18 +35,41 @@ def add_commands(parser: Parser) -> None:
     takes = parser.command("adapt", _adapt, what, logged=True)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("--model", required=True, help="Model file to write, for classify --model")
-    takes("--teacher", default="standard", metavar="MODEL", help="Model to learn from (default: standard)")
-    takes("--sure", type=float, default=0.7, metavar="SHARE", help="Least Reliability to learn from (0.7)")
+    takes(
+        "--teacher",
+        default="standard",
+        metavar="MODEL",
+        help="Model to learn from (default: standard)",
+    )
+    takes(
+        "--sure",
+        type=float,
+        default=0.7,
+        metavar="SHARE",
+        help="Least Reliability to learn from (0.7)",
+    )
     tiles.add_sizes(parser.commands["adapt"])
 
     what = "Compare classes with a reference, points or objects"
     takes = parser.command("accuracy", _accuracy, what, overrides=True, logged=True)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
-    takes("--reference", action="append", metavar="FILE", help="True classes: the same points in their order")
+    takes(
+        "--reference",
+        action="append",
+        metavar="FILE",
+        help="True classes: the same points in their order",
+    )
     takes("--model", help="Classify labeled files with this model and score it")
-    takes("--dimension", default="Classification", metavar="NAME", help="Dimension to score (Classification)")
+    takes(
+        "--dimension",
+        default="Classification",
+        metavar="NAME",
+        help="Dimension to score (Classification)",
+    )
     takes("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
-    takes("--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)")
+    takes(
+        "--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)"
+    )
     takes("--area", metavar="FILE", help="With --objects: count only objects inside these polygons")
     takes("--json", metavar="FILE", help="Write the figures to a JSON file")
     takes("--html", metavar="FILE", help="Write a report to a web page")
@@ -73,7 +98,9 @@ def _train(options: argparse.Namespace) -> None:
     extra = {name: value for name in _OF_TRAINING if (value := getattr(options, name)) is not None}
     files = input_files(options.inputs)
     surveys = {} if options.surveys is None else surveys_of(files, options.surveys)
-    task = TrainTask(files, options.model, options.overrides, extra, tiles.options_of(options), surveys)
+    task = TrainTask(
+        files, options.model, options.overrides, extra, tiles.options_of(options), surveys
+    )
     with tiles.interruptible():
         said = task.run()
     # Nothing is said of one written into a pipe or device

@@ -42,7 +42,11 @@ def add_commands(parser: Parser) -> None:
     _input(takes)
     takes("-o", "--output", metavar="FILE", help="Write to a file, not to standard output")
 
-    _input(parser.command("validate", _validate, "Check a pipeline without reading points", overrides=True))
+    _input(
+        parser.command(
+            "validate", _validate, "Check a pipeline without reading points", overrides=True
+        )
+    )
 
 
 def _input(takes: Callable) -> None:
@@ -61,7 +65,9 @@ def _source(options: argparse.Namespace) -> Path | PipelineSource:
         return parse_pipeline(text or " ", "standard input")
     name = options.file or options.file_option
     if not name:
-        raise StageError("no pipeline file was given", cure=f"Usage: pdal-stages {options.command} job.json")
+        raise StageError(
+            "no pipeline file was given", cure=f"Usage: pdal-stages {options.command} job.json"
+        )
     return Path(name)
 
 
@@ -107,7 +113,9 @@ def _in_tiles(options: argparse.Namespace) -> int:
         make_plan(pipeline, chosen.buffer)
         print(pipeline.validate())
         return 0
-    outputs = writers_outputs(pipeline.expanded.stages)  # '#' stands for names here, not for numbers
+    outputs = writers_outputs(
+        pipeline.expanded.stages
+    )  # '#' stands for names here, not for numbers
     named = [one for one in outputs if "#" not in one.path and Path(one.path).parent.is_dir()]
     check_outputs([*named, *extra], pipeline.inputs())
     run, interrupted = tiles.ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
@@ -133,6 +141,8 @@ def _validate(options: argparse.Namespace) -> int:
         print_messages(*pipeline.expanded.warnings)
         return 0
     except StageError as error:
-        print(json.dumps({"valid": False, "error_detail": str(error), "streamable": False}, indent=2))
+        print(
+            json.dumps({"valid": False, "error_detail": str(error), "streamable": False}, indent=2)
+        )
         print_messages(str(error))
         return 1

@@ -80,7 +80,11 @@ def _classify(options: argparse.Namespace) -> int:
         own = [one for one in others if not one.by_tag and one.selector in OPTIONS_OF]
         others = [one for one in others if one not in own]
     listed = options.dimensions
-    named = WRITTEN if listed is None else tuple(name.strip() for name in listed.split(",") if name.strip())
+    named = (
+        WRITTEN
+        if listed is None
+        else tuple(name.strip() for name in listed.split(",") if name.strip())
+    )
     same = ("noise", "bridges", "towers", "consistency", "keep_sure")
     request = ClassifyRequest(
         options.model,
@@ -114,7 +118,9 @@ def _classify(options: argparse.Namespace) -> int:
         print("1 input, in one piece")
         return 0
     end_at_once(options)
-    if options.is_program and not options.polygons:  # laspy loads them, half of its import, for nothing
+    if (
+        options.is_program and not options.polygons
+    ):  # laspy loads them, half of its import, for nothing
         sys.modules.update(dict.fromkeys({"requests", "pyproj"} - sys.modules.keys()))  # type: ignore[arg-type]
     written = task.run_whole()
     if options.metadata:
@@ -142,7 +148,9 @@ def _classify_tiles(
             for code, n in sorted(classes.items())
         ]
         said = f"; {', '.join(shares)}" if shares else ""
-        print(f"{job.outputs[0]}: {counted(job.record.get('written', 0), 'point')}{said}", flush=True)
+        print(
+            f"{job.outputs[0]}: {counted(job.record.get('written', 0), 'point')}{said}", flush=True
+        )
 
     run, interrupted = ran(lambda: task.run_tiles(dry_run=options.dry_run, finished=finished))
     if options.dry_run:
@@ -168,13 +176,29 @@ def add_arguments(command: argparse.ArgumentParser, survey: bool = False) -> Non
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
     when = "Several inputs and large files are cut into tiles" if survey else "Run in tiles"
     takes = add_sizes(command, f"{when} (docs/large-areas.md).")
-    takes("--scheduler", default="", metavar="ADDRESS", help="A running Dask scheduler, tcp://HOST:8786")
-    takes("--per", choices=PER, default="auto", help="One output per input or per tile (auto: per input)")
+    takes(
+        "--scheduler",
+        default="",
+        metavar="ADDRESS",
+        help="A running Dask scheduler, tcp://HOST:8786",
+    )
+    takes(
+        "--per",
+        choices=PER,
+        default="auto",
+        help="One output per input or per tile (auto: per input)",
+    )
     around = argparse.SUPPRESS if survey else "How far PDAL's own filters look beyond a tile"
     takes("--buffer", type=float, metavar="METERS", help=around)
     takes("--resume", action="store_true", help="Continue a run that was stopped or failed")
     takes("--dry-run", action="store_true", help="Show tiles, memory and disk needed, then stop")
-    takes("--report", action="append", default=[], metavar="FILE", help="Write a report, .html or .json")
+    takes(
+        "--report",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="Write a report, .html or .json",
+    )
 
 
 def add_sizes(
@@ -183,9 +207,19 @@ def add_sizes(
 ) -> Callable:
     """Add the flags of ``train``, whose only output is a model; returns a function that adds more."""
     takes = command.add_argument_group("large areas", what).add_argument
-    takes("--tile", type=_side, metavar="SIZE", help="Side of the tiles in the cloud's unit (default: auto)")
+    takes(
+        "--tile",
+        type=_side,
+        metavar="SIZE",
+        help="Side of the tiles in the cloud's unit (default: auto)",
+    )
     takes("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
-    takes("--workers", type=int, metavar="N", help="Worker processes, 0 for none (default: half the cores)")
+    takes(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="Worker processes, 0 for none (default: half the cores)",
+    )
     return takes
 
 
@@ -301,7 +335,9 @@ def print_run(run: TiledRun) -> None:
         files = Counter(out.state for out in run.outputs)
         lines.append(f"{counted(files['done'], 'file')} written{_others(files)}")
     lines.append(f"{counted(s['states']['done'], 'tile')} done{_others(s['states'])}")
-    lines.append(f"{s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)")
+    lines.append(
+        f"{s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)"
+    )
     print("; ".join(lines))
     if s["dropped"]:
         print(f"{s['dropped']:,} points were dropped by filters of the pipeline")
@@ -313,7 +349,9 @@ def print_run(run: TiledRun) -> None:
 
 def _others(states: Mapping[str, int]) -> str:
     told = {"kept": "kept from an earlier run", "failed": "failed"}
-    return "".join(f", {states[state]:,} {what}" for state, what in told.items() if states.get(state))
+    return "".join(
+        f", {states[state]:,} {what}" for state, what in told.items() if states.get(state)
+    )
 
 
 def _print_failures(run: TiledRun) -> None:
@@ -326,11 +364,19 @@ def _print_failures(run: TiledRun) -> None:
 def print_dry(run: TiledRun) -> None:
     """Print what a run would do."""
     s = run.summary
-    workers = {0: "this process", 1: "the worker"}.get(s["workers"], f"each of {s['workers']} workers")
-    print(f"{counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it")
-    print(f"{counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}")
+    workers = {0: "this process", 1: "the worker"}.get(
+        s["workers"], f"each of {s['workers']} workers"
+    )
+    print(
+        f"{counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it"
+    )
+    print(
+        f"{counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}"
+    )
     print(f"about {s['points_read_by_a_tile']:,} points read for a tile")
-    print(f"up to {s['memory_mb_of_a_worker']:,.0f} MB for {workers} with {s['threads_per_worker']} threads")
+    print(
+        f"up to {s['memory_mb_of_a_worker']:,.0f} MB for {workers} with {s['threads_per_worker']} threads"
+    )
     print(f"about {s['disk_gb']:,.2f} GB of disk beside the outputs")
     print(*(f"  {job.name}" for job in run.tiles[:_MOST_TILES]), sep="\n")
     if len(run.tiles) > _MOST_TILES:

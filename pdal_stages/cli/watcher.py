@@ -36,7 +36,9 @@ def watched(arguments: Sequence[str]) -> Callable[[], None]:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
             signal.signal(number, lambda number, _: asked.append(number))
         if not os.read(watcher_end, 1):
-            print_messages("interrupted; nothing half-written was left" if asked else str(_death(arguments)))
+            print_messages(
+                "interrupted; nothing half-written was left" if asked else str(_death(arguments))
+            )
             sys.stderr.flush()
     finally:
         os._exit(0)

@@ -8,4 +8,11 @@ from .engine import FeatureEngine, compute_features, warmup
 from .plan import FeaturePlan
 from .table import FeatureTable
 
-__all__ = ["FeatureEngine", "FeaturePlan", "FeatureTable", "ShapeBins", "compute_features", "warmup"]
+__all__ = [
+    "FeatureEngine",
+    "FeaturePlan",
+    "FeatureTable",
+    "ShapeBins",
+    "compute_features",
+    "warmup",
+]

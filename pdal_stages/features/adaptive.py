@@ -26,7 +26,17 @@ from .index import CellGrid, build_tree
 from .moments import COINCIDENT, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
 from .neighborhoods import AROUND, COPT_REACH
 from .plan import MOMENT_FEATURES, SURFACES, Columns, FeaturePlan, columns_of
-from .search import CROWD, FIRST2, LEAST2, MORE, ROOM, gather_near, make_groups, make_near, sort_near
+from .search import (
+    CROWD,
+    FIRST2,
+    LEAST2,
+    MORE,
+    ROOM,
+    gather_near,
+    make_groups,
+    make_near,
+    sort_near,
+)
 from .shapes import Axes, shapes_of, write_shapes
 from .surfaces import COLUMNS, FAR, SURFACE, UP, agreement
 
@@ -117,7 +127,13 @@ class AdaptiveNeighborhoods:
                 points, made = self._part(part), self._surfaces[part]
                 (table,) = self.choose(around, points)
                 finish(
-                    table, 0.0, points[2], np.zeros(1, np.int64), np.ones(len(made), np.int64), COLUMNS, made
+                    table,
+                    0.0,
+                    points[2],
+                    np.zeros(1, np.int64),
+                    np.ones(len(made), np.int64),
+                    COLUMNS,
+                    made,
                 )
                 made[:, FAR] = table[REACH] * UP
 
@@ -138,21 +154,29 @@ class AdaptiveNeighborhoods:
         """The curvature of every point of the cloud, in the order of the grid, (n,) float64 [H17]."""
         curvatures = np.empty(len(self.grid))
         radius = np.array([CURVATURE_RADIUS])
-        search = Search((), radius, np.zeros(0, np.int64), 1.0, 1.0, np.zeros((0, 3), np.int64), True)
+        search = Search(
+            (), radius, np.zeros(0, np.int64), 1.0, 1.0, np.zeros((0, 3), np.int64), True
+        )
         self._for_all(
-            lambda part: self.choose(search, self._part(part), least=least, curvature=curvatures[part]),
+            lambda part: self.choose(
+                search, self._part(part), least=least, curvature=curvatures[part]
+            ),
             threads,
         )
         return curvatures
 
-    def shape_values(self, points: Axes, seed: int, copt_threshold: float | None) -> dict[str, np.ndarray]:
+    def shape_values(
+        self, points: Axes, seed: int, copt_threshold: float | None
+    ) -> dict[str, np.ndarray]:
         """By neighborhood the metrics of all pulls round a few points, (m, 5, 255) float32, comparable."""
         if not self.shaped:
             return {}
         shapes = shapes_of(self.chosen, points, seed, None)
         for search in self.searches:
             self.choose(search, points, copt_threshold, shapes)
-        return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes}
+        return {
+            c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes
+        }
 
     def fill(
         self,
@@ -177,13 +201,29 @@ class AdaptiveNeighborhoods:
         for search in self.searches:
             table = self.choose(search, points, copt_threshold, shapes, out)
             for number, rows in zip(search.numbers, table, strict=True):
-                finish(rows, 0.0, points[2], few[number : number + 1], copies, self.columns[number], out)
+                finish(
+                    rows,
+                    0.0,
+                    points[2],
+                    few[number : number + 1],
+                    copies,
+                    self.columns[number],
+                    out,
+                )
                 far[number] += int(copies[rows[REACH] > self.halo_m].sum())
                 reach = max(reach, float(rows[REACH].max(initial=0.0)))
         return reach
 
     def choose(
-        self, search: Search, points: Axes, threshold=None, shapes=None, out=None, *, least=0, curvature=None
+        self,
+        search: Search,
+        points: Axes,
+        threshold=None,
+        shapes=None,
+        out=None,
+        *,
+        least=0,
+        curvature=None,
     ) -> np.ndarray:
         """Moments (numbers, ROWS, m) of what is chosen; shapes, surfaces and curvatures go where arguments say."""
         m = len(points[0])
@@ -208,9 +248,12 @@ def _by_number(ranges: dict[int, tuple[int, int]], around: bool) -> Search:
     all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
     ks = np.array(sorted(all_ks | ({AROUND} if around else set())), np.int64)
     choices = [
-        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST] for first, last in ranges.values()
+        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST]
+        for first, last in ranges.values()
     ]
-    return Search(tuple(ranges), np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 3))
+    return Search(
+        tuple(ranges), np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 3)
+    )
 
 
 def _searches(chosen: list[Columns], least: int) -> list[Search]:
@@ -263,7 +306,12 @@ def adaptive_block(
     near, s = make_near(CROWD * need + ROOM), np.empty((MOMENTS + 1, len(radii) + len(ks)))
     ends, record = np.zeros(len(radii) + len(ks), np.int64), np.empty((0, 4), np.float32)
     # What finish takes for one query (a constant's type would have it compiled once more).
-    alone = np.empty((1, SURFACE), np.float32), np.empty((ROWS, 1)), np.zeros(1, np.int64), COLUMNS.copy()
+    alone = (
+        np.empty((1, SURFACE), np.float32),
+        np.empty((ROWS, 1)),
+        np.zeros(1, np.int64),
+        COLUMNS.copy(),
+    )
     done = 0
     while True:
         if shapes is not None:
@@ -316,7 +364,9 @@ def _adaptive(
                     ends[shells + e] = min(ks[e] + 1, found)
                 add_up(near, x, y, z, ends, 0, shells, s)
                 add_up(near, x, y, z, ends, shells, count, s)
-                farthest2 = max(farthest2, near.sorted[min(found, need) - 1] if need and found else 0.0)
+                farthest2 = max(
+                    farthest2, near.sorted[min(found, need) - 1] if need and found else 0.0
+                )
                 if curved:
                     at = 0
                     while radii[at] < CURVATURE_RADIUS:
@@ -329,7 +379,9 @@ def _adaptive(
                     else:  # no point of the cloud
                         write_moments(s, shells + around, single, 0)
                         finish(single, 1.0, qz[q : q + 1], none, none, columns, own)
-                        own[0, FAR] = math.sqrt(near.sorted[AROUND]) * UP if found > AROUND else math.inf
+                        own[0, FAR] = (
+                            math.sqrt(near.sorted[AROUND]) * UP if found > AROUND else math.inf
+                        )
                 for j in range(len(numbers)):
                     first, last, members = choices[j, 0], choices[j, 1], choices[j, 2]
                     if curved and curvature[q] >= threshold:
@@ -345,7 +397,9 @@ def _adaptive(
                         k = ks[last - 1 - shells]
                         reach = math.sqrt(near.sorted[k]) if k < found else math.inf
                     if len(surfaces):
-                        beyond = agreement(surfaces, near, n, own[0], surface_columns[numbers[j]], out[q])
+                        beyond = agreement(
+                            surfaces, near, n, own[0], surface_columns[numbers[j]], out[q]
+                        )
                         reach = max(reach, beyond)
                     table[j, REACH, q] = 0.0 if curved else reach
                     if shapes is not None and shapes.shaped[numbers[j]]:

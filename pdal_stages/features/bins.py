@@ -37,7 +37,9 @@ class ShapeBins:
     """
 
     def __init__(self, thresholds: Mapping[str, Any]) -> None:
-        self._thresholds = {str(token): _checked(str(token), rows) for token, rows in thresholds.items()}
+        self._thresholds = {
+            str(token): _checked(str(token), rows) for token, rows in thresholds.items()
+        }
 
     @classmethod
     def fit(cls, values: Mapping[str, np.ndarray]) -> ShapeBins:
@@ -56,7 +58,9 @@ class ShapeBins:
                 column = np.asarray(sample)[:, m, :].ravel()
                 column = np.sort(column[np.isfinite(column)]).astype(np.float64)
                 if len(column):
-                    at = np.ceil(len(column) * np.arange(1, INNER + 1) / (INNER + 1)).astype(int) - 1
+                    at = (
+                        np.ceil(len(column) * np.arange(1, INNER + 1) / (INNER + 1)).astype(int) - 1
+                    )
                     rows[m] = column[at]
             result[token] = _to_units(rows)
         return cls(result)
@@ -121,7 +125,9 @@ def _checked(token: str, rows: Any) -> np.ndarray:
         )
     for name, row in zip(METRICS, array, strict=True):
         top = math.pi if name == "A3" else math.inf
-        if not (np.isfinite(row).all() and (np.diff(row) >= 0).all() and row[0] >= 0 and row[-1] <= top):
+        if not (
+            np.isfinite(row).all() and (np.diff(row) >= 0).all() and row[0] >= 0 and row[-1] <= top
+        ):
             raise OptionError(
                 f"the {name} thresholds of '{token}' must be finite, ascending, and "
                 + ("from 0 to pi" if name == "A3" else "not below 0"),
@@ -136,5 +142,11 @@ def _to_units(rows: np.ndarray) -> np.ndarray:
     a3, d1, d2, d3, d4 = rows
     cosine = -np.sign(a3) * np.sqrt(np.abs(a3))
     return np.array(
-        [np.arccos(np.clip(cosine, -1, 1)), np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)]
+        [
+            np.arccos(np.clip(cosine, -1, 1)),
+            np.sqrt(d1),
+            np.sqrt(d2),
+            (d3 / 4) ** 0.25,
+            np.cbrt(d4 / 6),
+        ]
     )

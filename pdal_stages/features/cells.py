@@ -33,7 +33,10 @@ SMALLEST, LARGEST, CELL = 1e-4, 5.0, 2.0
 
 
 def cell_means(
-    coordinates: npt.NDArray[np.float64], shares: npt.NDArray[np.uint16], side: float, votes: bool = False
+    coordinates: npt.NDArray[np.float64],
+    shares: npt.NDArray[np.uint16],
+    side: float,
+    votes: bool = False,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """(cell of each point, means (cells, columns) over each cell and those around it).
 
@@ -85,7 +88,9 @@ class Representatives:
     _members: npt.NDArray[Any]  # points asked for, by representative
     _start: npt.NDArray[Any]
 
-    def members(self, block: npt.NDArray[np.int64] | slice) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
+    def members(
+        self, block: npt.NDArray[np.int64] | slice
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
         """The cloud's points that a block of representatives stands for, and each one's place in the block."""
         first, last = self._start[:-1][block], self._start[1:][block]
         number = last - first

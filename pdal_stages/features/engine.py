@@ -92,10 +92,16 @@ class FeatureEngine:
     ) -> None:
         if not isinstance(plan, FeaturePlan):
             raise OptionError(
-                "'plan' must be a FeaturePlan", found=type(plan).__name__, cure="Use FeaturePlan.parse"
+                "'plan' must be a FeaturePlan",
+                found=type(plan).__name__,
+                cure="Use FeaturePlan.parse",
             )
         resolve_threads(threads)
-        self.plan, self.seed, self.threads = plan, checks.whole("'seed'", seed, 0, 2**63 - 1), threads
+        self.plan, self.seed, self.threads = (
+            plan,
+            checks.whole("'seed'", seed, 0, 2**63 - 1),
+            threads,
+        )
         self.bins, self.copt_threshold = bins, copt_threshold
         self.cloud = check_xyz(xyz)
         self.grid = build_grid(self.cloud, plan.cell) if grid is None else grid
@@ -130,7 +136,9 @@ class FeatureEngine:
 
                 self.copt_threshold = curvature_threshold(self.curvatures())
             if needs_bins:
-                self.bins = ShapeBins.fit(self.shape_values(smallest_hashes(self.cloud, self.seed)[1]))
+                self.bins = ShapeBins.fit(
+                    self.shape_values(smallest_hashes(self.cloud, self.seed)[1])
+                )
         return self
 
     def curvatures(self) -> np.ndarray:
@@ -148,7 +156,9 @@ class FeatureEngine:
         found = fixed.shape_values((x, y, z), self.seed)
         if adaptive is not None:
             found |= adaptive.shape_values((x, y, z), self.seed, self.copt_threshold)
-        return {c.neighborhood.token: found[c.neighborhood.token] for c in self.plan.layout if c.shapes}
+        return {
+            c.neighborhood.token: found[c.neighborhood.token] for c in self.plan.layout if c.shapes
+        }
 
     def neighborhoods(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
         """The plan's neighborhoods, made for the cloud once."""
@@ -157,7 +167,10 @@ class FeatureEngine:
                 from .fixed import FixedRadius
 
                 adaptive = None
-                if any(c.at and c.neighborhood.kind not in ("cylinder", "sphere") for c in self.plan.layout):
+                if any(
+                    c.at and c.neighborhood.kind not in ("cylinder", "sphere")
+                    for c in self.plan.layout
+                ):
                     from .adaptive import AdaptiveNeighborhoods
 
                     adaptive = AdaptiveNeighborhoods(self.grid, self.plan, self.threads)
@@ -243,7 +256,9 @@ class Run:
         self.engine, self.plan = engine, engine.plan
         self.indices, coordinates = _queries(queries, engine.cloud)
         count = len(engine) if coordinates is None else len(coordinates)
-        self.dimensions = dimensions if callable(dimensions) else _dimensions(self.plan, dimensions, count)
+        self.dimensions = (
+            dimensions if callable(dimensions) else _dimensions(self.plan, dimensions, count)
+        )
         self.grid = engine.grid if coordinates is None else build_grid(coordinates, self.plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(engine.threads if threads is None else threads)
@@ -261,8 +276,14 @@ class Run:
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
         self.distinct = np.append(np.flatnonzero(new), count)
         # Two results per thread may wait (map_blocks) and one is being made; copies of points double a block.
-        row = 8 * len(self.plan.names) + ROW_BYTES + NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods)
-        rows = min(memory_mb * 2**20 / ((2 * self.threads + 1) * row), MOST_ROWS, count / (4 * self.threads))
+        row = (
+            8 * len(self.plan.names) + ROW_BYTES + NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods)
+        )
+        rows = min(
+            memory_mb * 2**20 / ((2 * self.threads + 1) * row),
+            MOST_ROWS,
+            count / (4 * self.threads),
+        )
         self.starts = np.append(
             np.arange(0, len(self.distinct) - 1, max(int(rows), 64)), len(self.distinct) - 1
         )
@@ -287,7 +308,9 @@ class Run:
             )
             tally["fewer_than_three"].update(zip(tokens, few.tolist(), strict=True))
             self.reaches.append(reach)
-            tally["beyond_halo"] = {token: n for token, n in zip(tokens, far.tolist(), strict=True) if n}
+            tally["beyond_halo"] = {
+                token: n for token, n in zip(tokens, far.tolist(), strict=True) if n
+            }
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)
@@ -298,12 +321,16 @@ class Run:
         for column, name in enumerate(plan.dimensions, width - len(plan.dimensions)):
             given = found.get(name)
             values[:, column] = (
-                {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last] if given is None else given
+                {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last]
+                if given is None
+                else given
             )
         return positions, values, tally
 
     def blocks(
-        self, progress: Progress | bool | None, apply: Callable[[np.ndarray, np.ndarray], Any] | None = None
+        self,
+        progress: Progress | bool | None,
+        apply: Callable[[np.ndarray, np.ndarray], Any] | None = None,
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Any]]:
         """Positions, rows, and values or what `apply` makes of them, as threads finish the blocks."""
 
@@ -349,7 +376,9 @@ def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
         )
     array = array.astype(np.int64, copy=False)
     if outside := np.count_nonzero((array < 0) | (array >= len(cloud))):
-        raise OptionError(f"'queries' has indices outside the cloud of {len(cloud)} points", found=outside)
+        raise OptionError(
+            f"'queries' has indices outside the cloud of {len(cloud)} points", found=outside
+        )
     return array, cloud[array]
 
 
@@ -426,7 +455,9 @@ def compute_features(
     """
     names = tuple(dimensions) if dimensions else ()
     plan = FeaturePlan.parse(neighborhoods, feature_set, names)
-    engine = FeatureEngine(xyz, plan, bins=bins, copt_threshold=copt_threshold, seed=seed, threads=threads)
+    engine = FeatureEngine(
+        xyz, plan, bins=bins, copt_threshold=copt_threshold, seed=seed, threads=threads
+    )
     return engine.table(queries, dimensions=dimensions, memory_mb=memory_mb, progress=progress)
 
 
@@ -460,11 +491,15 @@ def fit_clouds(
     for cloud, (found, of_cloud) in zip(clouds, samples, strict=True):
         rows = of_cloud[found <= last]  # a thinned copy's points tie, and all stay
         if len(rows):
-            engine = FeatureEngine(cloud, plan, copt_threshold=threshold, seed=seed, threads=threads)
+            engine = FeatureEngine(
+                cloud, plan, copt_threshold=threshold, seed=seed, threads=threads
+            )
             for token, some in engine.shape_values(rows).items():
                 values.setdefault(token, []).append(some)
             del engine  # one index at a time
-    return ShapeBins.fit({token: np.concatenate(parts) for token, parts in values.items()}), threshold
+    return ShapeBins.fit(
+        {token: np.concatenate(parts) for token, parts in values.items()}
+    ), threshold
 
 
 def warmup() -> None:

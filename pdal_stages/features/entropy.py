@@ -113,7 +113,9 @@ def eigenvalues_of(s, j):
     x, y, z = s[SX, j] * w, s[SY, j] * w, s[SZ, j] * w
     xx, yy, zz = s[SXX, j] * w, s[SYY, j] * w, s[SZZ, j] * w
     xy, xz, yz = s[SXY, j] * w, s[SXZ, j] * w, s[SYZ, j] * w
-    l1, l2, l3, _, _, _ = eigen3(xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z)
+    l1, l2, l3, _, _, _ = eigen3(
+        xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z
+    )
     return l1, l2, l3, xx + yy + zz
 
 

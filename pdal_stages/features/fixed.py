@@ -31,7 +31,9 @@ class FixedRadius:
         self.shaped = any(c.shapes for c in self.chosen)
         self.tokens = [c.neighborhood.token for c in self.chosen]
         self.radii = np.array([c.neighborhood.parameters[0] for c in self.chosen], np.float64)
-        self.spherical = np.array([c.neighborhood.kind == "sphere" for c in self.chosen], np.float64)
+        self.spherical = np.array(
+            [c.neighborhood.kind == "sphere" for c in self.chosen], np.float64
+        )
         self.columns = columns_of(self.chosen, MOMENT_FEATURES)
         self.widths = widths_of(self.radii, grid.cell)
 
@@ -44,7 +46,9 @@ class FixedRadius:
             return {}
         shapes = shapes_of(self.chosen, points, seed, None)
         self._run(points, shapes, np.empty((len(points[0]), 0), np.float32))
-        return {c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes}
+        return {
+            c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes
+        }
 
     def fill(
         self,
@@ -82,10 +86,14 @@ def widths_of(radii: np.ndarray, cell: float) -> np.ndarray:
     none. A cell is half open, so one whose nearest border is the radius away holds no member.
     """
     reach = int(np.ceil(radii.max(initial=0.0) / cell)) + 1
-    away = np.maximum(np.abs(np.arange(-reach, reach + 1)) - 1, 0) * cell  # of a row, or column, at least
+    away = (
+        np.maximum(np.abs(np.arange(-reach, reach + 1)) - 1, 0) * cell
+    )  # of a row, or column, at least
     touched = away[:, None] ** 2 + away**2 < radii[:, None, None] ** 2
     touched = touched[:, touched.any(axis=(0, 2))]
-    return np.ascontiguousarray(touched[:, :, reach:].sum(axis=2) - 1)  # as of one radius: a kernel for both
+    return np.ascontiguousarray(
+        touched[:, :, reach:].sum(axis=2) - 1
+    )  # as of one radius: a kernel for both
 
 
 @njit
@@ -149,7 +157,9 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
                     n = members(px, py, pz, count, qx[q], qy[q], qz[q], spherical[k], r2, record)
                     w = 1.0 / table[k, N, q]
                     gx, gy, gz = table[k, SX, q] * w, table[k, SY, q] * w, table[k, SZ, q] * w
-                    write_shapes(shapes, k, q, record, n, np.float32(gx), np.float32(gy), np.float32(gz), out)
+                    write_shapes(
+                        shapes, k, q, record, n, np.float32(gx), np.float32(gy), np.float32(gz), out
+                    )
         a = b
 
 

@@ -101,12 +101,16 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
             cure="Use np.column_stack([points['X'], points['Y'], points['Z']])",
         )
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 4):
-        raise StageError(f"'{what}' must hold float64 coordinates in meters", found=f"dtype {array.dtype}")
+        raise StageError(
+            f"'{what}' must hold float64 coordinates in meters", found=f"dtype {array.dtype}"
+        )
     if array.ndim != 2 or array.shape[1] != 3:
         cure = "Rows are points: one column each for x, y and z"
         if array.ndim == 2 and array.shape[0] == 3:
             cure += "; this one looks transposed, give its .T"
-        raise StageError(f"'{what}' must have the shape (n, 3)", found=f"shape {array.shape}", cure=cure)
+        raise StageError(
+            f"'{what}' must have the shape (n, 3)", found=f"shape {array.shape}", cure=cure
+        )
     # Two reductions and no copy; NaN comes through both.
     largest = float(np.maximum(float(array.max()), -float(array.min()))) if array.size else 0.0
     if not largest <= LIMIT:  # NaN too
@@ -142,7 +146,9 @@ def cell_keys(coordinates: np.ndarray, side: float) -> tuple[np.ndarray, np.ndar
     And offsets (3 or 9,): added to a number, they give the middle cells of the rows of three around it.
     """
     axes, n = _ORDER[coordinates.shape[1]], len(coordinates)
-    spans = np.array([[coordinates[:, k].min(), coordinates[:, k].max()] if n else [0.0, 0.0] for k in axes])
+    spans = np.array(
+        [[coordinates[:, k].min(), coordinates[:, k].max()] if n else [0.0, 0.0] for k in axes]
+    )
     first, last = cell_numbers(spans, side).T
     # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
     lengths = [int(length) + 2 for length in last - first]
@@ -245,7 +251,9 @@ def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray, threads: int | None 
     if not 1 <= n < 2**32:
         raise ValueError(f"a tree needs 1 to 2**32 - 1 points, not {n}")
     depth = (n // LEAF).bit_length()
-    tree = KdTree(x, y, z, np.arange(n, dtype=np.uint32), np.empty((2 ** (depth + 1) - 1, 6)), depth)
+    tree = KdTree(
+        x, y, z, np.arange(n, dtype=np.uint32), np.empty((2 ** (depth + 1) - 1, 6)), depth
+    )
     keys = np.empty(n)
     upper = min(depth, 2)  # levels made one node after the other; the subtrees below them at once
     tasks = [(0, 0, n)]
@@ -256,7 +264,9 @@ def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray, threads: int | None 
             middle = (lo + hi) // 2
             halves += [(2 * node + 1, lo, middle), (2 * node + 2, middle, hi)]
         tasks = halves
-    for _ in map_blocks(lambda task: build_nodes(tree, keys, *task, depth - upper, True), tasks, threads):
+    for _ in map_blocks(
+        lambda task: build_nodes(tree, keys, *task, depth - upper, True), tasks, threads
+    ):
         pass
     return tree
 
@@ -279,9 +289,19 @@ def build_nodes(tree, keys, node, lo, hi, depth, whole):
         middle = halve(x, y, z, perm, keys, lo, hi, box)
         if not whole:
             return
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 2, middle, hi, depth - 1
+        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
+            2 * node + 2,
+            middle,
+            hi,
+            depth - 1,
+        )
         top += 1
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 1, lo, middle, depth - 1
+        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
+            2 * node + 1,
+            lo,
+            middle,
+            depth - 1,
+        )
         top += 1
 
 
@@ -390,7 +410,9 @@ def gather(tree, box, reach2, copies, limit, stack, cx, cy, cz, ci):
         n = np.uint64(node)
         if gap2(box, boxes, n) > reach2:
             continue
-        same = boxes[n, 0] == boxes[n, 3] and boxes[n, 1] == boxes[n, 4] and boxes[n, 2] == boxes[n, 5]
+        same = (
+            boxes[n, 0] == boxes[n, 3] and boxes[n, 1] == boxes[n, 4] and boxes[n, 2] == boxes[n, 5]
+        )
         if same and hi - lo > copies:
             hi = lo + copies
             depth = 0
@@ -409,8 +431,18 @@ def gather(tree, box, reach2, copies, limit, stack, cx, cy, cz, ci):
                 count += one if dx * dx + dy * dy + dz * dz <= reach2 else np.uint64(0)
             continue
         middle = (lo + hi) // 2
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 2, middle, hi, depth - 1
+        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
+            2 * node + 2,
+            middle,
+            hi,
+            depth - 1,
+        )
         top += 1
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = 2 * node + 1, lo, middle, depth - 1
+        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
+            2 * node + 1,
+            lo,
+            middle,
+            depth - 1,
+        )
         top += 1
     return np.int64(count)

@@ -109,8 +109,16 @@ def finish(table, volume, heights, few, copies, columns, out):
         for j in range(count):
             n = moments[N, j]
             inverse = 1.0 / (n if n > 0.0 else 1.0)
-            mx, my, mz = moments[SX, j] * inverse, moments[SY, j] * inverse, moments[SZ, j] * inverse
-            ax, ay, az = moments[SXX, j] * inverse, moments[SYY, j] * inverse, moments[SZZ, j] * inverse
+            mx, my, mz = (
+                moments[SX, j] * inverse,
+                moments[SY, j] * inverse,
+                moments[SZ, j] * inverse,
+            )
+            ax, ay, az = (
+                moments[SXX, j] * inverse,
+                moments[SYY, j] * inverse,
+                moments[SZZ, j] * inverse,
+            )
             xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
             apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
             m[0, j], m[1, j], m[2, j] = xx, yy, zz
@@ -124,9 +132,13 @@ def finish(table, volume, heights, few, copies, columns, out):
         for j in range(count):
             r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
             made[13, j] = moments[RADIUS, j]
-            made[8, j] = moments[N, j] / (4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume)
+            made[8, j] = moments[N, j] / (
+                4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume
+            )
         for j in range(count):
-            n = made[9, j]  # not from the moments, which LLVM must fear to overlap with what is written
+            n = made[
+                9, j
+            ]  # not from the moments, which LLVM must fear to overlap with what is written
             l1, l2, l3, nx, ny, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
             some = 1.0 if n >= 3.0 else 0.0
             made[14, j], made[15, j], made[16, j] = some * nx, some * ny, some * nz

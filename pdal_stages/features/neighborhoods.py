@@ -19,7 +19,10 @@ from ..base.errors import OptionError, suggest
 #: Preset name -> (neighborhood tokens, the points' own dimensions it uses as features).
 PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "blomley2016": (("c1", "c2", "c3", "c5", "kopt"), ("Z",)),
-    "weinmann2018": (("c1", "c2", "c3", "c5", "s1", "s2", "s3", "s5", "kopt"), ("HeightAboveGround",)),
+    "weinmann2018": (
+        ("c1", "c2", "c3", "c5", "s1", "s2", "s3", "s5", "kopt"),
+        ("HeightAboveGround",),
+    ),
     "he2017": (("copt",), ()),
 }
 
@@ -145,7 +148,9 @@ def _words(spec: Any) -> list[str]:
         return [w.strip().lower() for w in re.split(r",(?![^()]*\))", spec) if w.strip()]
     items = list(spec) if isinstance(spec, Iterable) else [spec]
     if not all(isinstance(item, str) for item in items):
-        raise OptionError("'neighborhoods' must be text or a list of text", found=repr(spec)[:80], cure=_CURE)
+        raise OptionError(
+            "'neighborhoods' must be text or a list of text", found=repr(spec)[:80], cure=_CURE
+        )
     return [word for item in items for word in _words(item)]
 
 
@@ -170,7 +175,9 @@ def _sized(text: str, head: str, size: float) -> Neighborhood:
             raise OptionError(f"k must be a whole number from 1 to {MAX_K}", found=text)
         return Neighborhood("knn", (size,))
     if not (MIN_RADIUS <= size <= MAX_RADIUS):
-        raise OptionError(f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} meters", found=text)
+        raise OptionError(
+            f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} meters", found=text
+        )
     return Neighborhood("cylinder" if head == "c" else "sphere", (_rounded(size),))
 
 
@@ -178,14 +185,21 @@ def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
     try:
         values = tuple(float(v) for v in inner.split(",")) if inner else ()
     except ValueError:
-        raise OptionError("the values in parentheses must be numbers", found=text, cure=_CURE) from None
+        raise OptionError(
+            "the values in parentheses must be numbers", found=text, cure=_CURE
+        ) from None
     if not all(math.isfinite(v) for v in values):
         raise OptionError("the values in parentheses must be finite", found=text)
     if head == "kopt":
         values = values or KOPT_DEFAULT
-        if len(values) != 2 or any(v != int(v) for v in values) or not 2 <= values[0] <= values[1] <= MAX_K:
+        if (
+            len(values) != 2
+            or any(v != int(v) for v in values)
+            or not 2 <= values[0] <= values[1] <= MAX_K
+        ):
             raise OptionError(
-                f"kopt takes two whole numbers, kopt(k_min,k_max), 2 <= k_min <= k_max <= {MAX_K}", found=text
+                f"kopt takes two whole numbers, kopt(k_min,k_max), 2 <= k_min <= k_max <= {MAX_K}",
+                found=text,
             )
     elif head == "ropt":
         values = values or ROPT_DEFAULT
@@ -197,7 +211,9 @@ def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
                 found=text,
             )
         if (values[1] - values[0]) / values[2] > 1000:
-            raise OptionError("ropt may try at most 1000 radii", found=text, cure="Make the step larger")
+            raise OptionError(
+                "ropt may try at most 1000 radii", found=text, cure="Make the step larger"
+            )
     elif values:
         raise OptionError("copt takes no values", found=text, cure="Write copt")
     return Neighborhood(head, tuple(_rounded(v) for v in values))

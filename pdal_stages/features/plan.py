@@ -13,7 +13,13 @@ import numpy as np
 from ..base import checks
 from ..base.errors import OptionError, suggest
 from . import returns
-from .neighborhoods import AROUND, LEAST_MEMBERS, Neighborhood, parse_neighborhoods, preset_dimensions
+from .neighborhoods import (
+    AROUND,
+    LEAST_MEMBERS,
+    Neighborhood,
+    parse_neighborhoods,
+    preset_dimensions,
+)
 
 #: Feature -> definition, in the order of the columns.
 COVARIANCE = {
@@ -34,7 +40,9 @@ GEOMETRIC = {
     "Radius": "the chosen size in meters; kopt, ropt and copt only",
 }
 #: What the papers' sets of features lack, and "all" therefore leaves out.
-RELATIVE = {"HeightAboveLowest": "z of the point minus the lowest z of the neighborhood, meters [HWS16]"}
+RELATIVE = {
+    "HeightAboveLowest": "z of the point minus the lowest z of the neighborhood, meters [HWS16]"
+}
 #: Of the points around a point, each with the surface that its 10 nearest make (``surfaces.py``). Features of features:
 #: of nearest neighbors (``k20``) only, and no part of "all".
 SURFACES = {
@@ -68,7 +76,14 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "geometric": tuple(GEOMETRIC),
     "shapes": SHAPE_FEATURES,
     "surfaces": tuple(SURFACES),
-    "he2017": ("Linearity", "Planarity", "Scattering", "SurfaceVariation", "Verticality", "HeightRange"),
+    "he2017": (
+        "Linearity",
+        "Planarity",
+        "Scattering",
+        "SurfaceVariation",
+        "Verticality",
+        "HeightRange",
+    ),
     **{metric: tuple(f"{metric}_{b}" for b in range(SHAPE_BINS)) for metric in SHAPES},
 }
 
@@ -92,7 +107,9 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
         try:
             words = [part for item in spec for part in item.split(",")]
         except (TypeError, AttributeError):
-            raise OptionError("'feature_set' must be text or a list of text", found=repr(spec)) from None
+            raise OptionError(
+                "'feature_set' must be text or a list of text", found=repr(spec)
+            ) from None
     known = {name.lower(): name for name in (*GROUPS, *ALL_FEATURES)}
     found: dict[str, None] = {}
     for word in (w.strip() for w in words):
@@ -191,10 +208,16 @@ class FeaturePlan:
             neighborhoods = list(neighborhoods)
         parsed = tuple(parse_neighborhoods(neighborhoods))
         given = dimensions.split(",") if isinstance(dimensions, str) else list(dimensions)
-        own = preset_dimensions(neighborhoods) if any(word in WITH_DIMENSIONS for word in words) else ()
+        own = (
+            preset_dimensions(neighborhoods)
+            if any(word in WITH_DIMENSIONS for word in words)
+            else ()
+        )
         names = dict.fromkeys(own)
         for name in (name.strip() for name in given):
-            names.update(dict.fromkeys(returns.NAMES if name == returns.GROUP else [name] if name else []))
+            names.update(
+                dict.fromkeys(returns.NAMES if name == returns.GROUP else [name] if name else [])
+            )
         return cls(parsed, words, tuple(names))
 
     @cached_property
@@ -216,7 +239,11 @@ class FeaturePlan:
                 found=", ".join(n.token for n in self.neighborhoods),
             )
         if not names:
-            cure = "Neighbors' surfaces exist for k20 and the like only" if wanted & {*SURFACES} else None
+            cure = (
+                "Neighbors' surfaces exist for k20 and the like only"
+                if wanted & {*SURFACES}
+                else None
+            )
             raise OptionError(
                 f"none of the neighborhoods has the feature '{', '.join(self.features)}'",
                 found=", ".join(n.token for n in self.neighborhoods),
@@ -272,7 +299,9 @@ class FeaturePlan:
     def _surfaced(self) -> list[int]:
         """The numbers of neighbors whose surfaces are wanted."""
         return [
-            int(c.neighborhood.parameters[0]) for c in self.layout if any(name in c.at for name in SURFACES)
+            int(c.neighborhood.parameters[0])
+            for c in self.layout
+            if any(name in c.at for name in SURFACES)
         ]
 
     @property
@@ -296,7 +325,9 @@ class FeaturePlan:
         lists = ("neighborhoods", "features", "dimensions")
         given: list[Any] = [data.get(name) if isinstance(data, Mapping) else None for name in lists]
         for value in given:
-            if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
+            if not isinstance(value, list | tuple) or not all(
+                isinstance(item, str) for item in value
+            ):
                 raise OptionError(
                     f"a feature plan needs lists of text: {', '.join(lists)}", found=repr(data)[:80]
                 )

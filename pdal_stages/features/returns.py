@@ -83,7 +83,9 @@ def return_features(
     wanted = {name: one for name in names if (one := parse(name)) is not None}
     if not wanted:
         return {}
-    number, total = (np.asarray(dimensions.get(source, np.zeros(len(xyz), np.uint8))) for source in SOURCES)
+    number, total = (
+        np.asarray(dimensions.get(source, np.zeros(len(xyz), np.uint8))) for source in SOURCES
+    )
     flags = np.empty((len(xyz), len(FLAGS)), np.uint16)
     flags[:, 0] = np.where(total > 1, WHOLE, 0)
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
@@ -91,7 +93,9 @@ def return_features(
     own = (flags > 0).view(np.uint8)
     found: dict[str, npt.NDArray[Any]] = {}
     for scale in dict.fromkeys((one.axes, one.side) for one in wanted.values()):
-        cell, means = cell_means(xyz[:, : scale[0]], flags, scale[1]) if scale[0] else (slice(None), own)
+        cell, means = (
+            cell_means(xyz[:, : scale[0]], flags, scale[1]) if scale[0] else (slice(None), own)
+        )
         for name, one in wanted.items():
             if (one.axes, one.side) == scale:
                 found[name] = means[:, list(FLAGS).index(one.flag)][cell]

@@ -108,7 +108,9 @@ def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, ne
         if hi - lo > 1 and side * side > 4.0 * reach2:
             hi = lo + 1
             continue
-        count = gather(tree, box, reach2, copies, limit, near.stack, near.x, near.y, near.z, near.at)
+        count = gather(
+            tree, box, reach2, copies, limit, near.stack, near.x, near.y, near.z, near.at
+        )
         if count >= need or (count >= 0 and reach2 >= cap2):
             return hi, count, reach2
         if count >= 0:
@@ -145,7 +147,11 @@ def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
     if there < need and reach2 < cap2:
         return -1
     most = there if within2 > 0.0 else min(need, there)
-    end, last, largest = 0, 0, 0  # where each bin starts; up to which the bins hold enough; what one holds
+    end, last, largest = (
+        0,
+        0,
+        0,
+    )  # where each bin starts; up to which the bins hold enough; what one holds
     while end < most:
         size = hist[last]
         hist[last] = end

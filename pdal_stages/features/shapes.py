@@ -79,7 +79,9 @@ class Shapes(NamedTuple):
 def make_work() -> Work:
     """Scratch for one thread."""
     u, f = np.uint32, np.float32
-    return Work(np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f), np.zeros((5, 9), f))
+    return Work(
+        np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f), np.zeros((5, 9), f)
+    )
 
 
 def shapes_of(chosen: Sequence[Columns], points: Axes, seed: int, bins: ShapeBins | None) -> Shapes:
@@ -112,7 +114,9 @@ def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: s
 
     Every bit of the coordinates (m,) counts, except that -0.0 is 0.0.
     """
-    h: Any = np.uint64(int.from_bytes(hashlib.sha256(f"{int(seed)}:{token}".encode()).digest()[:8], "little"))
+    h: Any = np.uint64(
+        int.from_bytes(hashlib.sha256(f"{int(seed)}:{token}".encode()).digest()[:8], "little")
+    )
     bits = [(np.ascontiguousarray(v, dtype=np.float64) + 0.0).view(np.uint64) for v in (x, y, z)]
     h = finalise(h + bits[0])
     h = finalise(h + GOLDEN + bits[1])
@@ -266,7 +270,9 @@ def pull(record, n, gx, gy, gz, seed, work):
             work.values[m * ROOM + i] = -np.inf
 
 
-@device(fastmath={"reassoc", "nsz"})  # sums of ones, exact in any order: what lets LLVM vectorize them
+@device(
+    fastmath={"reassoc", "nsz"}
+)  # sums of ones, exact in any order: what lets LLVM vectorize them
 def count_above(values, t, above):
     """How many of each metric's values lie above each of nine thresholds (no scatter: compare and add)."""
     for m in range(5):

@@ -48,5 +48,7 @@ class FeatureTable:
         if isinstance(name, list):
             return np.stack([self[one] for one in name], axis=1)
         if name not in self.names:
-            raise KeyError(f"no feature '{name}' in this table. {suggest(name, self.names)}".strip())
+            raise KeyError(
+                f"no feature '{name}' in this table. {suggest(name, self.names)}".strip()
+            )
         return self.values[:, self.names.index(name)]

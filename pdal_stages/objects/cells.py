@@ -63,7 +63,9 @@ def cell_keys(kind: int, row: NDArray, column: NDArray) -> NDArray[np.int64]:
     return (np.int64(kind) << _KIND) | ((row + _HALF) << _ROW) | (column + _HALF)
 
 
-def unpack(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def unpack(
+    keys: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Kind, row and column of keys."""
     low = (1 << _ROW) - 1
     return keys >> _KIND, ((keys >> _ROW) & low) - _HALF, (keys & low) - _HALF
@@ -145,7 +147,8 @@ class Cells:
         key, height = key[used], height[used]
         if max(-height.min(), height.max()) > 2**31 - 2:
             raise StageError(
-                "heights lie beyond 2,000 km", found=f"{height.min() / MM:g} to {height.max() / MM:g} m"
+                "heights lie beyond 2,000 km",
+                found=f"{height.min() / MM:g} to {height.max() / MM:g} m",
             )
         z = height.astype(np.int32)
         given = np.full(len(z), np.nan) if reliability is None else np.asarray(reliability)[used]
@@ -186,12 +189,16 @@ class Cells:
         """Records of all parts' points together; cells of all parts have one size."""
         if len(parts) == 1:
             return parts[0]
-        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in _COLUMNS}
+        columns = {
+            name: np.concatenate([part.columns[name] for part in parts]) for name in _COLUMNS
+        }
         return Cells(parts[0].size, np.concatenate([part.key for part in parts]), columns)._joined()
 
     def of_kind(self, kind: Kind) -> Cells:
         """Those of a kind."""
-        first, last = np.searchsorted(self.key, [np.int64(kind) << _KIND, np.int64(kind + 1) << _KIND])
+        first, last = np.searchsorted(
+            self.key, [np.int64(kind) << _KIND, np.int64(kind + 1) << _KIND]
+        )
         return self._rows(slice(int(first), int(last)))
 
     def thin(self) -> tuple[str, float] | None:
@@ -216,7 +223,9 @@ class Cells:
         return part._rows((column_of >= column) & (column_of < column + columns))
 
     def _rows(self, which) -> Cells:
-        return Cells(self.size, self.key[which], {name: v[which] for name, v in self.columns.items()})
+        return Cells(
+            self.size, self.key[which], {name: v[which] for name, v in self.columns.items()}
+        )
 
 
 def point_keys(x: NDArray, y: NDArray, kinds: NDArray, size: float) -> NDArray[np.int64]:

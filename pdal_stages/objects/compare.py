@@ -92,7 +92,9 @@ def compare_buildings(found: Sequence[Any], true: Sequence[Any]) -> dict[str, An
     found, true = list(shapely.make_valid(list(found))), list(shapely.make_valid(list(true)))
     whole_found, whole_true = shapely.union_all(found), shapely.union_all(true)
     shared = whole_found.intersection(whole_true).area
-    parts = shapely.area(shapely.intersection(true, whole_found)) / np.maximum(shapely.area(true), 1e-12)
+    parts = shapely.area(shapely.intersection(true, whole_found)) / np.maximum(
+        shapely.area(true), 1e-12
+    )
     blocks, true_blocks = shapely.get_parts(whole_found), shapely.get_parts(whole_true)
     offsets = [np.empty(0)]
     for a, b in matched_by_overlap(blocks, true_blocks):
@@ -101,7 +103,9 @@ def compare_buildings(found: Sequence[Any], true: Sequence[Any]) -> dict[str, An
         offsets.append(shapely.distance(places, blocks[a].boundary))
     away = np.concatenate(offsets)
     return {
-        **_scores(matched_by_overlap(found, true), shapely.area(found), shapely.area(true), AREAS, "m2"),
+        **_scores(
+            matched_by_overlap(found, true), shapely.area(found), shapely.area(true), AREAS, "m2"
+        ),
         "area": {
             "reference": whole_true.area,
             "found": whole_found.area,
@@ -192,7 +196,9 @@ class Things:
                     there = ~shapely.is_missing(shapes) & ~shapely.is_empty(shapes)
                     bounds = shapely.bounds(shapes[there])
                 if not np.isfinite(bounds).all():
-                    raise StageError("coordinates are not finite (NaN or infinite)", where=path, found=name)
+                    raise StageError(
+                        "coordinates are not finite (NaN or infinite)", where=path, found=name
+                    )
                 self.shapes[what], self.crs[what] = shapes[there], str(about["crs"] or "")
                 columns = {str(n).lower(): v for n, v in zip(about["fields"], values, strict=True)}
                 if what == "trees":
@@ -220,7 +226,9 @@ class Things:
                 self.heights = self.heights[inside]
             else:
                 valid = shapely.make_valid(shapes)
-                inside = shapely.area(shapely.intersection(valid, area)) >= 0.5 * shapely.area(valid)
+                inside = shapely.area(shapely.intersection(valid, area)) >= 0.5 * shapely.area(
+                    valid
+                )
             self.shapes[what] = shapes[inside]
 
 
@@ -260,7 +268,9 @@ def compare_objects(
     out: dict[str, Any] = {}
     both = one.shapes.keys() & two.shapes.keys()
     if "buildings" in both:
-        out["buildings"] = compare_buildings(*(list(things.shapes["buildings"]) for things in (one, two)))
+        out["buildings"] = compare_buildings(
+            *(list(things.shapes["buildings"]) for things in (one, two))
+        )
     if "trees" in both and len(one.heights) + len(two.heights):
         out["trees"] = compare_trees(*one.trees, *two.trees)
     if not out:
@@ -294,7 +304,11 @@ def remarks(found: Things, reference: Things) -> list[str]:
 
 def _axes(crs: str) -> str:
     """Of a compound system the name of the plane one."""
-    return crs.split('"')[3] if crs.startswith(("COMPD_CS", "COMPOUNDCRS")) and crs.count('"') > 3 else crs
+    return (
+        crs.split('"')[3]
+        if crs.startswith(("COMPD_CS", "COMPOUNDCRS")) and crs.count('"') > 3
+        else crs
+    )
 
 
 def table(figures: dict[str, Any]) -> str:
@@ -302,13 +316,18 @@ def table(figures: dict[str, Any]) -> str:
     lines: list[str] = []
     for what, of in figures.items():
         objects = of["objects"]
-        rows = {"all": objects, **{n: v for n, v in of["sizes"].items() if v["reference"] or v["found"]}}
+        rows = {
+            "all": objects,
+            **{n: v for n, v in of["sizes"].items() if v["reference"] or v["found"]},
+        }
         lines += [
             f"{what}: {objects['found']:,} found, {objects['reference']:,} in the reference",
             f"{'':24s}{'reference':>10s}{'found':>10s}{'complete':>10s}{'correct':>10s}",
         ]
         for name, row in rows.items():
-            shares = "".join(f"{_percent(row[key]):>10s}" for key in ("completeness", "correctness"))
+            shares = "".join(
+                f"{_percent(row[key]):>10s}" for key in ("completeness", "correctness")
+            )
             lines.append(f"{name:24s}{row['reference']:10,}{row['found']:10,}{shares}")
         if what == "trees":
             lines += [

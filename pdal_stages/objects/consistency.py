@@ -132,7 +132,10 @@ class _Voxels:
         if self.height is None or self.flat is None:
             return _NONE, _GROUND
         built = self.kind == _BUILDING
-        low, stands = built & self.flat & (self.height < LOW), built & ~self.flat & (self.height > HIGH)
+        low, stands = (
+            built & self.flat & (self.height < LOW),
+            built & ~self.flat & (self.height > HIGH),
+        )
         # Feet of walls are labeled building as often as ground, so it is changed where more is low than stands.
         x, y = np.floor(self.xyz[self.rows, :2] / SIDE).T.astype(np.int64)
         column, at = np.unique((y << 32) + x, return_inverse=True)

@@ -39,7 +39,9 @@ def canopy(high: NDArray, ground: NDArray) -> NDArray[np.float64]:
 
 def smoothed(height: NDArray, sigma: float) -> NDArray:
     """Heights averaged by a Gaussian of `sigma` cells; beyond the array there is no canopy."""
-    out = scipy.ndimage.gaussian_filter(height, sigma, mode="constant", radius=int(np.ceil(2.5 * sigma)))
+    out = scipy.ndimage.gaussian_filter(
+        height, sigma, mode="constant", radius=int(np.ceil(2.5 * sigma))
+    )
     return np.where(height > 0.0, out, 0.0)
 
 
@@ -85,7 +87,9 @@ def crown_cells(s: NDArray, least: float, depth: float, reach: float) -> NDArray
                     seen[m] = n
                     if not _higher(z, m, n):
                         todo.append(m)
-                    elif away < nearest or (away == nearest and (up[n] == n or _higher(z, m, up[n]))):
+                    elif away < nearest or (
+                        away == nearest and (up[n] == n or _higher(z, m, up[n]))
+                    ):
                         up[n], nearest = m, away
     out = np.full(rows * columns, -1, np.int64)
     for n in range(rows * columns):

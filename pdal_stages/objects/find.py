@@ -31,7 +31,11 @@ FOUND = (Kind.BUILDING, Kind.TREE, Kind.SPAN, Kind.DECK)
 
 
 def find_objects(
-    cells: Cells, settings: ObjectSettings | None = None, *, block: int = BLOCK, progress: bool | None = None
+    cells: Cells,
+    settings: ObjectSettings | None = None,
+    *,
+    block: int = BLOCK,
+    progress: bool | None = None,
 ) -> Objects:
     """All objects of an area.
 
@@ -68,7 +72,9 @@ def find_objects(
         [len(one.keys) for ones in found.values() for one in ones],
     )
     order = np.argsort(key, kind="stable")
-    return Objects(chosen, {kind: _table(ones) for kind, ones in found.items()}, key[order], owner[order])
+    return Objects(
+        chosen, {kind: _table(ones) for kind, ones in found.items()}, key[order], owner[order]
+    )
 
 
 class _One(NamedTuple):
@@ -95,7 +101,9 @@ def _table(ones: list[_One]) -> Table:
     )
 
 
-def _bodies(number: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
+def _bodies(
+    number: NDArray[np.int64],
+) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
     """Every object's number, and the rows and columns of its cells, row by row."""
     flat = np.flatnonzero(number.ravel() >= 0)
     order = flat[np.argsort(number.ravel()[flat], kind="stable")]
@@ -162,7 +170,9 @@ def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
         body = near.body(kind, r, c, z)
         record = measure.tree(body, tr, tc, chosen)
         if record["height"] >= chosen.tree_height:
-            yield _One(int(object_id(kind, tr, tc)), record, body, cell_keys(kind, body.row, body.column))
+            yield _One(
+                int(object_id(kind, tr, tc)), record, body, cell_keys(kind, body.row, body.column)
+            )
 
 
 _FINDERS = {Kind.BUILDING: _surfaces, Kind.TREE: _trees, Kind.SPAN: _spans, Kind.DECK: _surfaces}

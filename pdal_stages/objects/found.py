@@ -31,7 +31,9 @@ class ObjectSettings(Settings):
         0.05,
         100,
     )
-    building_height: float = _setting(1.5, "Minimum height of a building's cells above the ground", 0, 100)
+    building_height: float = _setting(
+        1.5, "Minimum height of a building's cells above the ground", 0, 100
+    )
     building_area: float = _setting(
         4.0, "Minimum area of a building; smaller ones are left out", 0, 10_000, "m2"
     )
@@ -42,12 +44,20 @@ class ObjectSettings(Settings):
         100,
     )
     roof_part: float = _setting(
-        10.0, "Minimum area of a roof part; smaller ones (dormers) join their neighbor", 0, 10_000, "m2"
+        10.0,
+        "Minimum area of a roof part; smaller ones (dormers) join their neighbor",
+        0,
+        10_000,
+        "m2",
     )
     tree_height: float = _setting(3.0, "Minimum height of a tree", 0, 100)
     tree_area: float = _setting(1.0, "Minimum area of a tree's crown", 0, 1000, "m2")
-    saddle: float = _setting(0.3, "Depth of the saddle in the canopy that separates two trees", 0, 10)
-    smoothing: float = _setting(0.3, "Standard deviation of the Gaussian that smooths the canopy", 0, 5)
+    saddle: float = _setting(
+        0.3, "Depth of the saddle in the canopy that separates two trees", 0, 10
+    )
+    smoothing: float = _setting(
+        0.3, "Standard deviation of the Gaussian that smooths the canopy", 0, 5
+    )
     dbh_factor: float = _setting(
         0.557,
         "For the stem diameter at breast height, `dbh`: dbh_factor times (height times crown diameter) to the power of "
@@ -74,7 +84,9 @@ class Table:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def cells_of(self, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    def cells_of(
+        self, number: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Rows, columns and heights of an object's cells."""
         row, column, z = self.cells[number].T
         return row.astype(np.int64), column.astype(np.int64), z
@@ -91,7 +103,10 @@ class Table:
         """Some of the objects."""
         columns = {name: values[kept] for name, values in self.columns.items()}
         return Table(
-            self.ids[kept], columns, list(compress(self.cells, kept)), list(compress(self.paths, kept))
+            self.ids[kept],
+            columns,
+            list(compress(self.cells, kept)),
+            list(compress(self.paths, kept)),
         )
 
 

@@ -112,7 +112,11 @@ def _box_like(body: Body, height: float, slope: float, size: float) -> str:
     sides = np.array([np.ptp(u, axis=1) + 1.0, np.ptp(v, axis=1) + 1.0]) * size
     width, length = sorted(sides[:, np.argmin(np.round(sides.prod(axis=0), 6))].tolist())
     for name, (wide, long, high, ratio, flat) in BOXES.items():
-        fits = wide[0] <= width <= wide[1] and long[0] <= length <= long[1] and high[0] <= height <= high[1]
+        fits = (
+            wide[0] <= width <= wide[1]
+            and long[0] <= length <= long[1]
+            and high[0] <= height <= high[1]
+        )
         if fits and length >= ratio * width and slope <= flat:
             return name
     return ""

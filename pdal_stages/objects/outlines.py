@@ -63,7 +63,9 @@ def reading(
         except (StageError, MemoryError):
             raise
         except Exception as error:  # each package has its own
-            raise StageError(what, where=path, found=f"{type(error).__name__}: {error}", cure=cure) from error
+            raise StageError(
+                what, where=path, found=f"{type(error).__name__}: {error}", cure=cure
+            ) from error
 
 
 def _linked(file: Path, folder: Path) -> str:
@@ -94,7 +96,11 @@ def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
 def _interpreter() -> str:
     """The program of the Python that this is, inside a program that embeds it."""
     names = (f"python3.{sys.version_info.minor}", "python3")
-    inside = (os.path.join(prefix, "bin", name) for prefix in (sys.prefix, sys.base_prefix) for name in names)
+    inside = (
+        os.path.join(prefix, "bin", name)
+        for prefix in (sys.prefix, sys.base_prefix)
+        for name in names
+    )
     given = [sys.executable] if os.path.basename(sys.executable or "").startswith("python") else []
     return next((path for path in (*given, *inside) if os.access(path, os.X_OK)), "python3")
 
@@ -135,7 +141,9 @@ def straight_outlines(raw: list[Any], size: float) -> list[Any]:
     shapely = vector("shapely")
     out = np.array([*raw, None], object)[:-1]
     for group in _touching(shapely, raw):
-        corner = np.floor(shapely.total_bounds(out[group])[:2])  # near 0, so that places are exact numbers
+        corner = np.floor(
+            shapely.total_bounds(out[group])[:2]
+        )  # near 0, so that places are exact numbers
         local = shapely.transform(out[group], lambda xy, by=corner: xy - by)
         made = _straight(shapely, local)
         if not _good(shapely, made, local):
@@ -153,7 +161,9 @@ def _touching(shapely: Any, shapes: list[Any]) -> list[NDArray[np.int64]]:
     a, b = shapely.STRtree(shapes).query(shapes, predicate="touches")
     all_shapes = np.array(shapes, object)
     shared = shapely.length(shapely.intersection(all_shapes[a], all_shapes[b])) > 0
-    pairs = scipy.sparse.coo_matrix((np.ones(shared.sum()), (a[shared], b[shared])), (len(shapes),) * 2)
+    pairs = scipy.sparse.coo_matrix(
+        (np.ones(shared.sum()), (a[shared], b[shared])), (len(shapes),) * 2
+    )
     count, group = scipy.sparse.csgraph.connected_components(pairs, directed=False)
     order = np.argsort(group, kind="stable")
     return np.split(order, np.searchsorted(group[order], np.arange(1, count)))
@@ -176,7 +186,9 @@ def _straight(shapely: Any, shapes: NDArray) -> NDArray:
     rings, of_shape = shapely.get_rings(fine, return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)
     stays = np.isin(xy @ [1, 1j], kept @ [1, 1j])
-    if np.bincount(ring[stays], minlength=len(rings)).min() < 4 or len(np.unique(of_shape)) < len(shapes):
+    if np.bincount(ring[stays], minlength=len(rings)).min() < 4 or len(np.unique(of_shape)) < len(
+        shapes
+    ):
         return np.full(len(shapes), None, object)
     rings = shapely.linearrings(xy[stays], indices=ring[stays])
     corners, number = np.unique(shapely.get_coordinates(rings), axis=0, return_inverse=True)
@@ -192,7 +204,9 @@ def _straight(shapely: Any, shapes: NDArray) -> NDArray:
     moved = _turned(_adjusted(_turned(corners, angle), walls, of_wall), -angle)
     rings = shapely.set_coordinates(rings, np.round(moved[number] / _GRID) * _GRID)
     out = shapely.polygons(rings, indices=of_shape)
-    return shapely.coverage_simplify(out, 0.1) if shapely.is_valid(out).all() else out  # no corners on walls
+    return (
+        shapely.coverage_simplify(out, 0.1) if shapely.is_valid(out).all() else out
+    )  # no corners on walls
 
 
 def _steps(shapely: Any, rings: NDArray, values: NDArray) -> NDArray:
@@ -201,12 +215,16 @@ def _steps(shapely: Any, rings: NDArray, values: NDArray) -> NDArray:
     return np.stack([values[:-1], values[1:]], axis=1)[ring[1:] == ring[:-1]]
 
 
-def _adjusted(corners: NDArray, walls: NDArray[np.int64], of_wall: list[NDArray]) -> NDArray[np.float64]:
+def _adjusted(
+    corners: NDArray, walls: NDArray[np.int64], of_wall: list[NDArray]
+) -> NDArray[np.float64]:
     """Corners (n, 2), in the frame of the main direction, with those walls (n, 2: corners) along its axes that nearly are.
 
     Longest first; `of_wall`: places of the cells' boundary along each.
     """
-    same = np.tile(np.arange(len(corners)), (2, 1))  # by axis: corners that have a coordinate in common
+    same = np.tile(
+        np.arange(len(corners)), (2, 1)
+    )  # by axis: corners that have a coordinate in common
     value, weight = corners.T.copy(), np.zeros((2, len(corners)))
     lengths = np.hypot(*(corners[walls[:, 1]] - corners[walls[:, 0]]).T)
     for n in np.argsort(-np.round(lengths, 6), kind="stable"):

@@ -40,7 +40,9 @@ class Overlay:
         code, told, over = codes.partition(":")
         given = [one.strip() for one in over.split(",")] if told else [str(GROUND)]
         given = [] if given == ["all"] else given
-        if not file.strip() or not all(c.strip().isdecimal() and int(c) <= 255 for c in [code, *given]):
+        if not file.strip() or not all(
+            c.strip().isdecimal() and int(c) <= 255 for c in [code, *given]
+        ):
             raise OptionError(
                 "polygons are written FILE=CODE",
                 found=text,
@@ -52,7 +54,9 @@ class Overlay:
     def check(self) -> str:
         """The layer that will be read."""
         if "://" not in self.file and not Path(self.file).exists():
-            raise StageError("the file of polygons does not exist", where=self.file, cure="Check the path")
+            raise StageError(
+                "the file of polygons does not exist", where=self.file, cure="Check the path"
+            )
         with reading(self.file) as name:
             listed = vector("pyogrio").list_layers(name)
         layers = [str(name) for name, kind in listed if _POLYGONS.search(str(kind))]
@@ -92,7 +96,9 @@ def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[
     else:
         note = f"{overlay.file}: {'the points have' if crs else 'it has'} no reference system: the same was assumed"
     with reading(overlay.file) as name:
-        _, _, geometry, _ = pyogrio.raw.read(name, layer=layer, columns=[], bbox=box, where=where or None)
+        _, _, geometry, _ = pyogrio.raw.read(
+            name, layer=layer, columns=[], bbox=box, where=where or None
+        )
         shapes = shapely.force_2d(shapely.get_parts(shapely.get_parts(shapely.from_wkb(geometry))))
         shapes = shapes[shapely.get_type_id(shapes) == shapely.GeometryType.POLYGON]
         if forward is not None:
@@ -117,15 +123,28 @@ def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
             cure="Reproject the file first: ogr2ogr -t_srs",
         ) from None
     aside = 0.01 * max(east - west, north - south)
-    return lambda x, y: forward.transform(x, y), (west - aside, south - aside, east + aside, north + aside)
+    return lambda x, y: forward.transform(x, y), (
+        west - aside,
+        south - aside,
+        east + aside,
+        north + aside,
+    )
 
 
 def _flat(crs: Any) -> Any:
     """The horizontal part of a reference system."""
-    return _flat(crs.sub_crs_list[0]) if crs.is_compound else crs.to_2d() if len(crs.axis_info) > 2 else crs
+    return (
+        _flat(crs.sub_crs_list[0])
+        if crs.is_compound
+        else crs.to_2d()
+        if len(crs.axis_info) > 2
+        else crs
+    )
 
 
-def points_inside(x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]) -> NDArray[np.bool_]:
+def points_inside(
+    x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]
+) -> NDArray[np.bool_]:
     """Which points (n,) lie inside polygons, or on their edge."""
     shapely, inside = vector("shapely"), np.zeros(len(x), bool)
     whole = shapely.union_all(polygons)

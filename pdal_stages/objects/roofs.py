@@ -83,10 +83,16 @@ def continued(high: NDArray, leaves: NDArray, thick: NDArray, size: float, reach
     none; `thick` is how far the lowest point of vegetation lies below. It goes on by `reach` cells of `size` meters.
     """
     for _ in range(reach):
-        east, north, above, scatter = planes(high, np.where(np.isnan(high), leaves, np.nan), size, 1.0)
+        east, north, above, scatter = planes(
+            high, np.where(np.isnan(high), leaves, np.nan), size, 1.0
+        )
         steep = east**2 + north**2
         lean = size * np.sqrt(steep)  # the highest point of a cell lies anywhere in it
-        added = (scatter <= PLANE**2 + 0.09 * lean**2) & (steep <= 4.0) & (thick <= SURFACE + 1.5 * lean)
+        added = (
+            (scatter <= PLANE**2 + 0.09 * lean**2)
+            & (steep <= 4.0)
+            & (thick <= SURFACE + 1.5 * lean)
+        )
         added &= np.abs(above) - 0.4 * lean <= NEAR
         if not added.any():
             break
@@ -103,7 +109,9 @@ def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
     """
     out, empty = high.copy(), np.isnan(high) & ~seen
     holes, count = scipy.ndimage.label(empty)
-    deepest = scipy.ndimage.maximum(scipy.ndimage.distance_transform_cdt(empty), holes, np.arange(count + 1))
+    deepest = scipy.ndimage.maximum(
+        scipy.ndimage.distance_transform_cdt(empty), holes, np.arange(count + 1)
+    )
     near = np.zeros(count + 1, bool)
     near[holes[scipy.ndimage.binary_dilation(~np.isnan(high))]] = True
     near[0] = False
@@ -142,7 +150,9 @@ def connected(mask: NDArray, step: float, *values: NDArray) -> NDArray[np.int64]
         with np.errstate(invalid="ignore"):
             joined = mask[a] & mask[b] & ~(sum(np.abs(v[a] - v[b]) for v in values) > step)
         pairs.append((number[a][joined], number[b][joined]))
-    number[mask] = _sets(np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]), count)
+    number[mask] = _sets(
+        np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]), count
+    )
     return number
 
 
@@ -153,7 +163,9 @@ def _sets(a: NDArray, b: NDArray, count: int) -> NDArray[np.int64]:
     return number
 
 
-def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int) -> NDArray[np.int64]:
+def building_parts(
+    mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int
+) -> NDArray[np.int64]:
     """Number of each cell's building, from 0 in the order of their first cells; -1 outside.
 
     Connected cells whose heights differ by at most 1 m are a roof. Roofs of fewer than `smallest` cells (dormers,
@@ -168,7 +180,9 @@ def building_parts(mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest
         a, b, length, _ = _borders(number)
         size = np.bincount(number[number >= 0])
         a, b, length = np.r_[a, b], np.r_[b, a], np.r_[length, length]
-        order = np.lexsort((b, -length, a))  # the longest border; of equal ones the part that begins first
+        order = np.lexsort(
+            (b, -length, a)
+        )  # the longest border; of equal ones the part that begins first
         order = order[size[a[order]] < smallest]
         small, first = np.unique(a[order], return_index=True)
         if not len(small):
@@ -197,7 +211,10 @@ def _borders(
             near.append(np.ones(at.shape[1]))
             continue
         way = np.array([[down], [right]])
-        levels = [_roof_level(number, surface, at, -way), _roof_level(number, surface, at + way, way)]
+        levels = [
+            _roof_level(number, surface, at, -way),
+            _roof_level(number, surface, at + way, way),
+        ]
         near.append(np.abs(levels[0] - levels[1]) <= step)
     both, which, length = np.unique(
         np.concatenate(pairs, axis=1), axis=1, return_inverse=True, return_counts=True
@@ -205,7 +222,9 @@ def _borders(
     return *both, length, np.bincount(which.ravel(), np.concatenate(near), len(length))
 
 
-def _roof_level(number: NDArray, surface: tuple[NDArray, ...], at: NDArray, way: NDArray) -> NDArray:
+def _roof_level(
+    number: NDArray, surface: tuple[NDArray, ...], at: NDArray, way: NDArray
+) -> NDArray:
     """Heights of roofs at their border: at the outer side of cells there, whose inner neighbors lie `way`.
 
     The cell itself and the next may hold the rim of a flat roof, or the wall of a higher one: so it is the plane through
@@ -243,4 +262,8 @@ def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]
     if not taken.any():
         return 0, 0.0, 0.0
     slope = np.degrees(np.arctan(np.hypot(east[taken], north[taken])))
-    return int(large.sum()), float(slope.mean()), float(taken.sum() / np.count_nonzero(~np.isnan(z)))
+    return (
+        int(large.sum()),
+        float(slope.mean()),
+        float(taken.sum() / np.count_nonzero(~np.isnan(z))),
+    )

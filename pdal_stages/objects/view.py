@@ -42,7 +42,10 @@ class Window(NamedTuple):
     def widened(self, margin: int) -> Window:
         margin += margin % GROUND_CELLS
         return Window(
-            self.row - margin, self.column - margin, self.rows + 2 * margin, self.columns + 2 * margin
+            self.row - margin,
+            self.column - margin,
+            self.rows + 2 * margin,
+            self.columns + 2 * margin,
         )
 
     def common(self, other: Window) -> Window:
@@ -58,14 +61,19 @@ class Window(NamedTuple):
         return slice(row, row + both.rows), slice(column, column + both.columns)
 
     def holds(self, row: int, column: int) -> bool:
-        return self.row <= row < self.row + self.rows and self.column <= column < self.column + self.columns
+        return (
+            self.row <= row < self.row + self.rows
+            and self.column <= column < self.column + self.columns
+        )
 
 
 def _extent(parts: Mapping[Kind, Cells]) -> Window:
     """The rectangle that holds the cells of all kinds, of which there must be one, and an empty rim."""
     places = [np.stack(unpack(part.key)[1:]) * _width(kind) for kind, part in parts.items()]
     low, high = (end(np.concatenate(places, axis=1), axis=1) for end in (np.min, np.max))
-    low, high = (end // GROUND_CELLS * GROUND_CELLS for end in (low - 8, high + 8 + 2 * GROUND_CELLS))
+    low, high = (
+        end // GROUND_CELLS * GROUND_CELLS for end in (low - 8, high + 8 + 2 * GROUND_CELLS)
+    )
     return Window(*low.tolist(), *(high - low).tolist())
 
 
@@ -78,7 +86,9 @@ class CellView:
 
     def __init__(self, cells: Cells, window: Window, chosen: ObjectSettings) -> None:
         self.cells, self.seen, self.chosen = cells, window, chosen
-        self.inside = {kind: cells.within(kind, *(n // _width(kind) for n in window)) for kind in Kind}
+        self.inside = {
+            kind: cells.within(kind, *(n // _width(kind) for n in window)) for kind in Kind
+        }
         self.window = window.common(_extent(self.inside))
         self.held, self.surface = cache(self._held), cache(self._surface)
 
@@ -106,7 +116,9 @@ class CellView:
     @cached_property
     def ground(self) -> NDArray[np.float64]:
         """Height of the ground, meters; NaN where none is within reach."""
-        mean = self.column(Kind.GROUND, "sum", np.nan) / self.column(Kind.GROUND, "count", np.nan) / MM
+        mean = (
+            self.column(Kind.GROUND, "sum", np.nan) / self.column(Kind.GROUND, "count", np.nan) / MM
+        )
         return _wide(fill_gaps(mean, round(GROUND_REACH / (self.cells.size * GROUND_CELLS))))
 
     def _surface(self, kind: Kind) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
@@ -114,7 +126,11 @@ class CellView:
         if kind != Kind.BUILDING:
             return roofs.roof_cells(self.high(kind))
         chosen, leaves = self.chosen, self.high(Kind.TREE)
-        seen = _wide(self.held(Kind.GROUND)[1] >= 0) | ~np.isnan(leaves) | (self.held(Kind.OTHER)[1] >= 0)
+        seen = (
+            _wide(self.held(Kind.GROUND)[1] >= 0)
+            | ~np.isnan(leaves)
+            | (self.held(Kind.OTHER)[1] >= 0)
+        )
         with np.errstate(invalid="ignore"):
             leaves[leaves - self.ground < chosen.building_height] = np.nan
         thick = leaves - self.column(Kind.TREE, "low", np.nan) / MM
@@ -152,7 +168,9 @@ class CellView:
         margin, view = round(MARGIN / self.chosen.cell), self
         while True:
             mask = masked(view)
-            part, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask)
+            part, count = scipy.ndimage.label(
+                scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask
+            )
             reached = np.zeros(count + 1, bool)
             reached[part[view.window.part(core)]] = True
             reached[0] = False

@@ -73,7 +73,11 @@ def compare_files(
                     _refuse_other_points(mine, other, source, reference)
                 true = _codes(other, reference_dimension, reference or source)
             arrays = {name: values for name, values in mine.arrays.items() if name in kept}
-            arrays |= {"Withheld": mine.flag("Withheld"), "Classification": judged, "Reference": true}
+            arrays |= {
+                "Withheld": mine.flag("Withheld"),
+                "Classification": judged,
+                "Reference": true,
+            }
             parts.append((Path(source).name, stage.points(arrays, wkt=mine.wkt)))
             bar.update(1)
     if not any(points.count for _, points in parts):
@@ -113,7 +117,8 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
         reference = by_name[max(inside, key=lambda one: len(one[1]))]
         if reference in pairs:
             raise StageError(
-                "two files have the same reference", found=f"{pairs[reference]} and {source}: {reference}"
+                "two files have the same reference",
+                found=f"{pairs[reference]} and {source}: {reference}",
             )
         pairs[reference] = source
     return [(source, reference) for reference, source in pairs.items()]
@@ -124,7 +129,9 @@ def _places_and_names(files: Sequence[str]) -> list[tuple[str, str]]:
     return [os.path.split(name) for name in in_folders(files, [Path(file).stem for file in files])]
 
 
-def _read(source: str, stages: Sequence[dict[str, Any]] = (), overrides: Sequence[Override] = ()) -> Points:
+def _read(
+    source: str, stages: Sequence[dict[str, Any]] = (), overrides: Sequence[Override] = ()
+) -> Points:
     """All points of a file, after some stages."""
     pipeline = Pipeline([reader_of(source, "input"), *stages], overrides)
     pipeline.execute()
@@ -150,7 +157,9 @@ def _refuse_other_points(mine: Points, true: Points, source: str, reference: str
     else:
         apart = [np.count_nonzero(np.abs(mine.arrays[n] - true.arrays[n]) > 0.01) for n in named]
         found = (
-            f"{max(apart, default=0):,} points of {source} and {reference} lie apart" if any(apart) else ""
+            f"{max(apart, default=0):,} points of {source} and {reference} lie apart"
+            if any(apart)
+            else ""
         )
     if found:
         raise StageError(

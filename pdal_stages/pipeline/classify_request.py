@@ -36,7 +36,9 @@ class ClassifyRequest:
     #: Created dimensions to write besides the input's own; ``all`` and ``none`` are allowed.
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True  #: mark low and high noise first
-    bridges: bool = True  #: find bridge decks, where heights come from ``filters.hag_morphological``
+    bridges: bool = (
+        True  #: find bridge decks, where heights come from ``filters.hag_morphological``
+    )
     wires: bool = False  #: find wires, where heights are computed
     towers: bool = False  #: find wires, and towers and poles
     consistency: bool = True  #: correct classes that contradict their surroundings
@@ -51,7 +53,11 @@ class ClassifyRequest:
 
     @cached_property
     def _classifier(self) -> dict[str, Any]:
-        stage: dict[str, Any] = {"type": "filters.modelclassifier", "model": self.model, **self._inside}
+        stage: dict[str, Any] = {
+            "type": "filters.modelclassifier",
+            "model": self.model,
+            **self._inside,
+        }
         stage["compact"] = True
         if self.keep_sure is not None:
             stage["keep_sure"] = self.keep_sure
@@ -91,7 +97,9 @@ class ClassifyRequest:
         if self._with_bridges:
             # The heights and flags of the last one are those that remain.
             at = max(n for n, stage in enumerate(prepared) if stage["type"] == _DECKS)
-            prepared = [{**stage, "decks": True} if n == at else stage for n, stage in enumerate(prepared)]
+            prepared = [
+                {**stage, "decks": True} if n == at else stage for n, stage in enumerate(prepared)
+            ]
         noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
         return [*noise, *prepared, self._classifier, *self._corrections]
 
@@ -106,7 +114,13 @@ class ClassifyRequest:
         """Whether to look for decks: not where the model knows bridges itself, or heights come from another stage."""
         known = {code for code, _ in self.loaded.classes}
         there = any(stage["type"] == _DECKS for stage in self._prepared)
-        return self.bridges and there and known >= {2, 6} and BRIDGE not in known and not self._by_class
+        return (
+            self.bridges
+            and there
+            and known >= {2, 6}
+            and BRIDGE not in known
+            and not self._by_class
+        )
 
     @property
     def _by_class(self) -> bool:
@@ -124,14 +138,18 @@ class ClassifyRequest:
                 cure="Add filters.polygons in a second run",
             )
         settled = overridden(self._classifier, self.overrides)
-        taken: dict[str, Any] = {name: settled[name] for name in ("ignore", "keep") if name in settled}
+        taken: dict[str, Any] = {
+            name: settled[name] for name in ("ignore", "keep") if name in settled
+        }
         wanted = {
             "filters.bridges": self._with_bridges,
             "filters.wires": self.wires and not self._by_class,
             "filters.consistency": self.consistency and known >= {2, 6} and not self._by_class,
             "filters.polygons": bool(self.polygons),
         }
-        stages = [{"type": kind, **taken, **self._inside} for kind, chosen in wanted.items() if chosen]
+        stages = [
+            {"type": kind, **taken, **self._inside} for kind, chosen in wanted.items() if chosen
+        ]
         for stage in stages:
             if stage["type"] == "filters.wires" and self.towers:
                 stage["towers"] = True

@@ -48,7 +48,9 @@ def write_corrections(
         if not reads_in_parts(name):
             raise StageError("corrections are read from LAS and LAZ files", found=name)
     if named_copc(output):
-        raise OptionError("corrections are written as LAS or LAZ", found=output, cure="Name it .laz")
+        raise OptionError(
+            "corrections are written as LAS or LAZ", found=output, cure="Name it .laz"
+        )
     check_outputs([Output(output, "output")], [*filter(None, (before, after)), *areas])
     reference = reference_of_file(before)
     units = reference.units
@@ -80,7 +82,9 @@ def write_corrections(
     if CHECKED not in las.point_format.extra_dimension_names:
         las.add_extra_dim(laspy.ExtraBytesParams(CHECKED, "uint8", "1: a person has checked it"))
     las.classification, las[CHECKED] = new, checked.astype(np.uint8)
-    if "Reliability" in las.point_format.extra_dimension_names:  # of another class, or of less than a person
+    if (
+        "Reliability" in las.point_format.extra_dimension_names
+    ):  # of another class, or of less than a person
         las["Reliability"] = np.where(checked, 1.0, las["Reliability"])
     with whole_files(output) as (part,):
         las.write(str(part))
@@ -100,19 +104,28 @@ def _read(path: str) -> Any:
     out = laspy.LasData(header)
     if points := [one.array for one in las_chunks(path)]:
         joined = np.concatenate(points)
-        out.points = laspy.ScaleAwarePointRecord(joined, header.point_format, header.scales, header.offsets)
+        out.points = laspy.ScaleAwarePointRecord(
+            joined, header.point_format, header.scales, header.offsets
+        )
     return out
 
 
 def _codes_of(
-    before: str, after: str, las: Any, xyz: NDArray[np.float64], codes: NDArray[np.uint8], notes: list[str]
+    before: str,
+    after: str,
+    las: Any,
+    xyz: NDArray[np.float64],
+    codes: NDArray[np.uint8],
+    notes: list[str],
 ) -> NDArray[np.uint8]:
     """The classes of the same points in another file; their own where they are missing there."""
     other = _read(after)
     theirs = np.column_stack([other.x, other.y, other.z])
     step = float(max(*las.header.scales, *other.header.scales))
     both = {*las.point_format.dimension_names} & {*other.point_format.dimension_names}
-    named = [n for n in ("gps_time", "return_number", "number_of_returns", "classification") if n in both]
+    named = [
+        n for n in ("gps_time", "return_number", "number_of_returns", "classification") if n in both
+    ]
     more = [(np.asarray(las[n]), np.asarray(other[n])) for n in named]
     found = partners(xyz, theirs, step, more, apart=3.0 * step)
     lost, extra = int((found < 0).sum()), len(theirs) - int((found >= 0).sum())
@@ -187,7 +200,9 @@ def partners(
         orders.append(np.lexsort((*(pair[side] for pair in reversed(more)), named)))
         ordered = named[orders[-1]]
         # The first of a place is paired with the first of the same place, and so on.
-        keys.append(ordered * max(n, m) + np.arange(len(ordered)) - np.searchsorted(ordered, ordered))
+        keys.append(
+            ordered * max(n, m) + np.arange(len(ordered)) - np.searchsorted(ordered, ordered)
+        )
     at, there = places_among(keys[1], keys[0])
     out[orders[0][there]] = orders[1][at[there]]
     left = np.ones(m, bool)
@@ -202,7 +217,9 @@ def partners(
     return out
 
 
-def near_any(xyz: NDArray[np.float64], chosen: NDArray[np.bool_], within: float) -> NDArray[np.bool_]:
+def near_any(
+    xyz: NDArray[np.float64], chosen: NDArray[np.bool_], within: float
+) -> NDArray[np.bool_]:
     """(n,) whether each point lies `within` so many meters of a chosen one."""
     from scipy.spatial import cKDTree
 

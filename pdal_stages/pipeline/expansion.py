@@ -27,7 +27,8 @@ from .stagefiles import is_reader, reader_files
 
 #: Stages after which several views are what the user asked for.
 SPLITS = {
-    f"filters.{name}" for name in ("splitter", "chipper", "divider", "groupby", "returns", "separatescanline")
+    f"filters.{name}"
+    for name in ("splitter", "chipper", "divider", "groupby", "returns", "separatescanline")
 }
 
 
@@ -84,7 +85,9 @@ def _each_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
-    flags = files_with_flags_to_split(stages, any(stage["type"] in stage_types() for stage in stages))
+    flags = files_with_flags_to_split(
+        stages, any(stage["type"] in stage_types() for stage in stages)
+    )
     readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
     if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
         raise PipelineError(
@@ -136,11 +139,14 @@ def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str])
     ends = [number for number in range(len(stages)) if number not in taken]
     if len(ends) > 1:
         named = [
-            " ".join(str(stages[n][key]) for key in ("type", "filename") if key in stages[n]) for n in ends
+            " ".join(str(stages[n][key]) for key in ("type", "filename") if key in stages[n])
+            for n in ends
         ]
         raise PipelineError(
             "the pipeline has several ends, and PDAL runs only what leads to the first of them",
-            found=", ".join(f"{name} ({where[n]})" for n, name in list(zip(ends, named, strict=True))[:5]),
+            found=", ".join(
+                f"{name} ({where[n]})" for n, name in list(zip(ends, named, strict=True))[:5]
+            ),
             cure="Write one file after the other (a writer passes its points on, so leave its 'inputs' out), or add a last "
             'stage that takes all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}',
         )
@@ -157,7 +163,9 @@ def settle_upstream(
     `before` are the earlier stages in order, as written, each with the dimensions it creates: :meth:`Stage.creates`, or
     :func:`heights_of` for PDAL's own.
     """
-    wanted = set(stage.reads()) - {"Classification"}  # which noise is marked in, too: it is no preparation
+    wanted = set(stage.reads()) - {
+        "Classification"
+    }  # which noise is marked in, too: it is no preparation
     makers = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
     stage.makes_again = any(set(creates) & set(stage.creates()) for _, creates in before)
     return makers, stage.follows(makers)
@@ -189,9 +197,12 @@ def _follow_preparations(expanded: Expanded) -> None:
 #: Prefixes of dimensions that come only from a stage or from extra bytes.
 _MADE = ("HeightAbove", "Ground", "Slope", "Reference")
 #: Stages of PDAL that may create dimensions of any name.
-_MAKES_ANY = {f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")}
+_MAKES_ANY = {
+    f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")
+}
 _DEGREES = re.compile(
-    r"^\s*EPSG:\s*4\d{3}\s*$|longlat|latlong|^\s*(OGC:)?CRS:?84|^\s*(GEOGCS|GEOGCRS|GEODCRS)", re.IGNORECASE
+    r"^\s*EPSG:\s*4\d{3}\s*$|longlat|latlong|^\s*(OGC:)?CRS:?84|^\s*(GEOGCS|GEOGCRS|GEODCRS)",
+    re.IGNORECASE,
 )
 
 
@@ -282,7 +293,10 @@ def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             last = made.get(several[-1]["label"])
             if not (isinstance(last, ExpandedStage) and last.stage.forgets):
                 adds = [*dict.fromkeys(before["add_dimension"] + stage["add_dimension"])]
-                joined = {"pdalargs": {"stages": [*several, stage["pdalargs"]]}, "add_dimension": adds}
+                joined = {
+                    "pdalargs": {"stages": [*several, stage["pdalargs"]]},
+                    "add_dimension": adds,
+                }
                 out[-1] = {**before, **joined}
                 continue
         out.append(stage)

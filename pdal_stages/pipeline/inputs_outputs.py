@@ -128,7 +128,10 @@ def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
     folders = [os.path.dirname(os.path.abspath(source)) for source in sources]
     shared = os.path.commonpath(folders)
     inside = (os.path.relpath(folder, shared) for folder in folders)
-    return [os.path.normpath(os.path.join(folder, name)) for folder, name in zip(inside, names, strict=True)]
+    return [
+        os.path.normpath(os.path.join(folder, name))
+        for folder, name in zip(inside, names, strict=True)
+    ]
 
 
 def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[str]:
@@ -141,7 +144,9 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
         names = [_output_name(source, copc and pdal_env.knows_copc()) for source in sources]
         outputs = [str(path.parent / name) for name in in_folders(sources, names)]
     else:
-        outputs = named_outputs(target, [Path(_output_name(source, False)).stem for source in sources])
+        outputs = named_outputs(
+            target, [Path(_output_name(source, False)).stem for source in sources]
+        )
     first: dict[str, str] = {}
     for source, output in zip(sources, outputs, strict=True):
         if (other := first.setdefault(output, source)) is not source:
@@ -185,7 +190,9 @@ def writer_of(target: str) -> dict[str, Any]:
 
 def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:
     """A stage with the overrides of its type."""
-    return apply_overrides([stage], [o for o in overrides if not o.by_tag and o.selector == stage["type"]])[0]
+    return apply_overrides(
+        [stage], [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
+    )[0]
 
 
 def check_octrees(stages: list[dict[str, Any]]) -> None:
@@ -203,6 +210,10 @@ def stage_files(stage: Stage) -> list[str]:
     written = {output.path for output in stage.outputs()}
     if stage.type.startswith("writers."):  # whose outputs may be named after it
         written.add(stage.options["filename"])
-    given = [(o.kind, stage.options[o.name]) for o in stage.all_options() if o.kind in ("filename", "model")]
+    given = [
+        (o.kind, stage.options[o.name])
+        for o in stage.all_options()
+        if o.kind in ("filename", "model")
+    ]
     found = [find(name) if kind == "model" else name for kind, name in given if name]
     return [name for name in [*found, *stage.inputs()] if name not in written]

@@ -81,7 +81,9 @@ def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage])
             if (limit := _code_limit(writer, stages[: one.index])) is not None:
                 stage.code_limit = limit if stage in last else None
                 if (largest := stage.largest_class()) > LEGACY_LIMIT:
-                    raise OptionError(limit[0], where=stage.place, found=f"code {largest}", cure=limit[1])
+                    raise OptionError(
+                        limit[0], where=stage.place, found=f"code {largest}", cure=limit[1]
+                    )
             if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
                     f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
@@ -115,7 +117,9 @@ def check_copc_outputs(stages: list[dict[str, Any]]) -> None:
             continue
         if not pdal_env.knows_copc():
             what = f"PDAL {pdal_env.dotted_version()} cannot write COPC"
-            raise PipelineError(what, found=name, cure="Name the output .laz, or use PDAL 2.4 or later")
+            raise PipelineError(
+                what, found=name, cure="Name the output .laz, or use PDAL 2.4 or later"
+            )
         what = "writers.las writes plain LAZ, not COPC"
         raise PipelineError(what, found=name, cure='Use "type": "writers.copc"')
 
@@ -139,7 +143,9 @@ def stage(ins, outs):
 """
 
 
-def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool = True) -> list[bool]:
+def files_with_flags_to_split(
+    stages: Sequence[dict[str, Any]], with_ours: bool = True
+) -> list[bool]:
     """For each input file, whether flags must be split from the class; empty where nothing is to be done.
 
     A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: our stages are involved;
@@ -147,7 +153,11 @@ def files_with_flags_to_split(stages: Sequence[dict[str, Any]], with_ours: bool 
     """
     if pdal_env.splits_class_flags():
         return []
-    read = [[header.point_format for header in las_headers([stage])] for stage in stages if is_reader(stage)]
+    read = [
+        [header.point_format for header in las_headers([stage])]
+        for stage in stages
+        if is_reader(stage)
+    ]
     old = [one <= 5 for formats in read for one in formats or [6]]
     if True not in old:
         return []

@@ -42,7 +42,9 @@ class _Family:
             expanded = expand_stage({"type": kind.type, **own})
             runtime.remember_stdout()
             stages = [*([{"type": "filters.merge", **wired}] if merge else []), expanded.plain]
-            shown = f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
+            shown = (
+                f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
+            )
             joined = _joined(stages, shown, expanded)
             joined.type, joined.tag = kind.type, options.get("tag")
             joined.options = {"type": kind.type, **options}
@@ -65,7 +67,10 @@ def _signature(kind: type[Stage]) -> inspect.Signature:
     by_name = {"tag": None, "inputs": None, "merge": True} | defaults
     return inspect.Signature(
         [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in needed]
-        + [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d) for n, d in by_name.items()]
+        + [
+            inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d)
+            for n, d in by_name.items()
+        ]
     )
 
 
@@ -73,7 +78,12 @@ def _help(kind: type[Stage]) -> str:
     lines = [f"{kind.summary}.", "", "Parameters", "----------"]
     for option in kind.all_options():
         lines += [f"{option.name} : {option.kind}", f"    {option.help}"]
-    lines += ["tag, inputs", "    As for PDAL's stages", "merge : bool", "    False keeps views apart"]
+    lines += [
+        "tag, inputs",
+        "    As for PDAL's stages",
+        "merge : bool",
+        "    False keeps views apart",
+    ]
     return "\n".join(lines)
 
 

@@ -30,7 +30,13 @@ def arrays_in_parts(
 
     LAS and LAZ files are read in parts (`only`: see :func:`las_chunks`), others at once by PDAL.
     """
-    named = {"X": "x", "Y": "y", "Z": "z", "Classification": "classification", "Withheld": "withheld"}
+    named = {
+        "X": "x",
+        "Y": "y",
+        "Z": "z",
+        "Classification": "classification",
+        "Withheld": "withheld",
+    }
     if not reads_in_parts(path):
         ran = pdal_env.execute([reader_of(path, "input")])
         for array in ran.arrays:
@@ -63,7 +69,10 @@ def las_chunks(
     at, what = start, "the input cannot be read"
     try:
         with laspy.open(path, **more) as reader:
-            end, what = int(reader.header.point_count) if end is None else end, "the input is damaged"
+            end, what = (
+                int(reader.header.point_count) if end is None else end,
+                "the input is damaged",
+            )
             if start:
                 reader.seek(start)
             while at < end and len(chunk := reader.read_points(min(most, end - at))):
@@ -72,7 +81,11 @@ def las_chunks(
     except (GeneratorExit, KeyboardInterrupt, MemoryError):
         raise
     except BaseException as error:  # the decompressor's panics are no Exceptions
-        found = error if isinstance(error, OSError) else f"{type(error).__name__} at point {at:,}: {error}"
+        found = (
+            error
+            if isinstance(error, OSError)
+            else f"{type(error).__name__} at point {at:,}: {error}"
+        )
         raise StageError(what, where=path, found=found) from None
     if at != end:
         raise StageError("the input is cut short", where=path, found=f"{at:,} of {end:,} points")
@@ -91,7 +104,9 @@ def header_of(path: str) -> Any:
     except Exception as error:  # laspy raises many types
         found = f"{type(error).__name__}: {error}"
         raise StageError("the input cannot be read", where=path, found=found) from None
-    for directory in header.vlrs.get("GeoKeyDirectoryVlr"):  # laspy counts what pads the record as keys
+    for directory in header.vlrs.get(
+        "GeoKeyDirectoryVlr"
+    ):  # laspy counts what pads the record as keys
         directory.geo_keys_header.number_of_keys = sum(key.id > 0 for key in directory.geo_keys)
     for records in filter(None, (header.vlrs, header.evlrs)):
         records[:] = [record for record in records if record.user_id != "copc"]

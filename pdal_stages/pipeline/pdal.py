@@ -49,9 +49,17 @@ def bindings():
         import pdal
     except ImportError as error:
         found = f"{sys.executable}: {error}"
-        raise DependencyError("python-pdal cannot be imported", found=found, cure=INSTALL) from error
-    except (OSError, subprocess.SubprocessError) as error:  # it asks the program `pdal` for its drivers
-        what, cure = "python-pdal could not start the program 'pdal'", f"Put pdal on PATH. {INSTALL}"
+        raise DependencyError(
+            "python-pdal cannot be imported", found=found, cure=INSTALL
+        ) from error
+    except (
+        OSError,
+        subprocess.SubprocessError,
+    ) as error:  # it asks the program `pdal` for its drivers
+        what, cure = (
+            "python-pdal could not start the program 'pdal'",
+            f"Put pdal on PATH. {INSTALL}",
+        )
         raise DependencyError(what, found=str(error), cure=cure) from error
     return pdal
 
@@ -77,7 +85,9 @@ def program() -> str:
 
 
 def _run_program(*arguments: str, **how: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([program(), *arguments], capture_output=True, text=True, check=False, **how)
+    return subprocess.run(
+        [program(), *arguments], capture_output=True, text=True, check=False, **how
+    )
 
 
 def ask_program(*arguments: str) -> str:
@@ -122,7 +132,12 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         pipeline = pdal.Pipeline(json.dumps(adapted(stages)), loglevel=loglevel)
         count = pipeline.execute()
         metadata = pipeline.metadata  # text in older python-pdal, a dict in newer
-    except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # C++'s errors, as Python has them
+    except (
+        RuntimeError,
+        ValueError,
+        IndexError,
+        OverflowError,
+    ) as error:  # C++'s errors, as Python has them
         keep(stdout)
         if _CUT_POINTS.search(str(error)) and (read := readers_files(stages, las=True)):
             raise PipelineError(
@@ -151,10 +166,14 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
 
 
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
-_NOT_UTF8 = re.compile(r"returned a result with an exception set|UnicodeDecodeError|codec can't decode")
+_NOT_UTF8 = re.compile(
+    r"returned a result with an exception set|UnicodeDecodeError|codec can't decode"
+)
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
 #: How PDAL begins a line of its log; some stages say their name once more.
-_BY_PROGRAM = re.compile(r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE)
+_BY_PROGRAM = re.compile(
+    r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE
+)
 _kept: list[Any] = []
 
 
@@ -215,7 +234,10 @@ def validate(stages: list[dict[str, Any]]) -> None:
     try:
         verdict = json.loads(done.stdout)
     except ValueError:
-        verdict = {"valid": done.returncode == 0, "error_detail": (done.stderr or done.stdout).strip()}
+        verdict = {
+            "valid": done.returncode == 0,
+            "error_detail": (done.stderr or done.stdout).strip(),
+        }
     if not verdict.get("valid", False):
         raise translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
 
@@ -233,7 +255,9 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
             found=text.splitlines()[-1],
             cure="Install pdal_stages into the Python that the plugin of filters.python was built for",
         )
-    if "Traceback (most recent call last)" in text:  # of a script, as the pieces of a list in older PDAL
+    if (
+        "Traceback (most recent call last)" in text
+    ):  # of a script, as the pieces of a list in older PDAL
         lines = [line.strip(" '") for line in text.replace("\\n", "\n").splitlines()]
         place = [line for line in lines if line.startswith("File ")][-1:]
         last = [line for line in lines if line][-1]
@@ -332,7 +356,10 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
                     found=str(stage.get("filename", "")),
                     cure="Use PDAL 2.4 or later, or filters.crop after the reader",
                 )
-            stage = {**{k: v for k, v in stage.items() if k not in _COPC_TUNING}, "type": "readers.las"}
+            stage = {
+                **{k: v for k, v in stage.items() if k not in _COPC_TUNING},
+                "type": "readers.las",
+            }
         else:
             codes = {geotiff_code(path) for path in reader_files(stage, las=True)}
             if len(codes) == 1 and "" not in codes:  # which that PDAL does not look at
@@ -371,7 +398,10 @@ def flags_inside_classification(dimensions, metadata: Any) -> bool:
 
     Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
     """
-    if any(name in dimensions for name in ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")):
+    if any(
+        name in dimensions
+        for name in ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")
+    ):
         return False
     formats = [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
     return bool(formats) and all(f <= 5 for f in formats)
@@ -385,5 +415,7 @@ def _values(node: Any, name: str) -> list[Any]:
         return []
     own = [node.get("value")] if node.get("name") == name else []
     for key, child in node.items():
-        own += [child] if key == name and not isinstance(child, dict | list) else _values(child, name)
+        own += (
+            [child] if key == name and not isinstance(child, dict | list) else _values(child, name)
+        )
     return own

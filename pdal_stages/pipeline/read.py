@@ -47,9 +47,13 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     if isinstance(source, list | dict):
         stages = source.get("pipeline") if isinstance(source, dict) else source
         if not isinstance(stages, list):
-            raise PipelineError("a pipeline is a list of stages, or an object with a list named 'pipeline'")
+            raise PipelineError(
+                "a pipeline is a list of stages, or an object with a list named 'pipeline'"
+            )
         return _checked(PipelineSource(stages, [0] * len(stages)))
-    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n")[:2].startswith(("[", "{", "//", "/*")):
+    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n")[:2].startswith(
+        ("[", "{", "//", "/*")
+    ):
         return parse_pipeline(source)
     try:
         data = _content(Path(source))
@@ -70,7 +74,9 @@ def _content(path: Path) -> bytes:
 def decode(data: bytes, name: str) -> str:
     """The text of a pipeline file, which is UTF-8, with or without a byte order mark."""
     if data.startswith(b"LASF"):
-        cure = "Give the JSON file of a pipeline; or classify the points: pdal-stages classify IN OUT"
+        cure = (
+            "Give the JSON file of a pipeline; or classify the points: pdal-stages classify IN OUT"
+        )
         raise PipelineError("this is a point cloud, not a pipeline", where=name, cure=cure)
     try:
         return data.decode("utf-8-sig")
@@ -98,7 +104,9 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
         ) from None
     except (ValueError, RecursionError) as error:
         found = str(error)[:200]
-        raise PipelineError("the pipeline is not valid JSON", where=name or None, found=found) from None
+        raise PipelineError(
+            "the pipeline is not valid JSON", where=name or None, found=found
+        ) from None
     stages = value.get("pipeline") if isinstance(value, dict) else value
     if not isinstance(stages, list):
         what, found = "must be a list or an object", type(value).__name__
@@ -167,9 +175,13 @@ def _check_values(stage: Any, where: str) -> None:
     except UnicodeEncodeError as error:
         found = ascii(error.object[max(0, error.start - 40) : error.end])
         cure = "If it is a file's name, rename the file"
-        raise PipelineError("a text is not valid UTF-8", where=where, found=found, cure=cure) from None
+        raise PipelineError(
+            "a text is not valid UTF-8", where=where, found=found, cure=cure
+        ) from None
     except (TypeError, ValueError, RecursionError) as error:
-        raise PipelineError("a stage holds a value that PDAL cannot take", where=where, found=error) from None
+        raise PipelineError(
+            "a stage holds a value that PDAL cannot take", where=where, found=error
+        ) from None
 
 
 # The closing quote is optional, so that a match never fails: searching stays linear whatever the text.
@@ -232,7 +244,9 @@ def parse_overrides(arguments: Iterable[str]) -> tuple[list[Override], list[str]
                 raise OptionError(f"'{flag}' has no value", cure=f"Write {flag}=VALUE")
             value = waiting.pop(0)
         found.append(
-            Override(match["tag"] or match["type"], match["tag"] is not None, match["option"], value)
+            Override(
+                match["tag"] or match["type"], match["tag"] is not None, match["option"], value
+            )
         )
     return found, rest
 
@@ -245,7 +259,9 @@ def apply_overrides(stages: list[Any], overrides: Iterable[Override]) -> list[An
         hits = [s for s in out if isinstance(s, dict) and str(s.get(key, "")) == override.selector]
         if not hits:
             known = sorted({str(s[key]) for s in out if isinstance(s, dict) and key in s})
-            there = f"The pipeline's {key}s: {', '.join(known)}" if known else f"No stage has a {key}"
+            there = (
+                f"The pipeline's {key}s: {', '.join(known)}" if known else f"No stage has a {key}"
+            )
             raise OptionError(
                 f"no stage of the pipeline has the {key} '{override.selector}'",
                 found=override.flag,

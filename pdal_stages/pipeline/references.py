@@ -14,7 +14,12 @@ from . import pdal as pdal_env
 from .stagefiles import reader_files
 
 #: Stages that may bring points into one reference.
-MOVING = ("filters.reprojection", "filters.projpipeline", "filters.transformation", "filters.georeference")
+MOVING = (
+    "filters.reprojection",
+    "filters.projpipeline",
+    "filters.transformation",
+    "filters.georeference",
+)
 #: Differences between references that move coordinates by less than a meter; units are compared separately.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
 _ASIDE = re.compile(r"\+(v?units|v?to_meter|towgs84|geoidgrids|no_defs|type|wktext)")
@@ -27,7 +32,9 @@ class Reference:
     """The spatial reference of an input."""
 
     units: Units
-    plane: frozenset[str] = frozenset()  #: the projection's parameters; empty where they are not known
+    plane: frozenset[str] = (
+        frozenset()
+    )  #: the projection's parameters; empty where they are not known
     height: str = ""  #: the authority's code of the heights' system, where it is known
     name: str = ""
     wkt: str = ""  #: of the horizontal system, for other programs
@@ -44,7 +51,9 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
     try:
         header = header_there(str(reader["filename"]))
-        count, (x0, y0, x1, y1) = (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
+        count, (x0, y0, x1, y1) = (
+            (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
+        )
         middle = ((x0 + x1) / 2, (y0 + y1) / 2) if count else None
         units = units_of_wkt(wkt, horizontal=horizontal, place=middle)
         if units.assumed:
@@ -61,7 +70,11 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
 
 def reference_of_file(path: str, horizontal: str = "") -> Reference:
     """The same of a file."""
-    las = {"type": "readers.las", "count": 1} if named_las(path) and read_header(path) is not None else {}
+    las = (
+        {"type": "readers.las", "count": 1}
+        if named_las(path) and read_header(path) is not None
+        else {}
+    )
     return reference_of(pdal_env.typed([{"filename": path, **las}])[0], horizontal)
 
 
@@ -76,11 +89,17 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
     for path, one in found.items():
         across, upward = one.units.horizontal, one.units.vertical
         assumed = ", as there is no spatial reference" if one.units.assumed else ""
-        units.setdefault((across, upward), f"{across:g} m across and {upward:g} m upward in {path}{assumed}")
+        units.setdefault(
+            (across, upward), f"{across:g} m across and {upward:g} m upward in {path}{assumed}"
+        )
         for kinds, said in ((planes, one.plane), (heights, one.height)):
             if said:
                 kinds.setdefault(said, f"{one.name} in {path}")
-    of_kind = {"units of length": units, "reference systems": planes, "reference systems of heights": heights}
+    of_kind = {
+        "units of length": units,
+        "reference systems": planes,
+        "reference systems of heights": heights,
+    }
     for what, kinds in of_kind.items():
         if len(kinds) > 1:
             raise StageError(
@@ -105,7 +124,10 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
     for stage in stages:
         options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}
         for path in reader_files(stage, las=True):
-            readers[path] = f"{projection(path)} {options}", {**options, "filename": path, "count": 1}
+            readers[path] = (
+                f"{projection(path)} {options}",
+                {**options, "filename": path, "count": 1},
+            )
     kinds = dict(readers.values())
     if len(kinds) < 2:
         return []

@@ -107,7 +107,11 @@ class Review:
 
 
 def review_files(
-    inputs: Sequence[str], share: float = 0.95, cell: float = 0.0, model: str = STANDARD, workers: int = 1
+    inputs: Sequence[str],
+    share: float = 0.95,
+    cell: float = 0.0,
+    model: str = STANDARD,
+    workers: int = 1,
 ) -> Review:
     """Read classified files and find the patches.
 
@@ -135,7 +139,9 @@ def review_files(
     patches = find_patches(cells)
     held = np.cumsum(patches.errors)
     listed = int(np.searchsorted(held, share * held[-1])) + 1 if held[-1] > 0 else 0
-    return Review(cells, patches, min(listed, len(patches)), files, references[files[0]].units.horizontal)
+    return Review(
+        cells, patches, min(listed, len(patches)), files, references[files[0]].units.horizontal
+    )
 
 
 def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
@@ -146,13 +152,17 @@ def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[
         if "Reliability" not in part:
             whole.append(part)
         elif len(part["codes"]):
-            found.append(ReviewCells.of(part["xyz"], part["codes"], part["Reliability"], side, number))
+            found.append(
+                ReviewCells.of(part["xyz"], part["codes"], part["Reliability"], side, number)
+            )
     if whole:
         print_messages(
             f"{path} has no Reliability: now computed by the model {model}, which takes as long as classifying"
         )
         every = {name: np.concatenate([part[name] for part in whole]) for name in whole[0]}
-        found.append(ReviewCells.of(every["xyz"], every["codes"], reliability_of(every, model), side, number))
+        found.append(
+            ReviewCells.of(every["xyz"], every["codes"], reliability_of(every, model), side, number)
+        )
     return [ReviewCells.join(found)] if found else []
 
 
@@ -210,7 +220,9 @@ def write_review(
             files[0].write_bytes((json.dumps(found.to_dict(), indent=1) + "\n").encode())
         if html:
             files[-1].write_bytes(review_page(found).encode())
-        write_layers(output, layers, reference_of_file(found.files[0]).wkt, styles(found.patches.errors))
+        write_layers(
+            output, layers, reference_of_file(found.files[0]).wkt, styles(found.patches.errors)
+        )
     return found
 
 
@@ -226,7 +238,9 @@ def review_layers(found: Review) -> dict[str, Layer]:
     patches = [{**row, "done": 0} for row in found.rows]
     return {
         name: Layer(
-            [shapely.MultiPolygon(shapely.get_parts(s)) for s in drawn], "MultiPolygon", _fields(rows)
+            [shapely.MultiPolygon(shapely.get_parts(s)) for s in drawn],
+            "MultiPolygon",
+            _fields(rows),
         )
         for name, drawn, rows in (("patches", shapes, patches), ("tiles", outlines, tiles))
     }
@@ -248,13 +262,20 @@ def review_page(review: Review) -> str:
     points, expected = found["points"], found["expected"]
     figures = [
         ("Points judged", f"{points:,}", "", "ground, vegetation and buildings"),
-        ("Expected wrong", f"{expected:,.0f}", "", f"{100 * expected / max(points, 1):.2f} % of them"),
+        (
+            "Expected wrong",
+            f"{expected:,.0f}",
+            "",
+            f"{100 * expected / max(points, 1):.2f} % of them",
+        ),
         ("Patches", f"{found['listed']:,}", "", "in the vector file, worst first"),
     ]
     held, spent = np.cumsum(review.patches.errors), np.cumsum(review.patches.minutes)
     for share in (0.25, 0.5, 0.75, 0.9) if expected > 0 else ():
         place = min(int(np.searchsorted(held, share * held[-1])), len(spent) - 1)
-        figures.append((f"{100 * share:.0f} % of these", duration(60 * spent[place]), "", "of looking"))
+        figures.append(
+            (f"{100 * share:.0f} % of these", duration(60 * spent[place]), "", "of looking")
+        )
     return render(
         "review.html",
         title="Where to look",

@@ -23,7 +23,14 @@ from .expansion import Expanded, check_dimensions, expand, merge_filters
 from .inputs_outputs import check_octrees, stage_files
 from .read import Override, PipelineSource, apply_overrides, read_pipeline
 from .references import check_readers
-from .stagefiles import is_reader, is_writer, named_files, readers_files, with_outputs, writers_outputs
+from .stagefiles import (
+    is_reader,
+    is_writer,
+    named_files,
+    readers_files,
+    with_outputs,
+    writers_outputs,
+)
 
 #: Points that got no class from the classifier, or were changed after it, by their keys in the reports of stages.
 LEFT_ALONE = {
@@ -72,7 +79,9 @@ class Pipeline:
     ) -> None:
         read = source if isinstance(source, PipelineSource) else read_pipeline(source)
         overrides = list(overrides)
-        named = apply_overrides(read.stages, [one for one in overrides if one.by_tag])  # of files, too
+        named = apply_overrides(
+            read.stages, [one for one in overrides if one.by_tag]
+        )  # of files, too
         stages = apply_overrides(pdal_env.typed(named, read.where), overrides)
         self.source = PipelineSource(stages, read.lines, read.name)
         self.expanded: Expanded = expand(self.source, whole)
@@ -90,7 +99,9 @@ class Pipeline:
     def left_alone(self) -> dict[str, int]:
         """Numbers of points by :data:`LEFT_ALONE`, from the last stage that counts them."""
         last = [each[-1].figures for _, each in self.reports if each]
-        return {k: one[k] for one in last for k in LEFT_ALONE if isinstance(one.get(k), int) and one[k]}
+        return {
+            k: one[k] for one in last for k in LEFT_ALONE if isinstance(one.get(k), int) and one[k]
+        }
 
     @property
     def messages(self) -> list[str]:
@@ -100,7 +111,8 @@ class Pipeline:
             for text in [text for report in reports for text in report.messages]:
                 places.setdefault(text, {})[place] = None
         of_stages = [
-            text if len(said) > 1 else f"{next(iter(said))}: {text}" for text, said in places.items()
+            text if len(said) > 1 else f"{next(iter(said))}: {text}"
+            for text, said in places.items()
         ]
         return [*self.warnings, *of_stages]
 
@@ -122,7 +134,9 @@ class Pipeline:
             self._check_inputs()
             # Some of PDAL's writers open their file, and empty it, when they are prepared: theirs are in a folder of ours.
             with TemporaryDirectory(prefix="pdal-stages-") as folder:
-                names = [os.path.basename(one.path).replace("#", "0") for one in writers_outputs(stages)]
+                names = [
+                    os.path.basename(one.path).replace("#", "0") for one in writers_outputs(stages)
+                ]
                 elsewhere = [os.path.join(folder, f"{n}-{name}") for n, name in enumerate(names)]
                 pdal_env.validate(with_outputs(stages, elsewhere))
         except StageError as error:
@@ -143,7 +157,12 @@ class Pipeline:
         """Local files that are read: by readers, by other stages, and the pipeline itself."""
         stages = self.expanded.stages
         named = [name for ours in self.expanded.ours for name in stage_files(ours.stage)]
-        return [*readers_files(stages), *named_files(stages), *named, *filter(None, [self.source.name])]
+        return [
+            *readers_files(stages),
+            *named_files(stages),
+            *named,
+            *filter(None, [self.source.name]),
+        ]
 
     def __or__(self, other: Any) -> Pipeline:
         """The pipeline with more stages: objects of python-pdal, ours or PDAL's, or another pipeline's."""
@@ -221,7 +240,9 @@ class Pipeline:
             except OSError as error:
                 raise PipelineError("the file cannot be read", where=path, found=error) from None
         stages = self.expanded.stages
-        if stages and not is_reader(stages[0]):  # newer PDAL refuses it, older PDAL runs it on nothing
+        if stages and not is_reader(
+            stages[0]
+        ):  # newer PDAL refuses it, older PDAL runs it on nothing
             ours = {one.index: one.stage.type for one in self.expanded.ours}
             found = ours.get(0, stages[0]["type"])
             cure = "Put the file that is to be read first"
@@ -248,7 +269,9 @@ class Pipeline:
             error.cure = f"List its options with: pdal-stages options {named[0]}"
         if error.cure is None and _NO_STAGE.search(found):
             error.found = found.splitlines()[0]
-            theirs = [one["name"] for one in json.loads(pdal_env.ask_program("--drivers", "--showjson"))]
+            theirs = [
+                one["name"] for one in json.loads(pdal_env.ask_program("--drivers", "--showjson"))
+            ]
             near = suggest(named[0], [*stage_types(), *theirs])
             error.cure = f"{near}List the stages there are with: pdal-stages drivers"
         return error
@@ -271,8 +294,12 @@ def _named_metadata(metadata: dict[str, Any], expanded: Expanded) -> dict[str, A
     if not isinstance(inner, dict):
         return metadata
     scripts = filter(None, _several(inner.pop("filters.python", None)))
-    theirs = [s for s in scripts if not (isinstance(s, dict) and any(name in stage_types() for name in s))]
-    named = [(ours.stage.type, report.to_dict()) for ours in expanded.ours for report in ours.reports]
+    theirs = [
+        s for s in scripts if not (isinstance(s, dict) and any(name in stage_types() for name in s))
+    ]
+    named = [
+        (ours.stage.type, report.to_dict()) for ours in expanded.ours for report in ours.reports
+    ]
     for kind, node in [*(("filters.python", node) for node in theirs), *named]:
         inner[kind] = [*_several(inner[kind]), node] if kind in inner else node
     return metadata

@@ -116,7 +116,9 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
                 held.failure = failure
             outs.clear()
             outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
-            if _redirected():  # PDAL puts it back only after a run that succeeds, and its log is gone by now
+            if (
+                _redirected()
+            ):  # PDAL puts it back only after a run that succeeds, and its log is gone by now
                 sys.stdout = _usual_stdout
                 pdal_env.keep(_usual_stdout)
             break
@@ -159,10 +161,14 @@ def points_of_views(
     arrays = [array for array in arrays if len(array)] or list(arrays[:1])
     names = arrays[0].dtype.names or () if arrays else ()
     columns = {name: np.concatenate([array[name] for array in arrays]) for name in names}
-    said = [node for kind, node in metadata.get("metadata", {}).items() if kind.startswith("readers.")]
+    said = [
+        node for kind, node in metadata.get("metadata", {}).items() if kind.startswith("readers.")
+    ]
     first = said[0] if said else None
     wkt = wkt_of(first[0] if isinstance(first, list) else first)
-    return made(columns, wkt=wkt, legacy_flags=pdal_env.flags_inside_classification(names, metadata))
+    return made(
+        columns, wkt=wkt, legacy_flags=pdal_env.flags_inside_classification(names, metadata)
+    )
 
 
 def _made_again(arguments: Mapping[str, Any]) -> Stage:
@@ -190,7 +196,9 @@ def run_on_view(
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.
         array = np.ascontiguousarray(values, dtype=target)
         if array.shape != (points.count,):
-            raise StageError(f"internal: '{name}' has {array.shape} values for {points.count} points")
+            raise StageError(
+                f"internal: '{name}' has {array.shape} values for {points.count} points"
+            )
         outs[name] = array
     return points.report
 
@@ -234,7 +242,9 @@ def wkt_of(reference: Any) -> str:
     return str(srs.get("compoundwkt") or srs.get("wkt") or srs.get("horizontal") or "")
 
 
-def node(name: str, children: list[dict[str, Any]], value: str = "", kind: str = "") -> dict[str, Any]:
+def node(
+    name: str, children: list[dict[str, Any]], value: str = "", kind: str = ""
+) -> dict[str, Any]:
     """A node of PDAL's metadata, as a script gives it."""
     return {"name": name, "value": value, "type": kind, "description": "", "children": children}
 
@@ -282,7 +292,9 @@ class Callbacks:
     def __init__(self) -> None:
         self._held: list[Callback] = []
 
-    def filter(self, function: Function, adds: Mapping[str, str] | None = None, **own: Any) -> dict[str, Any]:
+    def filter(
+        self, function: Function, adds: Mapping[str, str] | None = None, **own: Any
+    ) -> dict[str, Any]:
         """A ``filters.python`` that calls a function and adds dimensions (name -> PDAL type); `own`: its tag, inputs."""
         label = f"pdal_stages_callback_{uuid.uuid4().hex}"
         self._held.append(callback := Callback(function))
@@ -304,7 +316,9 @@ class Callbacks:
         return out
 
 
-def _check_ground(where: str, module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> None:
+def _check_ground(
+    where: str, module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
+) -> None:
     codes = ins.get("Classification")
     # As PDAL counts: flags inside the class make another class of it. No points at all do no harm.
     if codes is None or not len(codes) or (np.asarray(codes) == 2).any():

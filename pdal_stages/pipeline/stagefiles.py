@@ -70,7 +70,10 @@ def writes_las(stage: Mapping[str, Any]) -> bool:
 
 def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:
     """Files that PDAL's writers write."""
-    return [Output(s["filename"], "output", LAS if writes_las(s) else "") for s in filter(is_writer, stages)]
+    return [
+        Output(s["filename"], "output", LAS if writes_las(s) else "")
+        for s in filter(is_writer, stages)
+    ]
 
 
 def with_outputs(stages: list[dict[str, Any]], names: list[Any]) -> list[dict[str, Any]]:

@@ -134,7 +134,9 @@ class WorkerProcesses(AbstractContextManager):
                     pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
                 except OSError as error:
                     cure = "Make /dev/shm writable, or do without them: --workers 0"
-                    raise StageError("worker processes cannot be started", found=error, cure=cure) from None
+                    raise StageError(
+                        "worker processes cannot be started", found=error, cure=cure
+                    ) from None
                 future = pool.submit(perform, task)
         self._busy[future] = pool
         return future
@@ -173,7 +175,10 @@ class WorkerProcesses(AbstractContextManager):
 def _stop_sending(pool: Any) -> None:
     """Let go of a large task that a dead worker did not read; Python before 3.11.5 would wait for it (gh-94777)."""
     if sys.version_info < (3, 11, 5):
-        with suppress(OSError), open(os.devnull) as nothing:  # the pool's own thread closes the reader
+        with (
+            suppress(OSError),
+            open(os.devnull) as nothing,
+        ):  # the pool's own thread closes the reader
             os.dup2(nothing.fileno(), pool._call_queue._reader.fileno())
 
 
@@ -203,7 +208,10 @@ def _environment(threads: int) -> Iterator[None]:
     The program is not imported in it, so a script needs no ``if __name__ == "__main__"``.
     """
     names = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES]
-    wanted = dict.fromkeys(names, str(threads)) | {"PDAL_STAGES_PROGRESS": "0", "PYTHONSAFEPATH": "1"}
+    wanted = dict.fromkeys(names, str(threads)) | {
+        "PDAL_STAGES_PROGRESS": "0",
+        "PYTHONSAFEPATH": "1",
+    }
     before = {name: os.environ.get(name) for name in wanted}
     program = sys.modules["__main__"]
     os.environ.update(wanted)
@@ -247,7 +255,9 @@ def _answer(future: Any) -> TaskResult:
     return TaskResult(reason=f"{type(error).__name__}: {error}")
 
 
-def each_file(function: Callable[..., Any], work: Sequence[tuple], workers: int = 1) -> Iterator[Any]:
+def each_file(
+    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
+) -> Iterator[Any]:
     """The result for each item of work, the function's arguments, as they finish.
 
     The function must be importable by other processes. They share the cores. A single worker is this process. At the end
@@ -269,4 +279,6 @@ def each_file(function: Callable[..., Any], work: Sequence[tuple], workers: int 
     if failed and len(work) == 1:
         raise StageError(failed[0])
     if failed:
-        raise StageError(f"{len(failed)} of {len(work)} inputs cannot be read", found="; ".join(failed[:3]))
+        raise StageError(
+            f"{len(failed)} of {len(work)} inputs cannot be read", found="; ".join(failed[:3])
+        )

@@ -40,7 +40,10 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     try:
         stage, warning = _made(question)
         if question["step"] == "prepare":
-            said = [runtime.leaf("dimension", f"{name}={kind}") for name, kind in stage.creates().items()]
+            said = [
+                runtime.leaf("dimension", f"{name}={kind}")
+                for name, kind in stage.creates().items()
+            ]
             warnings = [warning] if warning else []
         else:
             report = runtime.run_on_view(stage, module, ins, outs)

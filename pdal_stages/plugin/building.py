@@ -33,12 +33,16 @@ _STILL_WORK = "pdal-stages pipeline and pdal-stages expand still work"
 def libraries() -> list[str]:
     """The files that PDAL looks for: ``filters.hag_minima`` is in ``libpdal_plugin_filter_hag_minima.so``."""
     parts = (name.partition(".") for name in stage_types())
-    return [f"libpdal_plugin_{family.removesuffix('s')}_{name}{SUFFIX}" for family, _, name in parts]
+    return [
+        f"libpdal_plugin_{family.removesuffix('s')}_{name}{SUFFIX}" for family, _, name in parts
+    ]
 
 
 def usual_folder() -> Path:
     """The folder in PDAL's path that has the plugin; otherwise the folder of ``filters.python``."""
-    named = [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
+    named = [
+        Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part
+    ]
     there = (path for path in named if any((path / name).is_file() for name in libraries()))
     return next(there, None) or plugin_folder()
 
@@ -65,7 +69,15 @@ def install(folder: Path | None = None) -> list[Path]:
         Path(work, "declarations.hpp").write_text(declarations.header())
         link = ["-shared", f"-L{found.library}", "-lpdalcpp", f"-Wl,-rpath,{found.library}"]
         link += [] if sys.platform == "darwin" else ["-Wl,-Bsymbolic", "-s"]
-        flags = ["-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-w", f"-I{work}", f"-I{found.headers}"]
+        flags = [
+            "-std=c++17",
+            "-O1",
+            "-fPIC",
+            "-fvisibility=hidden",
+            "-w",
+            f"-I{work}",
+            f"-I{found.headers}",
+        ]
         _run([*cxx, *flags, str(SOURCE), *link, "-o", str(library)])
         files = [target / name for name in libraries()]
         for path in files:
@@ -81,7 +93,9 @@ def uninstall(folder: Path | None = None) -> list[Path]:
         try:
             path.unlink()
         except OSError as error:
-            raise StageError("a file cannot be removed", found=f"{path}: {error.strerror}") from None
+            raise StageError(
+                "a file cannot be removed", found=f"{path}: {error.strerror}"
+            ) from None
     return gone
 
 
@@ -157,7 +171,9 @@ def pdal() -> Pdal:
 
 def plugin_folder() -> Path:
     """The folder of ``filters.python``, where PDAL will find our plugin too."""
-    named = [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
+    named = [
+        Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part
+    ]
     usual = [Path(sysconfig.get_path(key)) / "pdal" for key in ("platlib", "purelib")]
     tried = list(dict.fromkeys([*named, *usual, Path(sys.prefix) / "lib"]))
     for folder in tried:
@@ -182,7 +198,9 @@ class _Found(ctypes.Structure):
 
 def _library_folder() -> Path:
     """The folder of the library that python-pdal is linked to."""
-    extension = importlib.import_module(f"{pdal_env.bindings().__name__}.libpdalpython").__file__ or ""
+    extension = (
+        importlib.import_module(f"{pdal_env.bindings().__name__}.libpdalpython").__file__ or ""
+    )
     try:
         address = ctypes.cast(getattr(ctypes.CDLL(extension), _OF_PDAL), ctypes.c_void_p)
         found = _Found()

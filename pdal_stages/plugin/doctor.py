@@ -54,7 +54,9 @@ class Finding:
 
     def __str__(self) -> str:
         mark = "ok" if not self.cure else "MISSING" if self.needed else "no"
-        return f"{mark:8}{self.what}: {self.found}" + (f"\n        -> {self.cure}" if self.cure else "")
+        return f"{mark:8}{self.what}: {self.found}" + (
+            f"\n        -> {self.cure}" if self.cure else ""
+        )
 
 
 def examine() -> Iterator[Finding]:
@@ -69,7 +71,9 @@ def examine() -> Iterator[Finding]:
 
 def _package() -> Iterator[Finding]:
     python = f"Python {sys.version.split()[0]} of {sys.prefix}"
-    yield Finding("pdal_stages", f"{__version__} in {Path(__file__).resolve().parents[1]}, {python}")
+    yield Finding(
+        "pdal_stages", f"{__version__} in {Path(__file__).resolve().parents[1]}, {python}"
+    )
     try:
         loaded_model(STANDARD)
         yield Finding("shipped model", STANDARD)
@@ -80,7 +84,9 @@ def _package() -> Iterator[Finding]:
 def _bindings() -> Iterator[Finding]:
     module = pdal_env.bindings()
     yield Finding("PDAL", f"{pdal_env.dotted_version()}, python-pdal {module.__version__}")
-    yield _python_of("filters.python in this process", lambda stages: pdal_env.execute(stages, arrays=False))
+    yield _python_of(
+        "filters.python in this process", lambda stages: pdal_env.execute(stages, arrays=False)
+    )
 
 
 def _program() -> Iterator[Finding]:
@@ -99,17 +105,29 @@ def _run_program(stages: list) -> None:
 
 def _python_of(what: str, run: Callable[[list], object]) -> Finding:
     """Which Python PDAL runs, and whether it has our package."""
-    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": "([1, 2], [1, 2], [1, 2])"}
+    point = {
+        "type": "readers.faux",
+        "mode": "constant",
+        "count": 1,
+        "bounds": "([1, 2], [1, 2], [1, 2])",
+    }
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer")
-        run([point, runtime.python_filter("pdal_stages_doctor", _SCRIPT, {"answer": str(answer)}, {})])
+        run(
+            [
+                point,
+                runtime.python_filter("pdal_stages_doctor", _SCRIPT, {"answer": str(answer)}, {}),
+            ]
+        )
         if not answer.is_file():
             cure = "Install pdal-plugins again, for this PDAL and this Python"
             return Finding(what, "the script did not run", cure)
         prefix, found = answer.read_text().splitlines()[:2]
     python, here = f"Python of {prefix}", Path(__file__).resolve().parents[1]
     if not os.path.isabs(found):
-        return Finding(what, f"{python}; {found}", f"{prefix}/bin/python -m pip install pdal-stages")
+        return Finding(
+            what, f"{python}; {found}", f"{prefix}/bin/python -m pip install pdal-stages"
+        )
     if Path(found).resolve().parent != here:
         other = f"{python}, which has another pdal_stages: {found}"
         return Finding(what, other, "Keep one of them, or one version")
@@ -132,7 +150,9 @@ def _machine() -> Iterator[Finding]:
     cure = "" if free >= _LITTLE_MEMORY else "Work in tiles (--tile), or close other programs"
     yield Finding("free memory", f"{free / 2**30:.1f} GB", cure, needed=False)
     count = kept_kernels()
-    cure = "" if count else "pdal-stages warmup, once; otherwise the first job waits for the compiler"
+    cure = (
+        "" if count else "pdal-stages warmup, once; otherwise the first job waits for the compiler"
+    )
     yield Finding("compiled kernels", str(count) if count else "none yet", cure, needed=False)
 
 

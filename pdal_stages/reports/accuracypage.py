@@ -43,16 +43,24 @@ def places(files: Sequence[Place], systems: Sequence[str] = ()) -> list[Place]:
     there = [k for k, one in enumerate(files) if len(one.xyz)]
     if not there:
         return []
-    low, high = (np.array([how(files[k].xyz[:, :2], axis=0) for k in there]) for how in (np.min, np.max))
-    apart = np.linalg.norm((low[:, None] - high[None]).clip(0) + (low[None] - high[:, None]).clip(0), axis=2)
+    low, high = (
+        np.array([how(files[k].xyz[:, :2], axis=0) for k in there]) for how in (np.min, np.max)
+    )
+    apart = np.linalg.norm(
+        (low[:, None] - high[None]).clip(0) + (low[None] - high[:, None]).clip(0), axis=2
+    )
     system = np.array([systems[k] if systems else "" for k in there])
     _, group = connected_components((apart <= TOGETHER) & (system[:, None] == system))
     out = []
     for number in dict.fromkeys(group.tolist()):
         mine = [files[there[k]] for k in np.flatnonzero(group == number)]
-        listed = ", ".join(one.name for one in mine[:3]) + f" and {len(mine) - 3:,} more" * (len(mine) > 3)
+        listed = ", ".join(one.name for one in mine[:3]) + f" and {len(mine) - 3:,} more" * (
+            len(mine) > 3
+        )
         sides = ("xyz", "reference", "predicted")
-        out.append(Place(listed, *(np.concatenate([getattr(one, side) for one in mine]) for side in sides)))
+        out.append(
+            Place(listed, *(np.concatenate([getattr(one, side) for one in mine]) for side in sides))
+        )
     return out
 
 
@@ -104,7 +112,10 @@ def write_accuracy_report(
     if xyz is not None:
         places = [Place("", np.asarray(xyz), np.asarray(reference), np.asarray(predicted))]
     scenes = [
-        (one.name if len(places) > 1 else "", _maps(accuracy, one.xyz, one.reference, one.predicted))
+        (
+            one.name if len(places) > 1 else "",
+            _maps(accuracy, one.xyz, one.reference, one.predicted),
+        )
         for one in places[:DRAWN]
     ]
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
@@ -125,7 +136,9 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, An
     """Maps of reference, prediction and errors for the template; none where the points lie at one place or in a line."""
     points = np.asarray(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise StageError("'xyz' must be n x 3", where="accuracy report", found=f"shape {points.shape}")
+        raise StageError(
+            "'xyz' must be n x 3", where="accuracy report", found=f"shape {points.shape}"
+        )
     if not len(points):
         raise StageError("there is nothing to draw", where="accuracy report", found="0 points")
     if bad := int((~np.isfinite(points).all(axis=1)).sum()):
@@ -163,7 +176,9 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, An
         f"corner: x {s.x0:.0f}, y {s.y0:.0f}. Each pixel of {s.pixel:.2g} m shows its highest point; on the map of "
         "errors a wrong point lies above right ones.",
         "classes": [(class_color(code), f"{code} {a.name(code)}") for code in there],
-        "verdicts": [(RIGHT, "right"), (WRONG, "wrong"), (IGNORED, "not compared")][: 2 + (n < len(points))],
+        "verdicts": [(RIGHT, "right"), (WRONG, "wrong"), (IGNORED, "not compared")][
+            : 2 + (n < len(points))
+        ],
         "maps": [
             picture(shown[0], "Reference", "Map of the reference classes from above"),
             picture(shown[1], "Prediction", "Map of the predicted classes from above"),

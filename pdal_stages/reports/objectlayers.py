@@ -52,7 +52,9 @@ class Layer(NamedTuple):
     columns: dict[str, NDArray]
 
 
-def object_layers(objects: Objects, *, straight: bool = True, units: Units | None = None) -> dict[str, Layer]:
+def object_layers(
+    objects: Objects, *, straight: bool = True, units: Units | None = None
+) -> dict[str, Layer]:
     """Layers ``buildings``, ``trees``, ``crowns``, ``spans``, ``decks``.
 
     Parameters
@@ -96,7 +98,11 @@ def _columns(table: Table, kind: Kind) -> dict[str, NDArray]:
     out: dict[str, NDArray] = {"object_id": table.ids}
     for name, of in COLUMNS[kind].items():
         values = table.columns.get(name, np.empty(0, of))
-        out[name] = np.round(values.astype(of), 3) if of is _F else values.astype(object if of is _S else of)
+        out[name] = (
+            np.round(values.astype(of), 3)
+            if of is _F
+            else values.astype(object if of is _S else of)
+        )
     return out
 
 
@@ -186,7 +192,10 @@ def target_files(path: str | Path, layers: Sequence[str] = LAYERS) -> list[Path]
 
 
 def write_layers(
-    path: str | Path, layers: dict[str, Layer], wkt: str = "", styles: Mapping[str, str] | None = None
+    path: str | Path,
+    layers: dict[str, Layer],
+    wkt: str = "",
+    styles: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write layers, all or none; returns the files.
 
@@ -216,7 +225,10 @@ def write_objects(
     """Write all layers; returns the number of objects of each, and the ``files``."""
     layers = object_layers(objects, straight=straight, units=units)
     files = write_layers(path, layers, wkt)
-    return {**{name: len(layer.shapes) for name, layer in layers.items()}, "files": [str(f) for f in files]}
+    return {
+        **{name: len(layer.shapes) for name, layer in layers.items()},
+        "files": [str(f) for f in files],
+    }
 
 
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
@@ -239,12 +251,18 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
                 **({"VERSION": "1.2"} if named else {}),  # of which GDAL before 3.7 does not warn
             )
         found = pyogrio.read_info(path, layer=named, force_feature_count=True)["features"]
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.CRSError) as error:
+    except (
+        pyogrio.errors.DataSourceError,
+        pyogrio.errors.DataLayerError,
+        pyogrio.errors.CRSError,
+    ) as error:
         what, cure = "the vector file could not be written", "Is there room on the disk?"
         raise StageError(what, found=str(error), cure=cure) from None
     if found != len(layer.shapes):
         lost = f"{found:,} of {len(layer.shapes):,} {name}"
-        raise StageError("objects could not be written completely", found=lost, cure="Make room on the disk")
+        raise StageError(
+            "objects could not be written completely", found=lost, cure="Make room on the disk"
+        )
 
 
 #: Class whose color the sure objects of a layer have, and their opacity; objects to be checked are yellow.
@@ -268,7 +286,9 @@ def verdict_style(kind: str, name: str) -> str:
     """A style for QGIS that distinguishes sure objects from those to be checked."""
     code, opacity = _CLASSES[name]
     sure = ",".join(map(str, (*class_color(code), opacity)))
-    return qml(kind, [("sure", "verdict = 'sure'", sure), ("check", f"verdict = '{CHECK}'", _TO_CHECK)])
+    return qml(
+        kind, [("sure", "verdict = 'sure'", sure), ("check", f"verdict = '{CHECK}'", _TO_CHECK)]
+    )
 
 
 def qml(kind: str, rules: Sequence[tuple[str, str, str]], **options: Any) -> str:
@@ -276,9 +296,12 @@ def qml(kind: str, rules: Sequence[tuple[str, str, str]], **options: Any) -> str
     symbol, layer, color = _SYMBOLS[kind]
     listed = symbols = ""
     for n, (label, condition, ink) in enumerate(rules):
-        listed += f'<rule key="{{{n}}}" symbol="{n}" label="{label}" filter="{html.escape(condition)}"/>'
+        listed += (
+            f'<rule key="{{{n}}}" symbol="{n}" label="{label}" filter="{html.escape(condition)}"/>'
+        )
         values = "".join(
-            f'<Option type="QString" name="{k}" value="{v}"/>' for k, v in {color: ink, **options}.items()
+            f'<Option type="QString" name="{k}" value="{v}"/>'
+            for k, v in {color: ink, **options}.items()
         )
         symbols += (
             f'<symbol type="{symbol}" name="{n}" alpha="1"><layer class="{layer}" enabled="1" pass="0">'

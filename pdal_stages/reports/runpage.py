@@ -46,7 +46,11 @@ def run_page(run: Mapping[str, Any]) -> str:
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
         slowest=[(t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:ROWS]],
         done=len(done),
-        objects={k: one for k, one in (run.get("objects") or {}).items() if k != "files" and one["objects"]},
+        objects={
+            k: one
+            for k, one in (run.get("objects") or {}).items()
+            if k != "files" and one["objects"]
+        },
     )
 
 
@@ -71,7 +75,9 @@ def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
 
 
 def _what(run: Mapping[str, Any]) -> dict[str, Any]:
-    shown = {name: run[key] for key, name in _SETTINGS.items() if run.get(key) not in (None, "", [])}
+    shown = {
+        name: run[key] for key, name in _SETTINGS.items() if run.get(key) not in (None, "", [])
+    }
     if run.get("bounds"):
         x0, y0, x1, y1 = run["bounds"]
         shown[_SETTINGS["bounds"]] = f"x {x0:.2f} to {x1:.2f}, y {y0:.2f} to {y1:.2f}"

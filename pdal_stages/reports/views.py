@@ -42,7 +42,11 @@ def png(rgb: npt.NDArray[np.uint8]) -> bytes:
 
 def embedded(rgb: npt.NDArray[np.uint8]) -> dict[str, Any]:
     """An image for a template: its file as text, its size."""
-    return {"base64": base64.b64encode(png(rgb)).decode("ascii"), "tall": rgb.shape[0], "wide": rgb.shape[1]}
+    return {
+        "base64": base64.b64encode(png(rgb)).decode("ascii"),
+        "tall": rgb.shape[0],
+        "wide": rgb.shape[1],
+    }
 
 
 def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8]) -> Path:
@@ -75,7 +79,9 @@ class Surface:
         """Rows and columns of finite places on the map."""
         height, width = self.which.shape
         row = height - 1 - np.floor((y - self.y0) / self.pixel).astype(np.int64)
-        return row.clip(0), np.floor((x - self.x0) / self.pixel).astype(np.int64).clip(None, width - 1)
+        return row.clip(0), np.floor((x - self.x0) / self.pixel).astype(np.int64).clip(
+            None, width - 1
+        )
 
 
 def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
@@ -101,7 +107,10 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
     made = Surface(x0, y0, pixel, np.full(shape, -1), np.full(shape, np.nan), 1.0)
     order = np.argsort(z, kind="stable")
     cells = made.cells(x[order], y[order])
-    made.which[cells], made.z[cells] = good[order], z[order]  # of several the last stays: the highest
+    made.which[cells], made.z[cells] = (
+        good[order],
+        z[order],
+    )  # of several the last stays: the highest
     seen = made.which >= 0
     if seen.all():
         return made
@@ -116,10 +125,15 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
 def shading(s: Surface) -> np.ndarray:
     """Light on the surface, about 0.4 (dark) to 1.2: sun from the north-west, and less sky where surroundings are higher."""
     known = np.isfinite(s.z)
-    above, weight = np.where(known, s.z - np.nanmedian(s.z), 0.0).astype(np.float32), known.astype(np.float32)
+    above, weight = (
+        np.where(known, s.z - np.nanmedian(s.z), 0.0).astype(np.float32),
+        known.astype(np.float32),
+    )
 
     def smooth(size: float) -> np.ndarray:
-        soft, of = (ndimage.gaussian_filter(a, size, mode="nearest", truncate=2.0) for a in (above, weight))
+        soft, of = (
+            ndimage.gaussian_filter(a, size, mode="nearest", truncate=2.0) for a in (above, weight)
+        )
         return soft / np.maximum(of, 1e-6)
 
     fine = smooth(0.45 * s.spacing)
@@ -138,12 +152,16 @@ def paint(s: Surface, colors: np.ndarray, light: np.ndarray) -> np.ndarray:
     return np.clip(np.round(out), 0, 255).astype(np.uint8)
 
 
-def ramp(values: np.ndarray, anchors: npt.ArrayLike, limits: tuple[float, float] | None = None) -> np.ndarray:
+def ramp(
+    values: np.ndarray, anchors: npt.ArrayLike, limits: tuple[float, float] | None = None
+) -> np.ndarray:
     """Colors, (..., 3) uint8, of values between limits, by default the 1st and 99th percentile; NaN becomes mid gray."""
     good, colors = np.isfinite(values), np.asarray(anchors, dtype=float)
     low, high = limits or (np.percentile(values[good], [1, 99]) if good.any() else (0.0, 1.0))
     share = np.where(good, values - low, 0.0) / max(high - low, 1e-12) * (len(colors) - 1)
-    out = np.stack([np.interp(share, np.arange(len(colors)), colors[:, c]) for c in range(3)], axis=-1)
+    out = np.stack(
+        [np.interp(share, np.arange(len(colors)), colors[:, c]) for c in range(3)], axis=-1
+    )
     out[~good] = 150
     return np.round(out).astype(np.uint8)
 
@@ -185,7 +203,9 @@ def triptych(
         wrong = predicted != truth
         shown.append(verdict(s, x, y, z, wrong, np.zeros_like(wrong)))
     light, gap = shading(s), np.full((len(s.z), _GAP, 3), BACKGROUND, np.uint8)
-    return np.concatenate([part for colors in shown for part in (gap, paint(s, colors, light))][1:], axis=1)
+    return np.concatenate(
+        [part for colors in shown for part in (gap, paint(s, colors, light))][1:], axis=1
+    )
 
 
 def nice_step(rough: float) -> float:

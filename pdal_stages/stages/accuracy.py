@@ -44,9 +44,7 @@ class AccuracyStage(Stage):
     type = "filters.accuracy"
     summary = "Compare a class dimension with a reference dimension; report as table, JSON and HTML"
     source = "[B16] section 4.3, [W18] section 4.3"
-    instead_of_tiles = (
-        "Write the files first, then compare them: pdal-stages accuracy FILE --reference-dimension Reference"
-    )
+    instead_of_tiles = "Write the files first, then compare them: pdal-stages accuracy FILE --reference-dimension Reference"
     where_help = "Only points inside are compared"
     needs_points = "compare"
     dimension: str = option("string", "Classification", "The classes to judge")
@@ -77,13 +75,19 @@ class AccuracyStage(Stage):
         "filters.modelclassifier before",
         name="model",
     )
-    files: list[str] = option("list", (), "Files that the report names; default: those of the readers")
+    files: list[str] = option(
+        "list", (), "Files that the report names; default: those of the readers"
+    )
     print_table: bool = option("boolean", True, "Print the table on standard output", name="print")
 
     @classmethod
-    def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def from_pipeline(
+        cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
+    ) -> dict[str, Any]:
         taken: dict[str, Any] = {"files": files_read(before)}
-        models = [s["model"] for s in before if s.get("type") == ModelClassifier.type and "model" in s]
+        models = [
+            s["model"] for s in before if s.get("type") == ModelClassifier.type and "model" in s
+        ]
         if models and given.get("dimension", "Classification") == "Classification":
             taken["model"] = models[-1]
         return taken
@@ -109,7 +113,9 @@ class AccuracyStage(Stage):
         sides = [self._sides(points) for _, points in parts]
         rule = self._rule(sides, report)
         each = [
-            Accuracy.from_labels(reference, predicted, **rule, **confidence, allow_empty=len(parts) > 1)
+            Accuracy.from_labels(
+                reference, predicted, **rule, **confidence, allow_empty=len(parts) > 1
+            )
             for reference, predicted, confidence, _ in sides
         ]
         accuracy = each[0] if len(each) == 1 else sum(each[1:], each[0])
@@ -125,7 +131,8 @@ class AccuracyStage(Stage):
                 written = accuracy.to_dict()
                 if len(each) > 1:
                     written["files"] = [
-                        {"name": name, **summary(one)} for (name, _), one in zip(parts, each, strict=True)
+                        {"name": name, **summary(one)}
+                        for (name, _), one in zip(parts, each, strict=True)
                     ]
                 files[0].write_bytes((json.dumps(written, indent=1) + "\n").encode())
             if self.html:
@@ -149,7 +156,9 @@ class AccuracyStage(Stage):
             for name in ("Reliability", "Margin")
             if name in points.arrays
         }
-        reference, predicted = (points.codes_of(name)[inside] for name in (self.reference, self.dimension))
+        reference, predicted = (
+            points.codes_of(name)[inside] for name in (self.reference, self.dimension)
+        )
         return Sides(reference, predicted, confidence, inside)
 
     def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
@@ -205,12 +214,19 @@ class AccuracyStage(Stage):
     ) -> None:
         from ..reports.accuracypage import Place, places, write_accuracy_report
 
-        systems = ", ".join(dict.fromkeys(name_of_wkt(points.wkt) or "none given" for _, points in parts))
+        systems = ", ".join(
+            dict.fromkeys(name_of_wkt(points.wkt) or "none given" for _, points in parts)
+        )
         settings = {"files": self.files, "reference system": systems, "model": self.model_file}
-        settings |= {k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]}
+        settings |= {
+            k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]
+        }
         settings |= {k: rule[k] for k in ("classes", "ignore", "merge") if rule[k] is not None}
         importances = None
-        if self.model_file and (model := loaded_model(self.model_file)).info["passes"][-1]["importances"]:
+        if (
+            self.model_file
+            and (model := loaded_model(self.model_file)).info["passes"][-1]["importances"]
+        ):
             importances = model.importances("column")  # networks have none
         shown = [
             Place(name, points.xyz[one.inside], one.reference, one.predicted)

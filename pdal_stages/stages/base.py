@@ -87,10 +87,14 @@ class Stage(ABC):
         "integer", 0, "Threads to use; 0 takes every available core", minimum=0, maximum=1024
     )
     horizontal_unit: str = option(
-        "string", "", "Unit of x and y (meter, foot, us-ft), where the spatial reference is missing or wrong"
+        "string",
+        "",
+        "Unit of x and y (meter, foot, us-ft), where the spatial reference is missing or wrong",
     )
     vertical_unit: str = option(
-        "string", "", "Unit of z, where the spatial reference does not say; otherwise that of x and y"
+        "string",
+        "",
+        "Unit of z, where the spatial reference does not say; otherwise that of x and y",
     )
 
     #: In tiles: a dimension, how many meters outside a point lies, below zero for the tile's own, which reports count alone;
@@ -119,7 +123,9 @@ class Stage(ABC):
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:
         """The stage's own options, then those all stages share."""
-        every = [one for kind in cls.__mro__ for one in vars(kind).values() if isinstance(one, Option)]
+        every = [
+            one for kind in cls.__mro__ for one in vars(kind).values() if isinstance(one, Option)
+        ]
         where = every.index(vars(Stage)["where"])
         every[where] = replace(every[where], help=f"{every[where].help}. {cls.where_help}")
         return tuple(every)
@@ -169,11 +175,15 @@ class Stage(ABC):
         return 0.0
 
     @classmethod
-    def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def from_pipeline(
+        cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
+    ) -> dict[str, Any]:
         """Options that the stage takes from the stages before it in the pipeline, where its own do not give them."""
         return {}
 
-    def points(self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False) -> Points:
+    def points(
+        self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False
+    ) -> Points:
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
         own = arrays.get(self.own_points)

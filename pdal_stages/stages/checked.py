@@ -40,7 +40,9 @@ class CheckedPoints(NamedTuple):
 class CheckedChoice:
     """What samples are drawn from, of a cloud whose parts were counted; `known`: the classes of the base, if any."""
 
-    def __init__(self, known: Collection[int] | None, seed: int, parts: Iterable[Mapping[str, Any]]) -> None:
+    def __init__(
+        self, known: Collection[int] | None, seed: int, parts: Iterable[Mapping[str, Any]]
+    ) -> None:
         self._known, self._seed = known, seed
         self._points = self._checked = 0
         wanted, sure = Counter[str](), Counter[str]()

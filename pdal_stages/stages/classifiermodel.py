@@ -111,9 +111,17 @@ class ClassifierModel(Stage):
     )
     passes: int | None = trained("passes")
     context: list | None = trained("context")
-    files: list = option("list", (), "Input files that the model file names; default: those of the readers")
+    files: list = option(
+        "list", (), "Input files that the model file names; default: those of the readers"
+    )
     memory: int = trained(
-        "memory_mb", kind="integer", default=512, name="memory", minimum=16, exclusive=False, maximum=None
+        "memory_mb",
+        kind="integer",
+        default=512,
+        name="memory",
+        minimum=16,
+        exclusive=False,
+        maximum=None,
     )
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
@@ -130,7 +138,9 @@ class ClassifierModel(Stage):
         super().__init__(given, place)
 
     @classmethod
-    def from_pipeline(cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def from_pipeline(
+        cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
+    ) -> dict[str, Any]:
         return {"files": files_read(before)}
 
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
@@ -227,7 +237,9 @@ class ClassifierModel(Stage):
             name=self.named,
             mask=self._mask(points) if marks is None else points.mask,
         )
-        gone = points.ignored(replace(self.ignore, codes=()))  # the labels among them are left to the trainer
+        gone = points.ignored(
+            replace(self.ignore, codes=())
+        )  # the labels among them are left to the trainer
         return cloud.part(np.flatnonzero(~gone)) if gone.any() else cloud
 
     def finish(self, model: Model, report: Report) -> None:
@@ -237,7 +249,9 @@ class ClassifierModel(Stage):
             model.info["base"] = {"name": Path(self.base).stem, "sha256": digest_of(self.base)}
             if "checked" in report.figures and "sureness" in model.info:
                 before = loaded_model(self.base).info
-                model.info["sureness"] = of_the_base(model.info["sureness"], before, find(self.base))
+                model.info["sureness"] = of_the_base(
+                    model.info["sureness"], before, find(self.base)
+                )
         if self._by_hand:
             model.info["by_hand"] = self._by_hand
         model.save(self.filename)
@@ -272,7 +286,11 @@ class ClassifierModel(Stage):
     def checked_points(self, points: Points) -> tuple[CheckedPoints, dict[str, Any]]:
         """Which points a person checked, and of which others the base is sure; their counts."""
         arrays, codes = points.arrays, points.codes_of(self.label)
-        checked = np.asarray(arrays[CHECKED]) > 0 if CHECKED in arrays else np.zeros(points.count, np.bool_)
+        checked = (
+            np.asarray(arrays[CHECKED]) > 0
+            if CHECKED in arrays
+            else np.zeros(points.count, np.bool_)
+        )
         sure = np.zeros(points.count, np.bool_)
         if self.base and "Reliability" in arrays:
             sure = np.asarray(arrays["Reliability"]) >= SURE
@@ -297,7 +315,9 @@ class ClassifierModel(Stage):
             return [(0.0, cloud)]
         value = gather((self.survey,), cloud.dimensions, len(cloud), where=cloud.name)[self.survey]
         parts = [(float(one), cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
-        return [(one, replace(part, name=f"{self.survey} {one:g}", survey="")) for one, part in parts]
+        return [
+            (one, replace(part, name=f"{self.survey} {one:g}", survey="")) for one, part in parts
+        ]
 
 
 def _number(text: Any) -> Any:

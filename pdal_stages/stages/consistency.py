@@ -35,7 +35,9 @@ class Consistency(ClassStage):
         "points that become vegetation are low (3) below the first, medium (4) below the second and high (5) above; "
         "without heights they take the class of most vegetation around, or high"
     )
-    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
+    ignore: Selection = ignore_option(
+        "Points that are left out, even as neighbors, and keep their class"
+    )
     keep: Selection = keep_option()
 
     @property
@@ -53,7 +55,8 @@ class Consistency(ClassStage):
         change = points.inside & ~ignored & ~kept
         names = {"height": "HeightAboveGround", "ground": "Ground"}
         known = {
-            word: points.dimension(name) if name in points.arrays else None for word, name in names.items()
+            word: points.dimension(name) if name in points.arrays else None
+            for word, name in names.items()
         }
         if any(values is None for values in known.values()) and (self.ground or self.islands):
             points.report.warnings.append(

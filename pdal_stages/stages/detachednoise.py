@@ -44,7 +44,9 @@ class DetachedNoise(ClassStage):
     )
     low_class: int = code_option(NOISE[0], "Class code of low noise")
     high_class: int = code_option(NOISE[1], "Class code of high noise")
-    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
+    ignore: Selection = ignore_option(
+        "Points that are left out, even as neighbors, and keep their class"
+    )
 
     def halo_m(self) -> float:
         return REACH
@@ -64,7 +66,9 @@ class DetachedNoise(ClassStage):
         if points.mask is not None:
             found[~points.mask] = 0
         codes = points.class_codes.copy()
-        for name, code, given in zip(("low", "high"), NOISE, (self.low_class, self.high_class), strict=True):
+        for name, code, given in zip(
+            ("low", "high"), NOISE, (self.low_class, self.high_class), strict=True
+        ):
             codes[found == code] = given
             points.report.figures[name] = int(np.count_nonzero(found == code))
         if found.any():

@@ -37,7 +37,9 @@ class HagMinima(Stage):
         maximum=10_000,
         unit="m",
     )
-    ignore: Selection = ignore_option("Points that do not form the terrain but still receive heights")
+    ignore: Selection = ignore_option(
+        "Points that do not form the terrain but still receive heights"
+    )
 
     def check(self) -> None:
         check_sizes(self.cell, self.resolution)
@@ -52,7 +54,9 @@ class HagMinima(Stage):
 
     def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
         x, y, _ = points.xyz.T
-        return terrain_reach(x, y, points.usable(self.ignore), wanted, box, self.cell, self.resolution)
+        return terrain_reach(
+            x, y, points.usable(self.ignore), wanted, box, self.cell, self.resolution
+        )
 
     def run(self, points: Points) -> dict[str, NDArray]:
         x, y, z = points.xyz.T

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..terrain.cells import SIDE
-from ..terrain.groundblocks import GroundCells, around_blocks, by_block, cells_of_block, reach_of_block
+from ..terrain.groundblocks import (
+    GroundCells,
+    around_blocks,
+    by_block,
+    cells_of_block,
+    reach_of_block,
+)
 from ..terrain.groundcells import FilterOptions
 from ..terrain.morphological import filtered_ground
 from ..terrain.openings import opening_names
@@ -56,7 +62,9 @@ class HagMorphological(Stage):
         "openings",
         "where",
     )
-    cell: float = option("number", 1.0, "Side of the grid's cells", minimum=0.05, maximum=1000, unit="m")
+    cell: float = option(
+        "number", 1.0, "Side of the grid's cells", minimum=0.05, maximum=1000, unit="m"
+    )
     slope: float = option(
         "number",
         0.15,
@@ -83,7 +91,11 @@ class HagMorphological(Stage):
         unit="m",
     )
     scalar: float = option(
-        "number", 1.25, "Added to the threshold per unit of the terrain's slope", minimum=0, maximum=1000
+        "number",
+        1.25,
+        "Added to the threshold per unit of the terrain's slope",
+        minimum=0,
+        maximum=1000,
     )
     ignore: Selection = ignore_option("Points that are not ground but still receive heights")
     ground: bool = option(
@@ -105,7 +117,9 @@ class HagMorphological(Stage):
     )
 
     def check(self) -> None:
-        self._filter = FilterOptions(**{one.name: self.options[one.name] for one in fields(FilterOptions)})
+        self._filter = FilterOptions(
+            **{one.name: self.options[one.name] for one in fields(FilterOptions)}
+        )
 
     def creates(self) -> dict[str, str]:
         return {
@@ -139,7 +153,10 @@ class HagMorphological(Stage):
         }
 
     def block_of(
-        self, around: NDArray[np.float64], inside: Iterable[NDArray[np.float64]], block: tuple[int, int]
+        self,
+        around: NDArray[np.float64],
+        inside: Iterable[NDArray[np.float64]],
+        block: tuple[int, int],
     ) -> dict[str, NDArray]:
         """Then, what tiles need of a block (column, row): from what was left around it and, in parts, inside."""
         return cells_of_block(around, block, self._filter, inside).in_parts(_PART)

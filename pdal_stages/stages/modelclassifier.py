@@ -63,7 +63,9 @@ class ModelClassifier(Stage):
         minimum=0.5,
         maximum=0.999,
     )
-    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
+    ignore: Selection = ignore_option(
+        "Points that are left out, even as neighbors, and keep their class"
+    )
     keep: Selection = keep_option(
         "Points that are neighbors but keep their class, written as for ignore; default: 12, overlap of strips, which "
         "classifying would overwrite"
@@ -78,7 +80,11 @@ class ModelClassifier(Stage):
         "a third of the bytes",
     )
     memory: int = option(
-        "integer", 256, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
+        "integer",
+        256,
+        "Memory for blocks of points, in addition to the cloud itself",
+        minimum=16,
+        unit="MB",
     )
 
     def check(self) -> None:
@@ -124,7 +130,9 @@ class ModelClassifier(Stage):
             return f"Put before this stage: {as_json(self.preparation)}"
         by_hand = self.model.info.get("by_hand")
         return (
-            f"Put before this stage what stood there in training: {', '.join(by_hand)}" if by_hand else None
+            f"Put before this stage what stood there in training: {', '.join(by_hand)}"
+            if by_hand
+            else None
         )
 
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
@@ -137,7 +145,9 @@ class ModelClassifier(Stage):
 
     def reads(self) -> list[str]:
         return list(
-            dict.fromkeys([*self.model.required_dimensions, *([HEIGHT] if self.vegetation_heights else [])])
+            dict.fromkeys(
+                [*self.model.required_dimensions, *([HEIGHT] if self.vegetation_heights else [])]
+            )
         )
 
     def creates(self) -> dict[str, str]:
@@ -163,7 +173,9 @@ class ModelClassifier(Stage):
         inside = points.inside
         points.report.figures["kept"] = points.counted(inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
-        dimensions = {n: points.arrays[n] for n in self.model.optional_dimensions if n in points.arrays}
+        dimensions = {
+            n: points.arrays[n] for n in self.model.optional_dimensions if n in points.arrays
+        }
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
         current = points.class_codes
         points.keep_only([*dimensions, *self.creates(), HEIGHT])
@@ -200,7 +212,9 @@ class ModelClassifier(Stage):
             values |= {f"Probability_{code}": column for code, column in columns}
         if self.compact:
             values |= {
-                name: _rounded(value, _PARTS) for name, value in values.items() if name != "Classification"
+                name: _rounded(value, _PARTS)
+                for name, value in values.items()
+                if name != "Classification"
             }
             if HEIGHT in points.arrays:
                 height = points.arrays[HEIGHT]

@@ -43,7 +43,11 @@ class MultiscaleFeatures(Stage):
         "Groups (covariance, geometric, shapes, surfaces, all) or single features (Linearity, A3, ...)",
     )
     seed: int = option(
-        "integer", 0, "Seed for the random draws of the shape distributions", minimum=0, maximum=2**31 - 1
+        "integer",
+        0,
+        "Seed for the random draws of the shape distributions",
+        minimum=0,
+        maximum=2**31 - 1,
     )
     bins: str | None = option(
         "filename",
@@ -51,7 +55,9 @@ class MultiscaleFeatures(Stage):
         "JSON file with the thresholds of shape histograms and curvature: read if it exists, otherwise fitted to "
         "these points and written, so that other clouds can use the same ones",
     )
-    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and get no features")
+    ignore: Selection = ignore_option(
+        "Points that are left out, even as neighbors, and get no features"
+    )
     voxel: float = option(
         "number",
         0.0,
@@ -62,7 +68,11 @@ class MultiscaleFeatures(Stage):
         unit="m",
     )
     memory: int = option(
-        "integer", 512, "Memory for blocks of points, in addition to the cloud itself", minimum=16, unit="MB"
+        "integer",
+        512,
+        "Memory for blocks of points, in addition to the cloud itself",
+        minimum=16,
+        unit="MB",
     )
 
     @cached_property
@@ -97,7 +107,9 @@ class MultiscaleFeatures(Stage):
                 )
 
     def outputs(self) -> list[Output]:
-        return [Output(self.bins, "bins", JSON)] if self.bins and not Path(self.bins).exists() else []
+        return (
+            [Output(self.bins, "bins", JSON)] if self.bins and not Path(self.bins).exists() else []
+        )
 
     def creates(self) -> dict[str, str]:
         return dict.fromkeys(self.columns, "float")
@@ -146,7 +158,11 @@ class MultiscaleFeatures(Stage):
             {
                 "neighborhoods": len(plan.neighborhoods),
                 "features": len(names),
-                **({} if representatives is None else {"representatives": len(representatives.rows)}),
+                **(
+                    {}
+                    if representatives is None
+                    else {"representatives": len(representatives.rows)}
+                ),
                 **engine.report.figures,
             }
         )

@@ -131,7 +131,9 @@ class ObjectsFilter(ObjectOptions, Stage):
         False,
         "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area; of spans the length)",
     )
-    refused_class: int = code_option(1, "Class code for the points of objects that 'refuse' rejects")
+    refused_class: int = code_option(
+        1, "Class code for the points of objects that 'refuse' rejects"
+    )
 
     def reads(self) -> list[str]:
         return ["Classification"]
@@ -187,7 +189,9 @@ class ObjectsFilter(ObjectOptions, Stage):
             for name in ("ObjectVerdict", "ObjectHeight", "ObjectExtent"):
                 out[name] = np.array(points.arrays[name])
                 out[name][points.inside] = 0
-        points.report.figures |= {name: one for name, one in found.summary().items() if one["objects"]}
+        points.report.figures |= {
+            name: one for name, one in found.summary().items() if one["objects"]
+        }
         refused = np.zeros(points.count, bool)
         for kind, table in found.tables.items():
             if not len(table):

@@ -59,6 +59,8 @@ class ObjectsWriter(ObjectOptions, Stage):
         if self.refuse:
             points.report.figures["refused"] = refused
         straight = self.outlines == STRAIGHT
-        figures = with_vector(write_objects, self.filename, found, straight, points.units, points.wkt)
+        figures = with_vector(
+            write_objects, self.filename, found, straight, points.units, points.wkt
+        )
         points.report.figures |= figures
         return {}

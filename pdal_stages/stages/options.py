@@ -95,17 +95,22 @@ class Option:
     def parse(self, value: Any) -> Any:
         """The value as the stage wants it, from JSON or from command-line text; OptionError where it does not fit."""
         parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
-        return checks.one_of(f"option '{self.name}'", parsed, self.choices) if self.choices else parsed
+        return (
+            checks.one_of(f"option '{self.name}'", parsed, self.choices) if self.choices else parsed
+        )
 
     def _wrong(self, value: Any) -> OptionError:
         return OptionError(
-            f"option '{self.name}' must be {_KINDS[self.kind][1]}", found=json.dumps(value, default=str)
+            f"option '{self.name}' must be {_KINDS[self.kind][1]}",
+            found=json.dumps(value, default=str),
         )
 
     def _parse_number(self, value: Any) -> float:
         with suppress(ValueError):
             value = float(value) if isinstance(value, str) else value
-        check: Any = checks.whole if self.kind == "integer" else partial(checks.number, above=self.exclusive)
+        check: Any = (
+            checks.whole if self.kind == "integer" else partial(checks.number, above=self.exclusive)
+        )
         return check(f"option '{self.name}'", value, self.minimum, self.maximum, unit=self.unit)
 
     _parse_integer = _parse_number
@@ -121,7 +126,8 @@ class Option:
             raise self._wrong(value)
         if self.kind in ("filename", "model", "expression") and not value.strip():
             raise OptionError(
-                f"option '{self.name}' is empty", cure=f"Give {_KINDS[self.kind][1]}, or leave it out"
+                f"option '{self.name}' is empty",
+                cure=f"Give {_KINDS[self.kind][1]}, or leave it out",
             )
         return value
 
@@ -161,7 +167,8 @@ class Option:
         chosen = self._parse_selection(value)
         if chosen.spans:
             raise OptionError(
-                f"option '{self.name}' must list class codes of 0 to 255", found=chosen.spans[0].dimension
+                f"option '{self.name}' must list class codes of 0 to 255",
+                found=chosen.spans[0].dimension,
             )
         return list(chosen.codes)
 
@@ -234,5 +241,7 @@ def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[
         elif option.kind == "selection" and option.default is not None:
             values[name] = option.parse(option.default)
         else:
-            values[name] = list(option.default) if isinstance(option.default, tuple) else option.default
+            values[name] = (
+                list(option.default) if isinstance(option.default, tuple) else option.default
+            )
     return values

@@ -52,7 +52,9 @@ class Points:
     where: Expression | None = None  #: points the stage acts on
     #: Names of the horizontal and the vertical unit; empty where the spatial reference says it.
     unit_names: tuple[str, str] = ("", "")
-    legacy_flags: bool = False  #: whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`
+    legacy_flags: bool = (
+        False  #: whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`
+    )
     #: Below zero for the points whose results are used: :meth:`counted` counts those alone.
     own: NDArray | None = None
     used: NDArray[np.bool_] | None = None  #: in tiles: those for which anything is to be computed
@@ -189,7 +191,8 @@ class Points:
             codes = values.astype(np.uint8)
         if values.dtype != np.uint8 and (wrong := codes != values).any():
             raise DimensionError(
-                f"'{name}' must hold class codes (whole numbers of 0 to 255)", found=str(values[wrong][0])
+                f"'{name}' must hold class codes (whole numbers of 0 to 255)",
+                found=str(values[wrong][0]),
             )
         return codes & np.uint8(LEGACY_LIMIT) if self.legacy_flags else codes
 
@@ -213,13 +216,17 @@ class Points:
                 found |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
         for span in selection.spans:
             name = span.dimension
-            found |= span.holds(self.flag(name) if name in _FLAGS else self.dimension(name, meters=False))
+            found |= span.holds(
+                self.flag(name) if name in _FLAGS else self.dimension(name, meters=False)
+            )
         return found
 
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:
         """The same, counted in the report as ``ignored``, where they are inside `where`."""
         found = self.chosen(selection)
-        self.report.figures["ignored"] = self.counted(found if self.mask is None else found & self.mask)
+        self.report.figures["ignored"] = self.counted(
+            found if self.mask is None else found & self.mask
+        )
         return found
 
     def usable(self, ignored: Selection) -> NDArray[np.bool_]:

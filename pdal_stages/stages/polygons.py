@@ -15,7 +15,9 @@ from .selection import Selection
 
 class Polygons(ClassStage):
     type = "filters.polygons"
-    summary = "Set the class of points inside the polygons of any OGR file, such as water inside lakes"
+    summary = (
+        "Set the class of points inside the polygons of any OGR file, such as water inside lakes"
+    )
     where_help = "Points outside keep their class"
     polygons: list = option(
         "list",
@@ -46,7 +48,9 @@ class Polygons(ClassStage):
         counts, notes = {}, []
         for overlay in self.overlays:
             may = np.flatnonzero(change & np.isin(codes, overlay.over) if overlay.over else change)
-            inside, polygons, note = with_vector(inside_of, overlay, points.wkt, x[may], y[may], box)
+            inside, polygons, note = with_vector(
+                inside_of, overlay, points.wkt, x[may], y[may], box
+            )
             found = may[inside]
             codes[found] = overlay.code
             name = f"{overlay.file}|layername={overlay.layer}" if overlay.layer else overlay.file

@@ -42,16 +42,32 @@ _EXTRAPOLATION = Option("boolean", None, "", name="allow_extrapolation")
 PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
     "filters.smrf": (
         Option("number", None, "", 0.2, 100, name="cell"),
-        *(Option("number", None, "", 0, 1000, name=name) for name in ("cut", "scalar", "slope", "threshold")),
+        *(
+            Option("number", None, "", 0, 1000, name=name)
+            for name in ("cut", "scalar", "slope", "threshold")
+        ),
         Option("number", None, "", 1, 1000, name="window"),
         Option("selection", None, "", name="ignore"),
     ),
-    "filters.hag_nn": (_COUNT, Option("number", None, "", 0, 1e6, name="max_distance"), _EXTRAPOLATION),
+    "filters.hag_nn": (
+        _COUNT,
+        Option("number", None, "", 0, 1e6, name="max_distance"),
+        _EXTRAPOLATION,
+    ),
     "filters.hag_delaunay": (_COUNT, _EXTRAPOLATION),
 }
 #: Options that say where in a pipeline a stage stands, how it is run, or in what units the points at hand are; not what
 #: it makes; and decks, which whoever applies a model looks for or not.
-_ASIDE = ("decks", "tag", "inputs", "user_data", "log", "threads", "horizontal_unit", "vertical_unit")
+_ASIDE = (
+    "decks",
+    "tag",
+    "inputs",
+    "user_data",
+    "log",
+    "threads",
+    "horizontal_unit",
+    "vertical_unit",
+)
 #: How the names of heights above openings begin; the width follows.
 _OPENING = "HeightAboveOpening_"
 #: Most stages of a preparation, and characters of one as JSON.
@@ -96,7 +112,9 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         for number, stage in enumerate(made):
             before = [one["type"] for one in made[:number]]
             if stage["type"] in NEEDS_GROUND and MAKES_GROUND not in before:
-                raise ModelError(f"a model cannot carry {stage['type']} without {MAKES_GROUND} before it")
+                raise ModelError(
+                    f"a model cannot carry {stage['type']} without {MAKES_GROUND} before it"
+                )
         return made
     except ModelError as error:
         error.cure = "Training writes no such file: ask where it comes from"
@@ -115,7 +133,9 @@ def _checked(stage: Mapping[str, Any]) -> dict[str, Any]:
     if unknown := [name for name in given if name not in options]:
         raise ModelError(f"a model cannot carry option {unknown[0][:80]!r} of {kind}")
     if len(json.dumps(given, default=str)) > _LONGEST:
-        raise ModelError(f"a model cannot carry options of more than {_LONGEST} characters", found=kind)
+        raise ModelError(
+            f"a model cannot carry options of more than {_LONGEST} characters", found=kind
+        )
     try:
         made = {name: _value(options[name], value) for name, value in given.items()}
         if ours is not None:
@@ -129,7 +149,13 @@ def _value(option: Option, value: Any) -> Any:
     """An option's value in the spelling of JSON."""
     parsed = option.parse(value)
     if option.kind == "selection":
-        items = split_list(value) if isinstance(value, str) else value if isinstance(value, list) else [value]
+        items = (
+            split_list(value)
+            if isinstance(value, str)
+            else value
+            if isinstance(value, list)
+            else [value]
+        )
         return [str(one).strip() for one in items]
     if option.kind == "numbers":
         return [_number(one) for one in parsed]
@@ -143,7 +169,11 @@ def _number(value: float) -> int | float:
 def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """The stage that makes these dimensions, as far as they are heights."""
     wanted = list(names)
-    widths = [name.removeprefix(_OPENING).replace("_", ".") for name in wanted if name.startswith(_OPENING)]
+    widths = [
+        name.removeprefix(_OPENING).replace("_", ".")
+        for name in wanted
+        if name.startswith(_OPENING)
+    ]
     openings = [_number(float(width)) for width in widths if re.fullmatch(r"\d+(\.\d+)?", width)]
     if not openings and "Ground" not in wanted:
         return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in wanted else []
@@ -163,10 +193,16 @@ def made_of_coordinates(
 
     `usable` (n,) are points that may form the ground; the others only receive heights.
     """
-    if len(preparation) != 1 or "where" in preparation[0] or preparation[0]["type"] not in stage_types():
+    if (
+        len(preparation) != 1
+        or "where" in preparation[0]
+        or preparation[0]["type"] not in stage_types()
+    ):
         return {}
     options = {name: value for name, value in preparation[0].items() if name != "type"}
-    stage = stage_type(preparation[0]["type"])({**options, "ignore": "withheld", "threads": threads or 0})
+    stage = stage_type(preparation[0]["type"])(
+        {**options, "ignore": "withheld", "threads": threads or 0}
+    )
     there = {name: np.zeros(len(xyz), number_type(kind)) for name, kind in stage.creates().items()}
     withheld = np.zeros(len(xyz), np.uint8) if usable is None else (~usable).view(np.uint8)
     columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **there}

@@ -110,7 +110,11 @@ _OF_NUMBERS: dict[type, Callable] = {
     ast.GtE: np.greater_equal, ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: _divide,
     ast.USub: np.negative,
 }  # fmt: skip
-_OF_TRUTHS: dict[type, Callable] = {ast.And: np.logical_and, ast.Or: np.logical_or, ast.Not: np.logical_not}
+_OF_TRUTHS: dict[type, Callable] = {
+    ast.And: np.logical_and,
+    ast.Or: np.logical_or,
+    ast.Not: np.logical_not,
+}
 #: Other names that PDAL takes for dimensions, in small letters.
 _ALIASES = {
     "class": "Classification",
@@ -133,7 +137,10 @@ class Expression:
 
     def __init__(self, text: str) -> None:
         self.text = text
-        python, self._places = "", list[int]()  # where in the text the characters of the Python come from
+        python, self._places = (
+            "",
+            list[int](),
+        )  # where in the text the characters of the Python come from
         position, end = 0, len(text.rstrip())
         while position < end:
             match = _TOKEN.match(text, position)
@@ -201,7 +208,9 @@ class Expression:
             ):
                 parts = [left, right]
             case _:
-                raise self._error("it is not a condition of this form", self._places[node.col_offset])
+                raise self._error(
+                    "it is not a condition of this form", self._places[node.col_offset]
+                )
         takes_truth = type(op) in _OF_TRUTHS
         found = [self._value(part, values) for part in parts]
         for part, value in zip(parts, found, strict=True):

@@ -24,7 +24,9 @@ class Wires(ClassStage):
         "boolean", False, "Also give towers and poles their class, where wires end and meet"
     )
     tower_code: int = code_option(TOWER, "Class code of towers and poles")
-    ignore: Selection = ignore_option("Points that are left out, even as neighbors, and keep their class")
+    ignore: Selection = ignore_option(
+        "Points that are left out, even as neighbors, and keep their class"
+    )
     keep: Selection = keep_option()
 
     def reads(self) -> list[str]:

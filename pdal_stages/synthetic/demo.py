@@ -24,7 +24,9 @@ CLASSES = {
 }
 
 
-def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, seed: int = 1) -> None:
+def run_demo(
+    folder: str | Path, *, size: float = 200.0, density: float = 7.0, seed: int = 1
+) -> None:
     """Generate, train, classify, compare, draw.
 
     Everything goes through PDAL, as a user's pipelines would. Files in `folder`: ``town.laz``, ``town.model``,
@@ -41,7 +43,9 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     folder.mkdir(parents=True, exist_ok=True)
     if not folder.is_dir():
         raise StageError("the demo's folder cannot be made", found=str(folder))
-    with _step(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"):
+    with _step(
+        f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"
+    ):
         made = make_town(size, density, seed)
         write_town(made, str(folder / "town.laz"))
     stages = pipelines(folder, float(np.floor((made.x.min() + made.x.max()) / 2)), seed)
@@ -52,21 +56,28 @@ def run_demo(folder: str | Path, *, size: float = 200.0, density: float = 7.0, s
     with _step("classifying the eastern half; how right that is"):
         job = Pipeline(stages["classify"])
         job.execute()
-    with _step("the same with the model that comes with the package, which has never seen such a town"):
+    with _step(
+        "the same with the model that comes with the package, which has never seen such a town"
+    ):
         Pipeline(stages["standard"]).execute(arrays=False)
     with _step("drawing the picture"):
         (points,) = job.arrays
         shown = points[np.isin(points["Reference"], [*map(int, CLASSES)])]
         columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
         write_png(folder / "classified.png", triptych(*columns))
-    print("points, heights beside classes beside errors, and how right the first model is, for a browser:")
+    print(
+        "points, heights beside classes beside errors, and how right the first model is, for a browser:"
+    )
     for file in ("classified.laz", "classified.png", "accuracy.html"):
         print(f"  {folder / file}")
 
 
 def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str, Any]]]:
     """The pipelines ``train``, ``classify`` and ``standard`` of a town in a folder, parted at an X."""
-    town, model = {"type": "readers.las", "filename": str(folder / "town.laz")}, str(folder / "town.model")
+    town, model = (
+        {"type": "readers.las", "filename": str(folder / "town.laz")},
+        str(folder / "town.model"),
+    )
     train = [
         town,
         {"type": "filters.range", "limits": f"X[:{middle})"},

@@ -47,7 +47,12 @@ def _cars(s: Site, along, across, turn: float, share=0.45) -> None:
 def _row(s: Site) -> None:
     """Two rows of terraced houses, gardens with hedges, walls, sheds and trees between them."""
     for front in (0.4, s.d - 0.4):  # a row shares eaves and roof; gaps let the gardens be seen
-        a, deep, eave, pitch = s.draw(0.5, 2.0), s.draw(4.2, 5.0), s.draw(4.8, 7.5), s.draw(0.65, 1.1)
+        a, deep, eave, pitch = (
+            s.draw(0.5, 2.0),
+            s.draw(4.2, 5.0),
+            s.draw(4.8, 7.5),
+            s.draw(0.65, 1.1),
+        )
         roof, b = s.rng.choice(["gable", "gable", "halfhip"]), deep + 2.2
         while a + 14 < s.w:
             half = min(s.draw(14, 24), s.w - a - 0.5) / 2
@@ -58,7 +63,18 @@ def _row(s: Site) -> None:
     for a in np.arange(1.0, s.w - 1, 7.0):
         hedge(s, a, low, ACROSS, long, s.draw(1.0, 1.9), wall=s.chance() < 0.5)
         if s.chance() < 0.3:
-            house(s, a + 3.5, low + s.draw(0.2, 0.8) * long, 0, 1.5, 1.2, 2.1, "shed", 0.25, plain=True)
+            house(
+                s,
+                a + 3.5,
+                low + s.draw(0.2, 0.8) * long,
+                0,
+                1.5,
+                1.2,
+                2.1,
+                "shed",
+                0.25,
+                plain=True,
+            )
         _greenery(s, int(s.chance() < 0.4), 2, 4, 9, (a + 1, low, 5, long))
 
 
@@ -80,7 +96,12 @@ def _villa(s: Site) -> None:
     for a, b in itertools.product((0, w, 2 * w), (0, d)):
         turn = s.rng.choice([0, ACROSS]) + s.draw(-0.06, 0.06)
         roof = s.rng.choice(["hip", "gable", "halfhip", "pyramid", "flat"])
-        half_l, half_w, eave, pitch = s.draw(4.4, 5.6), s.draw(3.4, 4.2), s.draw(2.8, 6.2), s.draw(0.45, 1.1)
+        half_l, half_w, eave, pitch = (
+            s.draw(4.4, 5.6),
+            s.draw(3.4, 4.2),
+            s.draw(2.8, 6.2),
+            s.draw(0.45, 1.1),
+        )
         house(s, a + w / 2, b + d / 2, turn, half_l, half_w, eave, roof, pitch)
         house(s, a + 2.6, b + 3.0, 0, 1.5, 2.7, 2.5, "flat", plain=True)
         car(s, a + 2.6, b + 8.0, ACROSS)
@@ -153,8 +174,23 @@ def _canal(s: Site) -> None:
         tree(s, a, s.axis + side * 8.8, 6, 10, 0)
         mast(s, a + 4, s.axis + side * 8.8, side * ACROSS, 6.0, 1.4)
         _cars(s, [a], [s.axis + side * 10.3], 0.0)
-    for a, half_w, z1 in ((0, 5.0, -t.KERB), (-4.85, 0.15, 0.9), (4.85, 0.15, 0.9)):  # deck and parapets
-        s.box(a - MARGIN, s.axis, ACROSS, t.CANAL_HALF + 0.1, half_w, -0.8, z1, BRIDGE, "asphalt", "stone")
+    for a, half_w, z1 in (
+        (0, 5.0, -t.KERB),
+        (-4.85, 0.15, 0.9),
+        (4.85, 0.15, 0.9),
+    ):  # deck and parapets
+        s.box(
+            a - MARGIN,
+            s.axis,
+            ACROSS,
+            t.CANAL_HALF + 0.1,
+            half_w,
+            -0.8,
+            z1,
+            BRIDGE,
+            "asphalt",
+            "stone",
+        )
     s.built.append(("deck", -MARGIN, s.axis, ACROSS, t.CANAL_HALF + 0.1, 5.0))
 
 
@@ -177,7 +213,11 @@ def house(s: Site, a, b, turn, half_l, half_w, eave, roof, pitch=0.8, *, plain=F
     'gable', 'hip', 'halfhip', 'shed' or 'pyramid'.
     """
     corners = [s.z(*beside(a, b, turn, p * half_l, q * half_w)) for p in (-1, 1) for q in (-1, 1)]
-    foot, eave, extras = min(corners) - 0.8, sum(corners) / 4 + eave, 0 if plain else 1 + int(half_l // 4)
+    foot, eave, extras = (
+        min(corners) - 0.8,
+        sum(corners) / 4 + eave,
+        0 if plain else 1 + int(half_l // 4),
+    )
     wall, cover = s.rng.choice(["plaster", "brick", "stone"]), s.rng.choice(["tile", "slate"])
 
     def put(along, left, half_p, half_q, z0, z1, top=cover, side=wall, cuts=()):
@@ -195,7 +235,11 @@ def house(s: Site, a, b, turn, half_l, half_w, eave, roof, pitch=0.8, *, plain=F
             at, up = (s.draw(-0.75, 0.75) * half_l, s.draw(-0.65, 0.65) * half_w), s.draw(0.7, 2.6)
             put(*at, s.draw(0.5, 2.2), s.draw(0.5, 1.4), eave, eave + up, "metal", "metal")
         return
-    rise, overhang, hipped = pitch * half_w, 0.0 if plain else s.draw(0.2, 0.5), roof in ("hip", "pyramid")
+    rise, overhang, hipped = (
+        pitch * half_w,
+        0.0 if plain else s.draw(0.2, 0.5),
+        roof in ("hip", "pyramid"),
+    )
     top, cuts = eave + rise, [(0, side * pitch, eave + rise) for side in (1, -1)]
     if roof == "shed":
         cuts, top = cuts[:1], eave + 2 * rise
@@ -205,12 +249,35 @@ def house(s: Site, a, b, turn, half_l, half_w, eave, roof, pitch=0.8, *, plain=F
         cuts += [(side * slope, 0, start + slope * half_l) for side in (1, -1)]
     s.built.append(("house", a, b, turn, half_l, half_w, overhang / 2, overhang, eave, top, cuts))
     put(0, 0, half_l, half_w, foot, top, cuts=cuts)
-    put(0, 0, half_l + overhang / 2, half_w + overhang, eave - overhang * pitch - 0.18, top, cuts=cuts)
+    put(
+        0,
+        0,
+        half_l + overhang / 2,
+        half_w + overhang,
+        eave - overhang * pitch - 0.18,
+        top,
+        cuts=cuts,
+    )
     for n in range(extras):  # dormers on both sides, and a chimney
         along = half_l * ((n + 0.5) / extras * 1.7 - 0.85) * (0.3 if hipped else 1.0)
         for side in () if hipped else (-1, 1):
-            put(along, side * 0.55 * half_w, 0.8, s.draw(0.2, 0.26) * half_w, eave, top + 0.1 - 0.3 * rise)
-        put(along + 1.2, s.draw(-0.35, 0.35) * half_w, 0.35, 0.3, eave, top + s.draw(0.3, 0.9), "brick")
+            put(
+                along,
+                side * 0.55 * half_w,
+                0.8,
+                s.draw(0.2, 0.26) * half_w,
+                eave,
+                top + 0.1 - 0.3 * rise,
+            )
+        put(
+            along + 1.2,
+            s.draw(-0.35, 0.35) * half_w,
+            0.35,
+            0.3,
+            eave,
+            top + s.draw(0.3, 0.9),
+            "brick",
+        )
 
 
 def thing(s: Site, a, b, turn, half_l, half_w, height, above=-0.4) -> None:
@@ -229,11 +296,23 @@ def car(s: Site, a, b, turn) -> None:
 def hedge(s: Site, a, b, turn, length, height, half=0.4, *, wall=False) -> None:
     """A clipped hedge from (a, b) in direction `turn`, or a garden wall, stepping with the ground."""
     count = math.ceil(length / 2.5)
-    code, what, leafy = (UNCLASSIFIED, "brick", 0.0) if wall else (VEGETATION, "leaf", s.draw(1.8, 3.0))
+    code, what, leafy = (
+        (UNCLASSIFIED, "brick", 0.0) if wall else (VEGETATION, "leaf", s.draw(1.8, 3.0))
+    )
     for n in range(count):
         at = beside(a, b, turn, (n + 0.5) * length / count, 0)
         z, up = s.z(*at), height * s.draw(0.94, 1.06)
-        s.box(*at, turn, length / count / 2, 0.1 if wall else half, z - 0.3, z + up, code, what, leafy=leafy)
+        s.box(
+            *at,
+            turn,
+            length / count / 2,
+            0.1 if wall else half,
+            z - 0.3,
+            z + up,
+            code,
+            what,
+            leafy=leafy,
+        )
 
 
 def mast(s: Site, a, b, turn, height, arm) -> None:
@@ -262,7 +341,9 @@ def tree(s: Site, a, b, low, high, conifers=0.25) -> None:
         half, eighths = (top - foot) / steep, [n * math.pi / 4 for n in range(8)]
         s.built.append(("tree", a, b, 1.1 * height, half))
         sides = [(steep * math.cos(way), steep * math.sin(way), top) for way in eighths]
-        s.box(a, b, 0.2, half, half, foot, top, VEGETATION, "leaf", cuts=sides, leafy=s.draw(0.6, 1.0))
+        s.box(
+            a, b, 0.2, half, half, foot, top, VEGETATION, "leaf", cuts=sides, leafy=s.draw(0.6, 1.0)
+        )
         return
     leafy = s.draw(0.5, 0.9) if s.chance() < 0.8 else s.draw(0.15, 0.3)
     radius, bole = height * s.draw(0.26, 0.4), height * s.draw(0.18, 0.3)
@@ -272,7 +353,14 @@ def tree(s: Site, a, b, low, high, conifers=0.25) -> None:
     for n in range(5):
         at = beside(a, b, 2 * math.pi * (n + s.draw(-0.3, 0.3)) / 5, radius * s.draw(0.4, 0.6), 0)
         r, rz = radius * s.draw(0.42, 0.62), half * s.draw(0.4, 0.6)
-        s.ball(*at, z + bole + rz + 2 * (half - rz) * s.draw(0.15, 0.85), r, r * s.draw(0.8, 1.2), rz, leafy)
+        s.ball(
+            *at,
+            z + bole + rz + 2 * (half - rz) * s.draw(0.15, 0.85),
+            r,
+            r * s.draw(0.8, 1.2),
+            rz,
+            leafy,
+        )
 
 
 def shrub(s: Site, a, b) -> None:

@@ -44,7 +44,9 @@ MARGINS = {BANK: 14.0, CANAL: 15.5}  # from the other lines
 class Scene(NamedTuple):
     """Things of one part of the town, with the grid cells that list them."""
 
-    things: np.ndarray  # (n, 12): box, first plane, planes (0: ellipsoid), class, materials, extinction
+    things: (
+        np.ndarray
+    )  # (n, 12): box, first plane, planes (0: ellipsoid), class, materials, extinction
     planes: np.ndarray  # (m, 4): outward normal and offset; inside is n.p <= offset
     start: np.ndarray  # (nu * nv + 1,): first entry of each cell in ``member``
     member: np.ndarray
@@ -68,7 +70,9 @@ class Site:
         self.w, self.d, self.axis = PITCH_U - 2 * MARGIN, PITCH_V - low - self.high, -low
         self.things: list[tuple] = []  # rows of Scene's arrays
         self.planes: list[tuple] = []
-        self.built: list[tuple] = []  # what it was, for who asks what is true: its kind, then its measures
+        self.built: list[
+            tuple
+        ] = []  # what it was, for who asks what is true: its kind, then its measures
 
     def z(self, a: float, b: float) -> float:
         """Ground height."""
@@ -85,7 +89,9 @@ class Site:
         self.things.append((*box, *label))
         self.planes += [(x, y, z, off + x * u + y * v + z * w) for (x, y, z), off in planes]
 
-    def box(self, a, b, turn, half_l, half_w, z0, z1, code, top, side=None, *, cuts=(), leafy=0.0) -> None:
+    def box(
+        self, a, b, turn, half_l, half_w, z0, z1, code, top, side=None, *, cuts=(), leafy=0.0
+    ) -> None:
         """An upright box round (a, b), its length in direction `turn`.
 
         Each cut (p, q, height) leaves of it what lies at ``z <= height - p * x - q * y``, where x and y run along its
@@ -94,7 +100,9 @@ class Site:
         c, s, middle, planes = math.cos(turn), math.sin(turn), (a, b, 0.5 * (z0 + z1)), []
         for p, q, height in cuts:
             n = math.sqrt(p * p + q * q + 1.0)
-            planes.append((((p * c - q * s) / n, (p * s + q * c) / n, 1.0 / n), (height - middle[2]) / n))
+            planes.append(
+                (((p * c - q * s) / n, (p * s + q * c) / n, 1.0 / n), (height - middle[2]) / n)
+            )
         axes = (((c, s, 0.0), half_l), ((-s, c, 0.0), half_w), ((0.0, 0.0, 1.0), 0.5 * (z1 - z0)))
         self._add(middle, axes, planes, code, top, side, leafy)
 
@@ -113,7 +121,9 @@ class Site:
         self._add([(p + q) / 2 for p, q in zip(start, end, strict=True)], axes, [], code, material)
 
 
-def build_scene(sites: list[tuple[np.ndarray, np.ndarray]], low: np.ndarray, high: np.ndarray) -> Scene:
+def build_scene(
+    sites: list[tuple[np.ndarray, np.ndarray]], low: np.ndarray, high: np.ndarray
+) -> Scene:
     """Join the arrays of sites where they touch a rectangle of town coordinates, and list them by grid cell."""
     things, planes = (np.concatenate(arrays) for arrays in zip(*sites, strict=True))
     counts = [len(planes) for _, planes in sites]
@@ -121,16 +131,24 @@ def build_scene(sites: list[tuple[np.ndarray, np.ndarray]], low: np.ndarray, hig
     things = things[((things[:, :2] < high) & (things[:, 3:5] > low)).all(axis=1)]
     shape = np.ceil((high - low) / CELL).astype(np.int64)
     first = np.floor((things[:, :2] - STEP / 2 - low) / CELL).astype(np.int64).clip(0)
-    last = np.minimum(np.floor((things[:, 3:5] + STEP / 2 - low) / CELL).astype(np.int64), shape - 1)
+    last = np.minimum(
+        np.floor((things[:, 3:5] + STEP / 2 - low) / CELL).astype(np.int64), shape - 1
+    )
     wide = (last - first + 1).clip(0)
     count = wide.prod(axis=1)
     thing = np.repeat(np.arange(len(things)), count)
     nth = np.arange(len(thing)) - np.repeat(np.cumsum(count) - count, count)
-    cell = (first[thing, 0] + nth // wide[thing, 1]) * shape[1] + first[thing, 1] + nth % wide[thing, 1]
+    cell = (
+        (first[thing, 0] + nth // wide[thing, 1]) * shape[1]
+        + first[thing, 1]
+        + nth % wide[thing, 1]
+    )
     top, order = np.full(shape.prod(), -1e30), np.argsort(cell, kind="stable")
     np.maximum.at(top, cell, things[thing, 5])
     start = np.searchsorted(cell[order], np.arange(len(top) + 1))
-    return Scene(things, planes, start, thing[order], top.reshape(shape), np.array([*low, top.max()]))
+    return Scene(
+        things, planes, start, thing[order], top.reshape(shape), np.array([*low, top.max()])
+    )
 
 
 SUB_BEAMS = 5  # a pulse has at most as many returns
@@ -188,7 +206,9 @@ def first_hit(scene, ox, oy, oz, dx, dy, dz, limit, tested, beam, rng):
         j = math.floor((oy + t * dy - scene.corner[1]) / CELL)
         high, low = oz + (t - step) * dz, oz + (t + step) * dz
         t += step
-        if not (0 <= i < scene.top.shape[0] and 0 <= j < scene.top.shape[1] and low <= scene.top[i, j]):
+        if not (
+            0 <= i < scene.top.shape[0] and 0 <= j < scene.top.shape[1] and low <= scene.top[i, j]
+        ):
             continue
         cell = i * scene.top.shape[1] + j
         for m in range(scene.start[cell], scene.start[cell + 1]):
@@ -222,15 +242,22 @@ def cast(origin, direction, scene, plan, rng):
             r, way = HALF_DIVERGENCE * limit if s else 0.0, turn + 0.5 * math.pi * s
             x, y = ox + r * math.cos(way), oy + r * math.sin(way)
             limit, material = ground_range(x, y, oz, dx, dy, dz, limit, plan)
-            t, n, face = first_hit(scene, x, y, oz, dx, dy, dz, limit, tested, pulse * SUB_BEAMS + s, rng)
+            t, n, face = first_hit(
+                scene, x, y, oz, dx, dy, dz, limit, tested, pulse * SUB_BEAMS + s, rng
+            )
             x, y, code, cosine = x + t * dx, y + t * dy, 2, -dz
             if n >= 0:
                 normal = scene.planes[face]
-                code, material = int(things[n, CLASS]), int(things[n, TOP if normal[2] > 0.3 else SIDE])
+                code, material = (
+                    int(things[n, CLASS]),
+                    int(things[n, TOP if normal[2] > 0.3 else SIDE]),
+                )
                 cosine = abs(normal[0] * dx + normal[1] * dy + normal[2] * dz)
                 if things[n, LEAFY] > 0.0:
                     cosine = 0.45 + 0.5 * rng.random()
-            elif material == WATER:  # a mirror: little comes back, and less the farther from the vertical
+            elif (
+                material == WATER
+            ):  # a mirror: little comes back, and less the farther from the vertical
                 code = 9
                 if rng.random() > 0.015 + 0.25 * math.exp(-120.0 * (1.0 + dz)):
                     t = math.inf
@@ -240,7 +267,11 @@ def cast(origin, direction, scene, plan, rng):
                 if tall > 0.08:
                     t, code, material = t + tall / dz, VEGETATION, GRASS
             hit[s, 0], hit[s, 1], hit[s, 2], hit[s, 3] = t, x, y, oz + t * dz
-            hit[s, 4], hit[s, 5], hit[s, 6] = code, cosine * REFLECTANCE[material] / SUB_BEAMS, pulse
+            hit[s, 4], hit[s, 5], hit[s, 6] = (
+                code,
+                cosine * REFLECTANCE[material] / SUB_BEAMS,
+                pulse,
+            )
         for s in range(SUB_BEAMS):  # by range; numpy's sort takes seconds to compile
             place = s
             while place > 0 and hit[order[place - 1], 0] > hit[s, 0]:
@@ -248,9 +279,13 @@ def cast(origin, direction, scene, plan, rng):
                 place -= 1
             order[place] = s
         first = 0
-        while first < SUB_BEAMS and hit[order[first], 0] < math.inf:  # what is close in range is one return
+        while (
+            first < SUB_BEAMS and hit[order[first], 0] < math.inf
+        ):  # what is close in range is one return
             last, echo = first, hit[order[first], 5]
-            while last + 1 < SUB_BEAMS and hit[order[last + 1], 0] - hit[order[last], 0] < SEPARATION:
+            while (
+                last + 1 < SUB_BEAMS and hit[order[last + 1], 0] - hit[order[last], 0] < SEPARATION
+            ):
                 last += 1
                 echo += hit[order[last], 5]
             for k in range(7):

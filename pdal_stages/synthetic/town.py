@@ -51,7 +51,9 @@ class TownOptions(Settings):
     """How to make a town; wrong values raise an OptionError."""
 
     size: float = setting(200.0, "number", "Side of the square, meters", 20, 20_000)
-    density: float = setting(7.0, "number", "Returns per square meter, met within a few per cent", 0.05, 500)
+    density: float = setting(
+        7.0, "number", "Returns per square meter, met within a few per cent", 0.05, 500
+    )
     seed: int = setting(1, "integer", "Another number, another town", 0, 2**31 - 1)
     noise: float = setting(0.02, "number", "Standard deviation of a range, meters", 0, 0.5)
     origin: tuple = (500_000.0, 5_400_000.0, 60.0)  #: x, y of the low corner; height of the quays
@@ -69,14 +71,18 @@ class Town:
     """Points of a town (or of a chunk of one) with what is true about them."""
 
     xyz: np.ndarray  # (n, 3) float64: meters, multiples of 1 mm
-    classification: np.ndarray  # (n,) uint8: true ASPRS class; 3, 4, 5: below 0.5 m, below 2 m, above
+    classification: (
+        np.ndarray
+    )  # (n,) uint8: true ASPRS class; 3, 4, 5: below 0.5 m, below 2 m, above
     intensity: np.ndarray  # (n,) uint16
     return_number: np.ndarray  # (n,) uint8
     number_of_returns: np.ndarray  # (n,) uint8
     gps_time: np.ndarray  # (n,) float64: adjusted standard GPS time, unique to each pulse
     point_source_id: np.ndarray  # (n,) uint16: the strip, from 1
     scan_angle: np.ndarray  # (n,) float32: degrees, positive to the right of the flight
-    height_above_ground: np.ndarray  # (n,) float32: above the true bare ground; of water, its surface
+    height_above_ground: (
+        np.ndarray
+    )  # (n,) float32: above the true bare ground; of water, its surface
     options: TownOptions
 
     def __len__(self) -> int:
@@ -101,7 +107,9 @@ class Flight:
         rng, half = np.random.default_rng([seed, 0xF117]), math.radians(SCAN_ANGLE)
         self.heading = math.radians(rng.uniform(70, 110))  # from east
         swath = 2.0 * ALTITUDE * math.tan(half)
-        self.reach = 0.5 * size * (abs(math.cos(self.heading)) + abs(math.sin(self.heading))) + BESIDE
+        self.reach = (
+            0.5 * size * (abs(math.cos(self.heading)) + abs(math.sin(self.heading))) + BESIDE
+        )
         apart = swath * (1.0 - OVERLAP)
         # At least two strips, so that every town is seen from two sides.
         self.strips = max(2, math.ceil((2 * self.reach - swath * OVERLAP) / apart))
@@ -115,11 +123,15 @@ class Flight:
         """The flight in order of time: strip, first line, line after the last, with about so many pulses each."""
         step = max(1, int(pulses / min(self.per_line, 2 * self.reach / self.spacing)))
         firsts = range(0, self.lines, step)
-        return [(strip, n, min(n + step, self.lines)) for strip in range(self.strips) for n in firsts]
+        return [
+            (strip, n, min(n + step, self.lines)) for strip in range(self.strips) for n in firsts
+        ]
 
     def aimed(self, part: int) -> int:
         """How many of all pulses, made so many at a time, would meet level ground inside the square."""
-        return sum((np.abs(self.pulses(*p)[2]) < self.size / 2).all(axis=1).sum() for p in self.parts(part))
+        return sum(
+            (np.abs(self.pulses(*p)[2]) < self.size / 2).all(axis=1).sum() for p in self.parts(part)
+        )
 
     def pulses(self, strip: int, first: int, last: int) -> list[np.ndarray]:
         """The pulses of some scan lines of a strip that come near the square, in order of time.
@@ -153,7 +165,9 @@ class FlownTown:
         self.block = lru_cache(1500)(lambda i, j: fill(self.plan, i, j))
         # The spacing that gives the wanted density: from the returns of a coarse flight over the middle of the town.
         sizes = min(options.size, 400.0), options.size
-        trial, coarse = (Flight(int(options.seed), size, size / math.sqrt(SAMPLE)) for size in sizes)
+        trial, coarse = (
+            Flight(int(options.seed), size, size / math.sqrt(SAMPLE)) for size in sizes
+        )
         returns = sum(len(self.town(trial, *part)) for part in trial.parts(SAMPLE))
         density = max(returns, 1) / trial.aimed(SAMPLE) * coarse.aimed(SAMPLE) / options.size**2
         self.flight = Flight(
@@ -165,7 +179,9 @@ class FlownTown:
         o, turn, plan = self.options, self.plan.turn, self.plan
         rng = np.random.default_rng([int(o.seed), strip, first, last])
         origin, direction, level, time, angle = flight.pulses(strip, first, last)
-        origin, direction = (np.column_stack([a[:, :2] @ turn, a[:, 2]]) for a in (origin, direction))
+        origin, direction = (
+            np.column_stack([a[:, :2] @ turn, a[:, 2]]) for a in (origin, direction)
+        )
         hits = np.zeros((0, 7))
         if len(origin):
             low, high = (level @ turn).min(axis=0) - SIDEWAYS, (level @ turn).max(axis=0) + SIDEWAYS
@@ -182,8 +198,15 @@ class FlownTown:
         mm, pulse, distance, (code, echo) = mm[keep], pulse[keep], hits[keep, 0], hits[keep, 4:6].T
         above = mm[:, 2] / 1000.0 - heights((mm[:, :2] / 1000.0 - flight.size / 2) @ turn, plan)
         code = np.where(code == VEGETATION, np.select([above < 0.5, above < 2.0], [3, 4], 5), code)
-        echo = 4000.0 * echo * (ALTITUDE / distance) ** 2 * np.exp(0.12 * rng.standard_normal(len(echo)))
-        _, start, nth, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
+        echo = (
+            4000.0
+            * echo
+            * (ALTITUDE / distance) ** 2
+            * np.exp(0.12 * rng.standard_normal(len(echo)))
+        )
+        _, start, nth, count = np.unique(
+            pulse, return_index=True, return_inverse=True, return_counts=True
+        )
         return Town(
             xyz=(mm + np.round(np.array(o.origin) * 1000.0)) / 1000.0,
             classification=code.astype(np.uint8),
@@ -217,7 +240,9 @@ def make_town(size=200.0, density=7.0, seed=1, *, threads=None, progress=True, *
             line.update(len(piece))
             pieces.append(piece)
     names = [f.name for f in dataclasses.fields(Town)][:-1]
-    columns: dict = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names}
+    columns: dict = {
+        name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names
+    }
     return Town(**columns, options=options)
 
 
@@ -227,15 +252,22 @@ def write_town(town: Town, path: str | os.PathLike) -> None:
 
     target = Path(path)
     if not named_las(target):
-        raise OptionError("the output's name must end in .las or .laz", where="write_town", found=str(path))
+        raise OptionError(
+            "the output's name must end in .las or .laz", where="write_town", found=str(path)
+        )
     if not len(town):
         raise StageError(
             "no pulse hit this town", where="synthetic", cure="Give a larger 'size' or 'density'"
         )
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, 0.001), np.floor(np.array(town.options.origin))
-    header.creation_date = datetime.date(2020, 7, 1)  # fixed, so that the same town gives the same bytes
-    header.system_identifier, header.generating_software = "generated town", f"pdal-stages {__version__}"
+    header.creation_date = datetime.date(
+        2020, 7, 1
+    )  # fixed, so that the same town gives the same bytes
+    header.system_identifier, header.generating_software = (
+        "generated town",
+        f"pdal-stages {__version__}",
+    )
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True
     header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", WKT.encode() + b"\0"))

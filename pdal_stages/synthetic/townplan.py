@@ -25,7 +25,9 @@ BANK_CREST, BANK_FOOT, BANK_HEIGHT = 3.5, 12.0, 5.0
 _NAMES = "asphalt paving lawn soil stone water grass tile slate metal plaster brick leaf bark"
 MATERIAL = {name: code for code, name in enumerate(_NAMES.split())}
 #: Of the materials, at 1064 nm.
-REFLECTANCE = np.array([0.14, 0.28, 0.48, 0.3, 0.32, 0.04, 0.52, 0.33, 0.16, 0.5, 0.55, 0.36, 0.5, 0.3])
+REFLECTANCE = np.array(
+    [0.14, 0.28, 0.48, 0.3, 0.32, 0.04, 0.52, 0.33, 0.16, 0.5, 0.55, 0.36, 0.5, 0.3]
+)
 ASPHALT, PAVING, LAWN, SOIL, STONE, WATER, GRASS = range(7)
 
 
@@ -35,7 +37,9 @@ class Plan(NamedTuple):
     seed: int
     waves: np.ndarray  # (n, 4): height in meters, wave numbers along u and v in 1/m, phase
     shift: int  # of the pattern of blocks
-    turn: np.ndarray  # (2, 2): meters east and north from the middle, times this, are town coordinates
+    turn: (
+        np.ndarray
+    )  # (2, 2): meters east and north from the middle, times this, are town coordinates
 
 
 def plan_town(seed: int) -> Plan:
@@ -74,7 +78,9 @@ def ground(u, v, plan):
     """Height of the bare ground (of water: its surface) and the material there; slopes are never above one."""
     z = 0.0
     for n in range(plan.waves.shape[0]):
-        z += plan.waves[n, 0] * math.sin(plan.waves[n, 1] * u + plan.waves[n, 2] * v + plan.waves[n, 3])
+        z += plan.waves[n, 0] * math.sin(
+            plan.waves[n, 1] * u + plan.waves[n, 2] * v + plan.waves[n, 3]
+        )
     canal = _from_line(v, FIRST_V + CANAL * PITCH_V, 4 * PITCH_V)
     t = min(max((canal - 15.0) / 95.0, 0.0), 1.0)
     z *= t * t * (3.0 - 2.0 * t)  # wide valleys, level near the quays

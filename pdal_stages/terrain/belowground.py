@@ -170,7 +170,8 @@ def _has_company(base, supported, side, j, i, z, height, across, along):
                 company += deep[b, a]
     return (
         company >= COMPANY
-        and company - _of_land_above(levels, seen, deep, side, j, i, z + max(half, HIGHER)) >= COMPANY
+        and company - _of_land_above(levels, seen, deep, side, j, i, z + max(half, HIGHER))
+        >= COMPANY
     )
 
 
@@ -183,7 +184,9 @@ def _limits(low, base, supported, side, depth, limit):
                 continue
             plane = _plane_under(base, j, i, NEAR, 2 * NEAR + 1)
             lowest = plane[1] - depth - SCATTERS * plane[4]
-            if low[j, i] < lowest and not _has_company(base, supported, side, j, i, low[j, i], *plane[1:4]):
+            if low[j, i] < lowest and not _has_company(
+                base, supported, side, j, i, low[j, i], *plane[1:4]
+            ):
                 limit[j, i] = lowest
 
 
@@ -197,7 +200,9 @@ def _take_level(every, rows, columns, side, depth, limit):
             limit[j, i] = -np.inf
 
 
-def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -> NDArray[np.float64]:
+def below_ground(
+    low: NDArray, base: NDArray, side: float, depth: float = 1.0
+) -> NDArray[np.float64]:
     """Heights (h, w) below which low places are below the ground; -inf where they are not.
 
     `low` (h, w) has the lowest of what may be in each column, `base` that of what is not, both ``inf`` where there is none;
@@ -216,7 +221,9 @@ def below_ground(low: NDArray, base: NDArray, side: float, depth: float = 1.0) -
     return limit
 
 
-def pits(raster: NDArray[np.float32], highest: NDArray[np.floating], cell: float) -> NDArray[np.bool_]:
+def pits(
+    raster: NDArray[np.float32], highest: NDArray[np.floating], cell: float
+) -> NDArray[np.bool_]:
     """Cells (h, w) of a minimum grid whose lowest point is below the ground, of islands from which one walks nowhere.
 
     `raster` has heights, holes ``inf``; `highest` those of the highest points; `cell` is a cell's side; meters.
@@ -224,10 +231,14 @@ def pits(raster: NDArray[np.float32], highest: NDArray[np.floating], cell: float
     number, size, side = linked_cells(raster, LINK, lambda away: STEP + GRADE * cell * away)
     covered = highest_around(highest > raster + ABOVE, 1, 0)
     share = np.bincount(number[covered & (number >= 0)], minlength=len(size))
-    island = np.append(((size <= MOST) | (share >= COVERED * size)) & (side < EXTENT), False)[number]
+    island = np.append(((size <= MOST) | (share >= COVERED * size)) & (side < EXTENT), False)[
+        number
+    ]
     if not island.any():
         return island
-    return below_ground(np.where(island, raster, HOLE), np.where(island, HOLE, raster), cell) > -np.inf
+    return (
+        below_ground(np.where(island, raster, HOLE), np.where(island, HOLE, raster), cell) > -np.inf
+    )
 
 
 def pits_reach(cell: float) -> int:

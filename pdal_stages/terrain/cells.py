@@ -48,7 +48,9 @@ class CellWindow(NamedTuple):
 
     def grown(self, by: int) -> CellWindow:
         """So many cells more on every side."""
-        return CellWindow(self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by)
+        return CellWindow(
+            self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by
+        )
 
     def holds(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which cells lie in it."""
@@ -111,7 +113,9 @@ def _linked(padded, offsets, steps, reach, number):
                 continue
             for k in range(len(steps)):
                 b, a = j + offsets[k, 0], i + offsets[k, 1]
-                if abs(padded[b, a + reach] - here) <= steps[k] and parent[b * w + a] != mine:  # nor a hole
+                if (
+                    abs(padded[b, a + reach] - here) <= steps[k] and parent[b * w + a] != mine
+                ):  # nor a hole
                     other = root_of(parent, b * w + a)
                     mine, other = min(mine, other), max(mine, other)
                     parent[other] = mine
@@ -129,7 +133,9 @@ def _linked(padded, offsets, steps, reach, number):
 
 
 def linked_cells(
-    raster: NDArray[np.float32], reach: float, step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    raster: NDArray[np.float32],
+    reach: float,
+    step: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and their :func:`longest_sides`.
 
@@ -180,12 +186,15 @@ def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDAr
     if y is None and z is None:
         xyz = np.asarray(x, np.float64)
         if xyz.ndim != 2 or xyz.shape[1] != 3:
-            raise StageError("points must be an array of shape (n, 3), or x, y and z", found=xyz.shape)
+            raise StageError(
+                "points must be an array of shape (n, 3), or x, y and z", found=xyz.shape
+            )
         return [np.ascontiguousarray(column) for column in xyz.T]
     made = [np.ascontiguousarray(np.asarray(a, np.float64)) for a in (x, y, z)]
     if not (made[0].shape == made[1].shape == made[2].shape and made[0].ndim == 1):
         raise StageError(
-            "x, y and z must be one-dimensional and of one length", found=tuple(a.shape for a in made)
+            "x, y and z must be one-dimensional and of one length",
+            found=tuple(a.shape for a in made),
         )
     return made
 
@@ -197,7 +206,9 @@ def usable(*axes: NDArray[np.float64], mask: ArrayLike | None = None) -> NDArray
         return use
     kept = np.asarray(mask, bool)
     if kept.shape != use.shape:
-        raise StageError("'mask' must have one value per point", found=f"{kept.shape}, {len(use):,} points")
+        raise StageError(
+            "'mask' must have one value per point", found=f"{kept.shape}, {len(use):,} points"
+        )
     return use & kept
 
 
@@ -266,7 +277,9 @@ def lowest_of_cells(
     return mine[lowest_points(x, y, z, number, len(cells))], highest
 
 
-def levels(z: NDArray[np.float64], cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def levels(
+    z: NDArray[np.float64], cell: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Points (n,) in the order of their cells' numbers (small ones) and of their heights, and which begin a level of a cell.
 
     A cell's points are parted where a gap is wide: the ground and the deck over it, a roof and what it stands on. The lowest
@@ -322,7 +335,9 @@ def refuse_scattered(counts: Collection[int]) -> None:
         )
 
 
-def _groups(column: NDArray[np.int64], row: NDArray[np.int64], link: int) -> list[NDArray[np.int64]]:
+def _groups(
+    column: NDArray[np.int64], row: NDArray[np.int64], link: int
+) -> list[NDArray[np.int64]]:
     """Points that belong together: all within `link` cells of each other, and few that are a little farther apart."""
     side = -(-link // _PARTS)
     rings = -(-link // side)

@@ -74,7 +74,9 @@ SIDE = 1.5
 #: Blocks in which long decks are judged, cells, and how many blocks away land must be seen.
 BLOCK, FAR_ENDS = 64, 3
 #: How far away cells matter: blocks of a deck, its rim and the land at its ends, how far one walks and sees from there.
-RIMS_REACH = BLOCK * (FAR_ENDS + 1) + LINK + 2 * WIDEST + AHEAD + FAR + 8 + 2 * _FILLS + LINK + WALLS_REACH
+RIMS_REACH = (
+    BLOCK * (FAR_ENDS + 1) + LINK + 2 * WIDEST + AHEAD + FAR + 8 + 2 * _FILLS + LINK + WALLS_REACH
+)
 #: Side of the cells, meters: what is said of cells below is said of meters.
 CELL = 1.0
 #: How far from the deck's surface its points lie, meters: on it, and in cells beside it, where leaves are; parapets and cars
@@ -113,7 +115,9 @@ def deck_levels(z, start, h, w, left, bottom):
     return kind, without_walls(z, start, h, w, kind, end, found)
 
 
-def _judged(z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing) -> NDArray[np.bool_]:
+def _judged(
+    z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing
+) -> NDArray[np.bool_]:
     """Which levels (n,) of what may be decks are some, by what is at the rims of their parts."""
     level, number = np.flatnonzero(deck), np.cumsum(deck) - 1
     row, column = np.divmod(np.repeat(np.arange(h * w), np.diff(start)), w)
@@ -122,7 +126,9 @@ def _judged(z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing
     number_sets(number[one[both]], number[other[both]], part)
     # Where one walks on to what is no deck, and to land: from there, ahead and to both sides of that.
     one, other = one[~both], other[~both]
-    turn = np.rint(np.arctan2(row[other] - row[one], column[other] - column[one]) / (np.pi / 4)).astype(int)
+    turn = np.rint(
+        np.arctan2(row[other] - row[one], column[other] - column[one]) / (np.pi / 4)
+    ).astype(int)
     land = goes_on[other[:, None], (turn[:, None] + (-1, 0, 1)) % 8].all(axis=1)
     on, to_land = (np.bincount(some, minlength=len(z))[level] > 0 for some in (one, one[land]))
     row, column, end = row[level], column[level], end[level]
@@ -162,7 +168,9 @@ def _judged(z, start, h, w, left, bottom, kind, goes_on, end, deck, over_nothing
     long = length[part] > LONGEST
     if long.any():
         out[level[long]] = _stretches(
-            row[long] + bottom, column[long] + left, *(v[long] for v in (down, walled, rim, on, to_land))
+            row[long] + bottom,
+            column[long] + left,
+            *(v[long] for v in (down, walled, rim, on, to_land)),
         )
     return out
 
@@ -190,7 +198,9 @@ def _goes_on(rim: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _filled(z, start, h, w, kind, deck) -> NDArray[np.bool_]:
     """The decks, and what is walked on and has more of them than of other ground around."""
     cell = np.repeat(np.arange(h * w), np.diff(start))
-    near = highest_around(np.bincount(cell[deck], minlength=h * w).reshape(h, w) > 0, LINK, 0).ravel()
+    near = highest_around(
+        np.bincount(cell[deck], minlength=h * w).reshape(h, w) > 0, LINK, 0
+    ).ravel()
     one, other = _beside(z, start, h, w, kind, near[cell] & ~deck)
     return deck | (np.bincount(one, np.where(deck[other], 1, -1), len(z)) > 0)
 
@@ -214,7 +224,10 @@ def _beside(z, start, h, w, kind, some):
                             ):
                                 continue
                             if count == len(one):
-                                one, other = np.concatenate((one, one)), np.concatenate((other, other))
+                                one, other = (
+                                    np.concatenate((one, one)),
+                                    np.concatenate((other, other)),
+                                )
                             one[count], other[count] = n, m
                             count += 1
     return one[:count], other[:count]
@@ -261,14 +274,18 @@ def levels_near_decks(
             order, begins = levels(z[points], cell)
             lowest = order[begins]
             heights, cell = z[points][lowest], cell[lowest]
-            kind, deck = deck_levels(heights, np.searchsorted(cell, np.arange(h * w + 1)), h, w, left, bottom)
+            kind, deck = deck_levels(
+                heights, np.searchsorted(cell, np.arange(h * w + 1)), h, w, left, bottom
+            )
             there = np.bincount(cell[deck], minlength=h * w).reshape(h, w) > 0
             near = highest_around(there, 2 * BESIDE, 0).ravel()[cell]
             mine = np.zeros(len(c), bool)
             mine[own] = True
             near &= mine[lowest]
             lowest = lowest[near]
-            rows.append(np.column_stack([c[lowest], r[lowest], heights[near], deck[near], kind[near]]))
+            rows.append(
+                np.column_stack([c[lowest], r[lowest], heights[near], deck[near], kind[near]])
+            )
     return np.concatenate(rows)
 
 

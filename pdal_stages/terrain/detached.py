@@ -27,7 +27,16 @@ from ..base.jit import device, njit
 from ..base.las import NOISE
 from .belowground import ENOUGH, below_ground
 from .belowground import reach as below_reach
-from .cells import HIGHEST, cell_numbers, columns, longest_sides, number_sets, patches, sums_around, usable
+from .cells import (
+    HIGHEST,
+    cell_numbers,
+    columns,
+    longest_sides,
+    number_sets,
+    patches,
+    sums_around,
+    usable,
+)
 
 LOW, HIGH = NOISE
 #: Side of a voxel, meters.
@@ -125,7 +134,10 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     # One empty column on every side at least, and whole blocks.
     whole = BLOCK << SCALES
     left, bottom = (int(v.min() - 1) // whole * whole for v in (column, row))
-    w, h = (-(-(int(v.max()) + 2 - start) // whole) * whole for v, start in ((column, left), (row, bottom)))
+    w, h = (
+        -(-(int(v.max()) + 2 - start) // whole) * whole
+        for v, start in ((column, left), (row, bottom))
+    )
     voxels, voxel = Voxels.of(row - bottom, column - left, cell_numbers(z, SIDE), w)
     usual, spacing = surroundings(voxels)
     suspect, size, number = small_clusters(voxels, usual, spacing, cluster)
@@ -173,7 +185,9 @@ class Voxels(NamedTuple):
     @classmethod
     def of(cls, row, column, level, width: int, counts=None) -> tuple[Voxels, NDArray[np.int64]]:
         """Voxels of points, or of others with `counts` of them; and the number of each one's voxel."""
-        keys, voxel = np.unique(((row * width + column) << BITS) + level + LEVELS, return_inverse=True)
+        keys, voxel = np.unique(
+            ((row * width + column) << BITS) + level + LEVELS, return_inverse=True
+        )
         return cls(keys, np.bincount(voxel, counts).astype(np.int64), width), voxel
 
     @property
@@ -201,8 +215,12 @@ def _small(
     number, weak ones joined as well, -1 where it is wider than `extent`, in voxels."""
     keys, number = voxels.keys, len(voxels.keys)
     strong = voxels.counts > (WEAK * usual).astype(np.int64)
-    ahead = np.array([(dj * voxels.width + di) << BITS for dj, di in ((0, 1), (1, -1), (1, 0), (1, 1))])
-    spans = np.array([[1, 1], *zip(ahead - 1, ahead + 1, strict=True)])  # above, and in columns ahead
+    ahead = np.array(
+        [(dj * voxels.width + di) << BITS for dj, di in ((0, 1), (1, -1), (1, 0), (1, 1))]
+    )
+    spans = np.array(
+        [[1, 1], *zip(ahead - 1, ahead + 1, strict=True)]
+    )  # above, and in columns ahead
     pairs = np.empty((2, _touching(keys, spans, np.empty((2, 0), np.int64))), np.int64)
     _touching(keys, spans, pairs)
     one, other = pairs
@@ -260,8 +278,12 @@ def small_clusters(
             break
         # With one empty column on every side.
         width = (voxels.width >> scale) + 2
-        wider, of = Voxels.of((row >> scale) + 1, (column >> scale) + 1, level, width, voxels.counts)
-        still, total, numbers = _small(wider, np.ones(len(wider.keys)), most, LARGEST_EXTENT >> scale)
+        wider, of = Voxels.of(
+            (row >> scale) + 1, (column >> scale) + 1, level, width, voxels.counts
+        )
+        still, total, numbers = _small(
+            wider, np.ones(len(wider.keys)), most, LARGEST_EXTENT >> scale
+        )
         small[thin], size[thin] = still[of[thin]], total[of[thin]]
         number[thin] = np.where(numbers < 0, -1, numbers + number.max() + 1)[of[thin]]
     return small, size, number
@@ -324,7 +346,9 @@ def _in_line(hung, hung_suspect, j, i, z, u, v, dz):
     for b in range(max(j - FAR, 0), min(j + FAR + 1, h)):
         for a in range(max(i - FAR, 0), min(i + FAR + 1, w)):
             square = (b - j) ** 2 + (a - i) ** 2
-            if 4 < square <= FAR * FAR and abs(hung[b, a] - z) <= 1.0 + 0.3 * SIDE * np.sqrt(square):
+            if 4 < square <= FAR * FAR and abs(hung[b, a] - z) <= 1.0 + 0.3 * SIDE * np.sqrt(
+                square
+            ):
                 u[n], v[n], dz[n] = a - i, b - j, hung[b, a] - z
                 n += 1
                 suspects += hung_suspect[b, a]

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from .cells import HIGHEST, HOLE, SIDE, CellWindow, cell_numbers, keys_of, lowest_of_cells, runs
 from .decks import CELL, decks_of_levels, level_points, levels_near_decks
-from .groundcells import NEAR, CellMeans, FilterOptions, GroundPoints, add_ground, ground_raster, means_of
+from .groundcells import (
+    NEAR,
+    CellMeans,
+    FilterOptions,
+    GroundPoints,
+    add_ground,
+    ground_raster,
+    means_of,
+)
 from .planes import GroundRaster, around, heights_above, surface
 from .planes import reach as planes_reach
 
@@ -42,7 +50,9 @@ class GroundCells(NamedTuple):
     @staticmethod
     def names_within(side: int, west: int, south: int, east: int, north: int) -> set[str]:
         """Names of the arrays of :meth:`in_parts` that are needed for the cells of these columns and rows."""
-        columns, rows = (range(low // side, high // side + 1) for low, high in ((west, east), (south, north)))
+        columns, rows = (
+            range(low // side, high // side + 1) for low, high in ((west, east), (south, north))
+        )
         return {"decks", *(f"{i}_{j}" for i in columns for j in rows)}
 
     @staticmethod

@@ -213,7 +213,9 @@ def ground_raster(
         rest, seen = np.isfinite(raster) & ~ground, np.zeros(raster.shape, bool)
         seen[wanted.grown(plateaus + (ROUNDS - number) * step).within(kept).on(kept)] = True
         asked = np.flatnonzero(rest & seen)
-        near = _near(asked, place, rest, *blocks, *kept[:2], cell, options.threshold, options.scalar)
+        near = _near(
+            asked, place, rest, *blocks, *kept[:2], cell, options.threshold, options.scalar
+        )
         ground.ravel()[asked[near]] = True
     below = roofs_of_hillsides(ground, raster, cell)
     remove_plateaus(ground, floor, raster, steep, cell)
@@ -226,13 +228,17 @@ def ground_raster(
 
 
 @njit
-def _near(cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar):
+def _near(
+    cells, place, rest, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar
+):
     """Which of the cells (n,), numbered row by row, lie near the surface of the ground found so far (see :mod:`.planes`)."""
     h, w = rest.shape
     out = np.zeros(len(cells), np.bool_)
     for k in range(len(cells)):
         j, i = cells[k] // w, cells[k] % w
-        height, across, along = from_parents(blocks, blocks_left, blocks_bottom, i + left, j + bottom, 1.0)
+        height, across, along = from_parents(
+            blocks, blocks_left, blocks_bottom, i + left, j + bottom, 1.0
+        )
         x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
         gradient = np.sqrt(across * across + along * along) / cell
         if abs(z - height - x * across - y * along) > threshold + scalar * gradient:

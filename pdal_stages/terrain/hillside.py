@@ -50,7 +50,10 @@ def _creases(raster, arm, cell):
                         after = s
                 if before == 0 or after == 0:
                     continue
-                one, other = raster[j - before * dj, i - before * di], raster[j + after * dj, i + after * di]
+                one, other = (
+                    raster[j - before * dj, i - before * di],
+                    raster[j + after * dj, i + after * di],
+                )
                 both = before + after
                 rise = (one * after + other * before) / both - raster[j, i]
                 most = CREASE + TILT * abs(one - other) / (both * length * cell)
@@ -106,8 +109,14 @@ def roofs_of_hillsides(
     count = len(size)
     grounds = np.bincount(number[ground & ~creases], minlength=count)
     asked = (grounds > FOOTING * size) & (side * cell < WIDEST) & (size * cell * cell >= SMALLEST)
-    sectors, rims, low = np.zeros((count, 16), bool), np.zeros((count, 3), np.int64), np.zeros((count, 2))
-    _rims(number, asked, creases, ground, raster, cell, sums_of_sets(number, size), sectors, rims, low)
+    sectors, rims, low = (
+        np.zeros((count, 16), bool),
+        np.zeros((count, 3), np.int64),
+        np.zeros((count, 2)),
+    )
+    _rims(
+        number, asked, creases, ground, raster, cell, sums_of_sets(number, size), sectors, rims, low
+    )
     walls, others, creased = rims.T
     roof = asked & (sectors.sum(axis=1) >= DIRECTIONS) & (walls >= SHARE * (walls + others))
     roof &= (creased <= CREASED * size) & (low[:, 1] >= HIGH)
@@ -118,7 +127,9 @@ def roofs_of_hillsides(
         roof[k] = np.hypot(north, east) < LEVEL * cell
     if not roof.any():
         return np.full(raster.shape, HOLE)
-    below = np.append(np.where(roof, low[:, 0] / np.maximum(walls, 1), HOLE), HOLE)[number].astype(np.float32)
+    below = np.append(np.where(roof, low[:, 0] / np.maximum(walls, 1), HOLE), HOLE)[number].astype(
+        np.float32
+    )
     # Beside the slope roofs are creases.
     beside = -highest_around(-below, max(1, int(BEYOND / cell)), 0)
     return np.where(ground, np.where(creases, beside, below), HOLE)

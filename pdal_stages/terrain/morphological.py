@@ -125,12 +125,20 @@ def filtered_ground(
     }
     deck = np.zeros(len(x), np.uint8)
     if decks:
-        deck = find_decks(x, y, z, use) if cells is None else decks_of_levels(x, y, z, use, cells.decks)
+        deck = (
+            find_decks(x, y, z, use)
+            if cells is None
+            else decks_of_levels(x, y, z, use, cells.decks)
+        )
     if len(x):
         points = GroundPoints.of(x, y, z, z, use, deck, cell)
-        pieces = _found(points, options, counts) if cells is None else _given(points, options, cells)
+        pieces = (
+            _found(points, options, counts) if cells is None else _given(points, options, cells)
+        )
         for of, own, raster, means in pieces:
-            found = _measured(points.some(of), own, raster, means, options, slope_too, threads, counts)
+            found = _measured(
+                points.some(of), own, raster, means, options, slope_too, threads, counts
+            )
             for name, values in found.items():
                 out[name][of if isinstance(of, slice) else of[own]] = values[own]
     if figures is not None:
@@ -185,7 +193,9 @@ def _measured(
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
 
     def above(span):
-        heights_above(x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span])
+        heights_above(
+            x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span]
+        )
 
     list(map_blocks(above, spans, threads))
     is_ground = options.is_ground(use, deck, height, gradient)
@@ -209,7 +219,9 @@ def _measured(
         opening = raster.opened[radius]
 
         def over(span, opening=opening, values=values):
-            above_opening(x[span], y[span], z[span], cell, left, bottom, opening, height[span], values[span])
+            above_opening(
+                x[span], y[span], z[span], cell, left, bottom, opening, height[span], values[span]
+            )
 
         list(map_blocks(over, spans, threads))
     return found

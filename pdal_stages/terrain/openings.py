@@ -120,7 +120,9 @@ def _lower(fall, land, drop, falls, again, after, below, found):
 
 def objects_of(
     raster: NDArray[np.float32], cell: float, slope: float, window: int, keep: Collection[int] = ()
-) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]], NDArray[np.float32]]:
+) -> tuple[
+    NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]], NDArray[np.float32]
+]:
     """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
 
     Wide windows also lower steep land that the rim of the cloud cuts off uphill, so there they must lower by more (see
@@ -235,7 +237,9 @@ def direction(sums, j, i):
 
 
 @njit
-def _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim):
+def _look_around(
+    number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim
+):
     """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level.
 
     And of the set's own ground, twice how often other ground lies a jump higher, less how often it lies a jump lower; and
@@ -275,15 +279,25 @@ def remove_plateaus(
     `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere. `steep` (h, w)
     is how steep the land is, in meters per cell.
     """
-    number, size, side = linked_cells(raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away))
+    number, size, side = linked_cells(
+        raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away)
+    )
     count, sums = len(size), sums_of_sets(number, size)
     grounds = np.bincount(number[ground], minlength=count)
     asked = (grounds > FOOTING * size) & (side < int(WIDEST / cell))
-    sectors, around, level = np.zeros((count, 16), bool), np.zeros((count, 2), np.int64), np.zeros(count)
+    sectors, around, level = (
+        np.zeros((count, 16), bool),
+        np.zeros((count, 2), np.int64),
+        np.zeros(count),
+    )
     uphill, rim = np.zeros((2, count), np.int64)
-    _look_around(number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim)
+    _look_around(
+        number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim
+    )
     lower = around[:, 0]
-    plateau = (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
+    plateau = (
+        (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
+    )
     plateau &= rim <= RIM * np.sqrt(size)
     level[plateau] /= lower[plateau]
     taken = ground & np.append(plateau, False)[number]

@@ -52,14 +52,19 @@ class GroundRaster(NamedTuple):
         return self._replace(
             window=window,
             opened={radius: values[part].copy() for radius, values in self.opened.items()},
-            **{name: getattr(self, name)[part].copy() for name in ("lowest", "place", "ground", "floor")},
+            **{
+                name: getattr(self, name)[part].copy()
+                for name in ("lowest", "place", "ground", "floor")
+            },
         )
 
 
 class Planes(NamedTuple):
     """Of blocks of 2 x 2 cells."""
 
-    values: np.ndarray  #: (h, w, 3) at their centers: height, gradient per cell; NaN where nothing is known
+    values: (
+        np.ndarray
+    )  #: (h, w, 3) at their centers: height, gradient per cell; NaN where nothing is known
     left: int  #: number of the first column
     bottom: int  #: of the first row
 
@@ -180,11 +185,17 @@ def _coarsest(moments, size, steep, planes):
             if n < _MEASURED * 4.0 * size * size:
                 continue
             stiff = _STIFFNESS * size * size
-            xx, yy, xy = sums[3] / n - x * x + stiff, sums[5] / n - y * y + stiff, sums[4] / n - x * y
+            xx, yy, xy = (
+                sums[3] / n - x * x + stiff,
+                sums[5] / n - y * y + stiff,
+                sums[4] / n - x * y,
+            )
             xz, yz = sums[7] / n - x * z, sums[8] / n - y * z
             determinant = xx * yy - xy * xy
             gx, gy = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-            if np.sqrt(gx * gx + gy * gy) >= steep and gx * xz + gy * yz >= _PLANE * (sums[9] / n - z * z):
+            if np.sqrt(gx * gx + gy * gy) >= steep and gx * xz + gy * yz >= _PLANE * (
+                sums[9] / n - z * z
+            ):
                 planes[j, i, 0] = z - gx * x - gy * y
                 planes[j, i, 1], planes[j, i, 2] = gx, gy
 
@@ -265,7 +276,10 @@ def planes_of_blocks(raster: GroundRaster, levels: int, steep: float = np.inf) -
 
 
 def surface(
-    raster: GroundRaster, levels: int, needed: NDArray[np.bool_], planes: NDArray[np.float64] | None = None
+    raster: GroundRaster,
+    levels: int,
+    needed: NDArray[np.bool_],
+    planes: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
 

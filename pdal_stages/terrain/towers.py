@@ -43,7 +43,17 @@ APART = (3, 15)
 #: How far round an axis its points lie: a pole's, those that were taken for a wire's, and those of its arms; a tower's at
 #: the top, and so much more at its foot per meter of height; arms beyond the outermost wire, and along the wires; how far
 #: above these, meters, and of a tower's height, as wires hang from long insulators.
-STEM, OWN, POLE_ARM, TOP, SPREAD, BESIDE, ALONG, OVER, ABOVE = 0.8, 0.3, 2.2, 1.5, 0.12, 1.5, 2.5, 4.0, 0.3
+STEM, OWN, POLE_ARM, TOP, SPREAD, BESIDE, ALONG, OVER, ABOVE = (
+    0.8,
+    0.3,
+    2.2,
+    1.5,
+    0.12,
+    1.5,
+    2.5,
+    4.0,
+    0.3,
+)
 #: How far away wires and points matter, meters.
 REACH = AT_TOWER * WIDEST + BESIDE + APART[1] + FAR + PIECE + 4.0
 _PARTS = 1 << 16
@@ -66,7 +76,10 @@ class Cloud(NamedTuple):
 
 
 def find_towers(
-    xyz: NDArray[np.float64], height: NDArray[np.float64], wire: NDArray[np.bool_], use: NDArray[np.bool_]
+    xyz: NDArray[np.float64],
+    height: NDArray[np.float64],
+    wire: NDArray[np.bool_],
+    use: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Points (n,) of towers and poles: coordinates (n, 3) and heights above ground in meters, finite; which are of wires.
 
@@ -97,7 +110,9 @@ def find_towers(
     return out
 
 
-def _near(column: NDArray[np.int64], row: NDArray[np.int64], wires: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _near(
+    column: NDArray[np.int64], row: NDArray[np.int64], wires: NDArray[np.int64]
+) -> NDArray[np.bool_]:
     """Points in blocks at wires, and in those around."""
     side = int(AT_TOWER * WIDEST + BESIDE) + BODY[1] + CLEAR
     key = keys_of(column // side, row // side)
@@ -128,7 +143,9 @@ def _axes(cloud):
     top, there = np.full((cloud.h, cloud.w), -1.0), np.zeros((cloud.h, cloud.w), np.bool_)
     for p in range(len(cloud.x)):
         if cloud.wire[p]:
-            top[cloud.row[p], cloud.column[p]] = max(top[cloud.row[p], cloud.column[p]], cloud.height[p])
+            top[cloud.row[p], cloud.column[p]] = max(
+                top[cloud.row[p], cloud.column[p]], cloud.height[p]
+            )
         else:
             there[cloud.row[p], cloud.column[p]] = True
     out, n = np.empty((64, 9)), 0
@@ -136,7 +153,9 @@ def _axes(cloud):
         for i in range(cloud.w):
             for tall in range(2 if there[j, i] else 0):
                 reach = AT_TOWER if tall else AT_POLE
-                high = top[max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1].max()
+                high = top[
+                    max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1
+                ].max()
                 if high < (HIGH_WIRE if tall else LOW_WIRE) or high >= _HIGHEST:
                     continue
                 half = _half_width(cloud, j, i, high) if tall else SLIM
@@ -296,4 +315,6 @@ def _mark(cloud, j, i, tall, high, score, x, y, turn, half, out):
                 out[p] |= far <= (TOP + SPREAD * max(high - height, 0.0)) * size
                 out[p] |= height >= low - 1.5 and along <= ALONG * size and aside <= widest + BESIDE
             elif arms and height <= high + over:
-                out[p] |= far <= STEM or (height >= low - 1.0 and along <= STEM and aside <= POLE_ARM)
+                out[p] |= far <= STEM or (
+                    height >= low - 1.0 and along <= STEM and aside <= POLE_ARM
+                )

@@ -109,7 +109,11 @@ def surfaces(z, start, h, w):
                 kind[n] = ROUGH
                 if not _closed(z, start, h, w, j, i, n):
                     continue
-                for steep, (around, least, rough) in ((LEVEL, _WIDE), (LEVEL, _NARROW), (STEEP, _WIDE)):
+                for steep, (around, least, rough) in (
+                    (LEVEL, _WIDE),
+                    (LEVEL, _NARROW),
+                    (STEEP, _WIDE),
+                ):
                     slope, scatter = _fit(z, start, h, w, j, i, n, steep, around, least)
                     aslant = 1.0 + slope * slope if steep > LEVEL else 1.0
                     if 0.0 <= slope <= steep and scatter <= rough * rough * aslant:

@@ -242,8 +242,14 @@ def _seen_through(place, cells, w, good, line, x, y, z, begin, on):
         for b in range(j - _MARGIN, j + _MARGIN + 1):
             for a in range(i - _MARGIN, i + _MARGIN + 1):
                 for p in range(begin[b * w + a], begin[b * w + a + 1]):
-                    dx, dy = (a - i) * CELL + x[p] - place[n, 0], (b - j) * CELL + y[p] - place[n, 1]
-                    along, aside = dx * line[n, 0] + dy * line[n, 1], dy * line[n, 0] - dx * line[n, 1]
+                    dx, dy = (
+                        (a - i) * CELL + x[p] - place[n, 0],
+                        (b - j) * CELL + y[p] - place[n, 1],
+                    )
+                    along, aside = (
+                        dx * line[n, 0] + dy * line[n, 1],
+                        dy * line[n, 0] - dx * line[n, 1],
+                    )
                     if abs(along) > HALF or abs(aside) > STRIP_TO:
                         continue
                     above = z[p] - place[n, 2] - line[n, 2] * along
@@ -273,7 +279,10 @@ def _on_lines(place, cells, start, h, w, good, line):
                         (a - i) * CELL + place[m, 0] - place[n, 0],
                         (b - j) * CELL + place[m, 1] - place[n, 1],
                     )
-                    along, aside = dx * line[n, 0] + dy * line[n, 1], dy * line[n, 0] - dx * line[n, 1]
+                    along, aside = (
+                        dx * line[n, 0] + dy * line[n, 1],
+                        dy * line[n, 0] - dx * line[n, 1],
+                    )
                     above = place[m, 2] - place[n, 2] - line[n, 2] * along
                     away = abs(along)
                     if away > HALF or abs(aside) > BESIDE or abs(above) > NEAR + 0.02 * away:

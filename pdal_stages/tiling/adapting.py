@@ -67,7 +67,9 @@ def adapt(
     chosen, told = spread(files)
     with work_folder(model) as folder:
         request = ClassifyRequest(teacher, dimensions=("Reliability",))
-        classified = _classified(ClassifyTask(tuple(chosen), f"{folder}/classified/", request, options))
+        classified = _classified(
+            ClassifyTask(tuple(chosen), f"{folder}/classified/", request, options)
+        )
         found = sure_points(classified, sure, known.codes.tolist())
         codes = [code for code, count in found.items() if count >= FEWEST]
         if len(codes) < 2:
@@ -86,7 +88,10 @@ def adapt(
         }
         made = str(folder / "adapted.model")
         TrainTask(classified, made, (), given, options).run()
-        new, of = load_model(made), {"name": Path(teacher).stem, "sha256": digest_of(teacher), "sure": sure}
+        new, of = (
+            load_model(made),
+            {"name": Path(teacher).stem, "sha256": digest_of(teacher), "sure": sure},
+        )
         replace(new, info={**new.info, "teacher": of}).save(model)
     missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
     if missing:

@@ -51,7 +51,9 @@ class ClassifyTask:
     def in_one_piece(self) -> bool:
         """Whether there is one input that fits into memory, and no option asks for tiles."""
         options = self.options
-        asked = options.tile is not None or options.per != "auto" or options.scheduler or options.resume
+        asked = (
+            options.tile is not None or options.per != "auto" or options.scheduler or options.resume
+        )
         if len(self.files) > 1 or asked or any(one.what == "report" for one in self.extra_files):
             return False
         if not is_las(self.files[0]):
@@ -83,7 +85,9 @@ class ClassifyTask:
                         folder.mkdir(exist_ok=True)
                     except OSError as error:
                         found = f"{folder}: {error.strerror}"
-                        raise StageError("the output folder cannot be created", found=found) from None
+                        raise StageError(
+                            "the output folder cannot be created", found=found
+                        ) from None
                     made.append(folder)
             yield
         finally:
@@ -108,7 +112,9 @@ class ClassifyTask:
         classes = codes[-1] if codes else {}
         return Written(target, count, classes, pipeline.left_alone, messages, pipeline.metadata)
 
-    def run_tiles(self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None) -> TiledRun:
+    def run_tiles(
+        self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None
+    ) -> TiledRun:
         """Classify all inputs in tiles; `finished` is called with every output that was written."""
         from .inputs import one_format
         from .plan import plan_of_files
@@ -134,11 +140,15 @@ class ClassifyTask:
         alike = one_format(self.files) if self._per_tile else {}
         writer = {**writer_of(named), "filename": target, **alike}
         stages = [*self.request.stages, writer]
-        plan, source = plan_of_files(self.files, stages, self.request.overrides, self.options.buffer)
+        plan, source = plan_of_files(
+            self.files, stages, self.request.overrides, self.options.buffer
+        )
         extra_dims = self.request.extra_dims
         plan = replace(
             plan,
-            creates=["Classification", *extra_dims] if len(plan.tail) == 1 and plan.creates else plan.creates,
+            creates=["Classification", *extra_dims]
+            if len(plan.tail) == 1 and plan.creates
+            else plan.creates,
             makes=extra_dims,
             extra_dims=extra_dims,
             name=self.request.model,

@@ -45,7 +45,9 @@ class Cluster(contextlib.AbstractContextManager):
         if not threads:
             self._client.close()
             raise StageError(
-                "the scheduler has no workers", found=self.address, cure="Start dask worker on some hosts"
+                "the scheduler has no workers",
+                found=self.address,
+                cure="Start dask worker on some hosts",
             )
         # One tile at a time in a process; what Dask calls its threads are the cores it may use.
         self.slots, self.threads = len(threads), max(1, min(threads.values()))

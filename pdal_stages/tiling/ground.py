@@ -31,7 +31,9 @@ class FromBefore(NamedTuple):
     """Results of the first round for a tile."""
 
     blocks: Any  #: for the far-reaching stage
-    changed: list[Changed]  #: for each piece: rows and new values of dimensions, from the stages before it
+    changed: list[
+        Changed
+    ]  #: for each piece: rows and new values of dimensions, from the stages before it
 
 
 def left_name(tile: str) -> str:
@@ -50,7 +52,9 @@ def stage_of(plan: TilePlan) -> HagMorphological:
     return cast(HagMorphological, stage_from(plan.head[plan.first.at]))
 
 
-def make_block(plan: TilePlan, block: tuple[int, int], tiles: Sequence[str], target: str) -> dict[str, Any]:
+def make_block(
+    plan: TilePlan, block: tuple[int, int], tiles: Sequence[str], target: str
+) -> dict[str, Any]:
     """Save a block of the raster, computed from the first round's files of the tiles around it; returns a record."""
     assert plan.first is not None
     blocks = plan.first.blocks
@@ -65,7 +69,9 @@ def make_block(plan: TilePlan, block: tuple[int, int], tiles: Sequence[str], tar
     return {"outputs": written([target])}
 
 
-def blocks_around(context: RunContext, tile: tuple[int, int], around_m: float) -> list[tuple[int, int]]:
+def blocks_around(
+    context: RunContext, tile: tuple[int, int], around_m: float
+) -> list[tuple[int, int]]:
     """The blocks that a tile touches with so many meters around it."""
     assert context.plan.first is not None
     box = _box_m(context, tile, around_m)
@@ -77,7 +83,9 @@ def _box_m(context: RunContext, tile: tuple[int, int], around_m: float) -> Box:
     return (x0 - around_m, y0 - around_m, x1 + around_m, y1 + around_m)
 
 
-def from_before(context: RunContext, tile: tuple[int, int], read_m: float, cuts: list[Piece]) -> FromBefore:
+def from_before(
+    context: RunContext, tile: tuple[int, int], read_m: float, cuts: list[Piece]
+) -> FromBefore:
     """The results of the earlier rounds for a tile that is read with so many meters around it."""
     first = context.plan.first
     assert first is not None
@@ -86,7 +94,9 @@ def from_before(context: RunContext, tile: tuple[int, int], read_m: float, cuts:
     blocks = map(block_name, blocks_around(context, tile, around))
     stage = stage_of(context.plan)
     needed = stage.needed_of_blocks(box)
-    found = (load_arrays(path, needed) for path in _there(context.rasters, blocks))  # others have no points
+    found = (
+        load_arrays(path, needed) for path in _there(context.rasters, blocks)
+    )  # others have no points
     tiles = context.grid.covering(context.grid.box(tile, read_m / context.unit))
     left = _there(context.rasters, [left_name(context.grid.name(each)) for each in tiles])
     changed = [_changed(first.kept or (), left, piece) for piece in cuts]

@@ -49,7 +49,11 @@ class InputSource:
     def within(self, box: Box) -> dict[str, Any]:
         """The reader of an EPT source, restricted to a box."""
         x0, y0, x1, y1 = box
-        return {**self.reader, "filename": self.path, "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])"}
+        return {
+            **self.reader,
+            "filename": self.path,
+            "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])",
+        }
 
 
 def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
@@ -151,7 +155,9 @@ class CloudIndex:
     count: int
     box: Box  #: of all points
     tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
-    cells: NDArray[np.int64]  #: (n, 4): column, row, index of the first point in the copy, number of points
+    cells: NDArray[
+        np.int64
+    ]  #: (n, 4): column, row, index of the first point in the copy, number of points
     copy: str  #: the file with the points
 
     @classmethod
@@ -174,7 +180,9 @@ class Survey:
         self.messages = list(plan.messages)
         self.unreadable: dict[str, str] = {}  #: unreadable inputs by path, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
-        self.indexes: dict[str, CloudIndex] = {}  #: of LAS and LAZ files by path, once they were read
+        self.indexes: dict[
+            str, CloudIndex
+        ] = {}  #: of LAS and LAZ files by path, once they were read
         self.sources = find_sources(plan.readers)
         self.paths = [source.path for source in self.sources]
         others = named_files([*plan.head, *plan.tail])
@@ -196,7 +204,9 @@ class Survey:
         self.block_bytes = (
             block_bytes(plan.first.blocks, self.density.area * self.unit**2) if plan.first else 0.0
         )
-        self.options = settled(options, self.density, self.halo_units, self.per == "file", self.block_bytes)
+        self.options = settled(
+            options, self.density, self.halo_units, self.per == "file", self.block_bytes
+        )
         assert self.options.tile is not None
         self.grid = TileGrid(self.options.tile)
 
@@ -207,7 +217,9 @@ class Survey:
                 self.extents[source.path] = read_extent(source)
                 if any("\ud800" <= character <= "\udfff" for character in source.path):
                     raise StageError(
-                        "the name of the file is not UTF-8", where=source.path, cure="Rename the file"
+                        "the name of the file is not UTF-8",
+                        where=source.path,
+                        cure="Rename the file",
                     )
                 if source.kind == "las":
                     las.check_texts(source.path)
@@ -260,7 +272,9 @@ class Survey:
 
     def place(self) -> None:
         """Collect the boxes of inputs from headers or indexes, as an array for fast comparison."""
-        self.placed = [s for s in self.sources if s.path in self.extents and self.extents[s.path].count]
+        self.placed = [
+            s for s in self.sources if s.path in self.extents and self.extents[s.path].count
+        ]
         boxes = []
         for source in self.placed:
             index = self.indexes.get(source.path)
@@ -346,7 +360,9 @@ def one_format(paths: Sequence[str]) -> dict[str, Any]:
             if is_ept(path):
                 form = ept_form(read_ept(path))
                 formats.add(form["dataformat_id"])
-                places.add(tuple(form[f"{what}_{axis}"] for what in ("scale", "offset") for axis in "xyz"))
+                places.add(
+                    tuple(form[f"{what}_{axis}"] for what in ("scale", "offset") for axis in "xyz")
+                )
             elif is_las(path) and (header := las.read_header(path)) and header.count:
                 formats.add(header.point_format)
                 places.add((*header.scales, *header.offsets))

@@ -73,7 +73,9 @@ def objects_of_files(
             "version": __version__,
             "inputs": inputs,
             "files": files,
-            "settings": {one.name: getattr(found.settings, one.name) for one in fields(ObjectSettings)},
+            "settings": {
+                one.name: getattr(found.settings, one.name) for one in fields(ObjectSettings)
+            },
             "objects": summary,
             "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
@@ -94,7 +96,9 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
     return stage
 
 
-def _find_in_files(inputs: Sequence[str], stage: ObjectsWriter, workers: int) -> tuple[Objects, Units, str]:
+def _find_in_files(
+    inputs: Sequence[str], stage: ObjectsWriter, workers: int
+) -> tuple[Objects, Units, str]:
     """The objects of all files together; the units of the coordinates and their reference (WKT)."""
     references = {path: reference_of_file(path, stage.horizontal_unit) for path in inputs}
     print_messages(*check_one_reference(references))

@@ -91,7 +91,9 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
     return content
 
 
-def read_results(tiles: Iterable[str], source: InputSource, count: int, start: int, end: int) -> NewValues:
+def read_results(
+    tiles: Iterable[str], source: InputSource, count: int, start: int, end: int
+) -> NewValues:
     """The results of points `start` to `end` of a file with `count` points, from the files of its tiles.
 
     StageError where these do not contain each of the file's points once.
@@ -108,7 +110,9 @@ def read_results(tiles: Iterable[str], source: InputSource, count: int, start: i
         first, last = np.searchsorted(index, (start, end))
         mine = index[first:last] - start
         if (index.size and index[-1] >= count) or kept[mine].any():
-            raise StageError("internal: two tiles hold the same point", where=source.path, found=name)
+            raise StageError(
+                "internal: two tiles hold the same point", where=source.path, found=name
+            )
         kept[mine] = True
         for dimension, column in arrays.items():
             if dimension.startswith("dim/"):
@@ -151,7 +155,9 @@ def run_tail(
     def finish(made: Path, final: Path, number: int) -> None:
         if not Path(scratch).is_dir():  # the run was killed, and another one may be writing here
             raise StageError("the run that this belonged to has ended", found=scratch)
-        check_complete(made, final, writers[number], None if "where" in writers[number] else run.count)
+        check_complete(
+            made, final, writers[number], None if "where" in writers[number] else run.count
+        )
         las.supersede_copc(made)
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
@@ -163,7 +169,9 @@ def run_tail(
         for stage in tail:
             stage = {k: v for k, v in stage.items() if k != "inputs"}
             if stage["type"].startswith("writers."):
-                stage = las_output.uncompressed_writer({**stage, "filename": str(next(waiting))}, readers)
+                stage = las_output.uncompressed_writer(
+                    {**stage, "filename": str(next(waiting))}, readers
+                )
             stages.append(stage)
         run = pdal_env.execute(stages, arrays=False)
         las_output.compress(partials)
@@ -183,12 +191,16 @@ def read_with(
         holds_flags = flags_in_classes(reader["filename"])
         stages += [{**reader, "tag": f"in{number}"}, *_put(callbacks, values, number, holds_flags)]
         if flags and flags[number]:
-            stages.append(las_output.flag_splitter([True], inputs=[stages[-1]["tag"]], tag=f"split{number}"))
+            stages.append(
+                las_output.flag_splitter([True], inputs=[stages[-1]["tag"]], tag=f"split{number}")
+            )
         last.append(stages[-1]["tag"])
     return stages, last
 
 
-def _put(callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool) -> Iterator[dict[str, Any]]:
+def _put(
+    callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool
+) -> Iterator[dict[str, Any]]:
     """Filters that set new values of a reader's points, and drop some; PDAL needs two filters for this."""
 
     def put(module, ins, outs) -> None:
@@ -222,18 +234,27 @@ def with_dimensions(
 
 
 def write_file(
-    plan: TilePlan, source: InputSource, count: int, results: list[str], outputs: list[str], scratch: str
+    plan: TilePlan,
+    source: InputSource,
+    count: int,
+    results: list[str],
+    outputs: list[str],
+    scratch: str,
 ) -> dict[str, Any]:
     """Write the outputs of an input file of `count` points from the results of its tiles; the record, with class counts."""
     tail = with_dimensions(plan.tail, plan.extra_dims, [source.path])
     writer, names = plan.writers[0], [Path(path).suffix.lower() for path in outputs]
     plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())
-    if count > MOST_AT_ONCE and plain and names in ([".las"], [".laz"]):  # all parts have the same header
+    if (
+        count > MOST_AT_ONCE and plain and names in ([".las"], [".laz"])
+    ):  # all parts have the same header
         return _in_parts(source, count, results, tail, outputs, scratch)
     new = read_results(results, source, count, 0, count)
     if not count:  # no tile has results, so the dimensions come from the plan
         types = plan.makes.items()
-        new = NewValues(new.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types})
+        new = NewValues(
+            new.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types}
+        )
     reader = {**source.reader, "filename": source.path}
     return run_tail([reader], [new], tail, outputs, scratch) | {"classes": _classes(new)}
 
@@ -272,7 +293,9 @@ def _in_parts(
                     how = {"header": made.header, "do_compress": partial.suffix.lower() == ".laz"}
                     out = stack.enter_context(laspy.open(partial, mode="w", **how))
                 elif [*made.header.offsets] != [*out.header.offsets]:
-                    raise StageError("internal: parts of a file have different offsets", found=str(partial))
+                    raise StageError(
+                        "internal: parts of a file have different offsets", found=str(partial)
+                    )
                 for chunk in made.chunk_iterator(BLOCK):
                     out.write_points(chunk)
                 count += int(made.header.point_count)
@@ -298,6 +321,8 @@ def write_tile(
         return {"outputs": []}
     if plan.takes is not None:
         return plan.takes(mine, outputs, scratch)
-    tail = with_dimensions(plan.tail, plan.extra_dims, [result.piece.source.path for result in mine])
+    tail = with_dimensions(
+        plan.tail, plan.extra_dims, [result.piece.source.path for result in mine]
+    )
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in mine]
     return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, scratch)

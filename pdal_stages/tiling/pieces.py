@@ -24,7 +24,9 @@ from ..terrain.cells import refuse_scattered
 from .grid import Box, TileGrid, check_number
 from .inputs import CloudIndex, IndexedSource, InputSource, fetch_ept
 
-if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
+if (
+    TYPE_CHECKING
+):  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
     import laspy
 
 #: Points of a block, as many as in a LAZ chunk.
@@ -100,17 +102,22 @@ def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
     return np.column_stack([squares, points.astype(np.int64)])
 
 
-def coordinates(records: NDArray, header: laspy.LasHeader) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def coordinates(
+    records: NDArray, header: laspy.LasHeader
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """x and y of records."""
     x, y = (records[name] * header.scales[k] + header.offsets[k] for k, name in enumerate("XY"))
     return x, y
 
 
-def points_near(path: str, index: CloudIndex, grid: TileGrid, box: Box) -> tuple[NDArray[np.int64], NDArray]:
+def points_near(
+    path: str, index: CloudIndex, grid: TileGrid, box: Box
+) -> tuple[NDArray[np.int64], NDArray]:
     """Numbers, ascending, and records of the points of a file that lie in a box, edges included."""
     header = header_of(path)
     (i0, j0), (i1, j1) = (
-        TileGrid(grid.size / _CELLS).index(np.array(corner)).tolist() for corner in (box[:2], box[2:])
+        TileGrid(grid.size / _CELLS).index(np.array(corner)).tolist()
+        for corner in (box[:2], box[2:])
     )
     i, j = index.cells[:, 0], index.cells[:, 1]
     near = index.cells[(i >= i0) & (i <= i1) & (j >= j0) & (j <= j1)]

@@ -105,7 +105,11 @@ class _Step:
     @property
     def rank(self) -> int:
         """0 for readers, 1 for filters and all of ours, 2 for writers."""
-        return {"readers": 0, "writers": 2}.get(self.type.partition(".")[0], 1) if self.ours is None else 1
+        return (
+            {"readers": 0, "writers": 2}.get(self.type.partition(".")[0], 1)
+            if self.ours is None
+            else 1
+        )
 
     @property
     def sees_neighbors(self) -> bool:
@@ -185,7 +189,9 @@ def plan_of_files(
     return plan, pipeline.source
 
 
-def _first_round(readers: list[_Step], head: list[_Step], reaches: list[float]) -> FirstRound | None:
+def _first_round(
+    readers: list[_Step], head: list[_Step], reaches: list[float]
+) -> FirstRound | None:
     """Find the far-reaching stage whose raster is computed first; it then needs no halo."""
     for at, step in enumerate(head):
         if isinstance(step.ours, HagMorphological):
@@ -236,7 +242,9 @@ def _check_linear(steps: list[_Step]) -> None:
 def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]) -> None:
     if not readers:
         raise PipelineError("the pipeline has no reader, so there is nothing to cut into tiles")
-    if not writers and not any(step.ours is not None and step.ours.instead_of_tiles for step in filters):
+    if not writers and not any(
+        step.ours is not None and step.ours.instead_of_tiles for step in filters
+    ):
         cure = "End it with a file name, e.g. classified_#.laz"
         raise PipelineError("the pipeline has no writer", cure=cure)
     for step in writers:
@@ -291,19 +299,27 @@ def _for_workers(step: _Step) -> dict[str, Any]:
     if ours is not None:
         for option in ours.all_options():
             name = stage.get(option.name)
-            if name and (option.kind == "filename" or (option.kind == "model" and name not in shipped())):
+            if name and (
+                option.kind == "filename" or (option.kind == "model" and name not in shipped())
+            ):
                 stage[option.name] = str(Path(stage[option.name]).absolute())
     return stage
 
 
-def outputs_for(plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None) -> list[list[str]]:
+def outputs_for(
+    plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None
+) -> list[list[str]]:
     """For every input, or every tile by name, the output of each writer; StageError where it cannot be written."""
     found = []
     for writer in plan.writers:
         name = os.path.abspath(writer["filename"])
         found.append(outputs_of(inputs, name) if tiles is None else named_outputs(name, tiles))
     kinds = [LAS if writes_las(writer) else "" for writer in plan.writers]
-    every = [Output(path, "output", kind) for kind, paths in zip(kinds, found, strict=True) for path in paths]
+    every = [
+        Output(path, "output", kind)
+        for kind, paths in zip(kinds, found, strict=True)
+        for path in paths
+    ]
     # Missing folders will be created; a dry run checks the others.
     check_outputs([output for output in every if Path(output.path).parent.is_dir()], inputs)
     return [list(each) for each in zip(*found, strict=True)]

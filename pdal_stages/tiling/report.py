@@ -75,7 +75,9 @@ class TiledRun:
     changed: list[str]  #: files that changed during the run
     messages: list[str]  #: what the user should know
     summary: dict[str, Any]  #: figures for people; see :meth:`to_dict`
-    objects: dict[str, Any] | None = None  #: objects of the outputs: their files, and counts by kind
+    objects: dict[str, Any] | None = (
+        None  #: objects of the outputs: their files, and counts by kind
+    )
 
     @property
     def failures(self) -> list[tuple[str, str]]:
@@ -83,14 +85,23 @@ class TiledRun:
         jobs = [(f"tile {job.name}", job) for job in self.tiles]
         jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
         return [
-            *((p, why.removeprefix(f"{p}: ") + self._blocked_by(p)) for p, why in self.unreadable.items()),
+            *(
+                (p, why.removeprefix(f"{p}: ") + self._blocked_by(p))
+                for p, why in self.unreadable.items()
+            ),
             *((path, _CHANGED) for path in self.changed),
-            *((what, job.reason) for what, job in jobs if job.state == "failed" and not job.blocked_by),
+            *(
+                (what, job.reason)
+                for what, job in jobs
+                if job.state == "failed" and not job.blocked_by
+            ),
         ]
 
     def _blocked_by(self, path: str) -> str:
         """A remark on the jobs that depend on an unreadable input."""
-        tiles, outputs = (sum(j.blocked_by == path for j in jobs) for jobs in (self.tiles, self.outputs))
+        tiles, outputs = (
+            sum(j.blocked_by == path for j in jobs) for jobs in (self.tiles, self.outputs)
+        )
         if not tiles and not outputs:
             return ""
         return (
@@ -108,7 +119,11 @@ class TiledRun:
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
                 {"name": j.name, "tile": list(j.tile), "state": j.state, "points": j.points}
-                | {k: v for k, v in j.record.items() if k != "fingerprint" and (k != "outputs" or j.outputs)}
+                | {
+                    k: v
+                    for k, v in j.record.items()
+                    if k != "fingerprint" and (k != "outputs" or j.outputs)
+                }
                 | ({"reason": j.reason} if j.reason else {})
                 for j in self.tiles
             ],

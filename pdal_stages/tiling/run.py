@@ -107,7 +107,9 @@ def run_plan(
     if dry_run:
         return estimate(plan, survey)
     if not folder.is_dir():
-        raise StageError("the folder of the output does not exist", found=str(folder), cure="Create it first")
+        raise StageError(
+            "the folder of the output does not exist", found=str(folder), cure="Create it first"
+        )
     if plan.makes and progress is not False and not chosen.scheduler and not kept_kernels():
         print_messages("compiling for this processor first, once: it takes a minute or two")
     folders = {folder, *(Path(path).parent for paths in survey.outputs for path in paths)}
@@ -132,7 +134,10 @@ def run_plan(
         finally:
             for each in (*folders, store.kept):
                 sweep(each)  # left by workers that were killed
-    summary = survey.figures(plan) | {"workers": workers.slots, "threads_per_worker": workers.threads}
+    summary = survey.figures(plan) | {
+        "workers": workers.slots,
+        "threads_per_worker": workers.threads,
+    }
     summary |= summarize(run.tiles, run.cpu_seconds, time.monotonic() - started)
     summary["peak_mb_of_a_worker"] = run.peak_mb
     messages = survey.messages + messages_of(run.tiles, run.messages_before, chosen.most_points)
@@ -167,8 +172,16 @@ def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> No
 class _Run:
     """The state of a run: jobs that are to be done, and that are done."""
 
-    def __init__(self, plan: TilePlan, survey: Survey, store: Store, workers: Any, show: bool | None) -> None:
-        self.plan, self.survey, self.store, self.workers, self.show = plan, survey, store, workers, show
+    def __init__(
+        self, plan: TilePlan, survey: Survey, store: Store, workers: Any, show: bool | None
+    ) -> None:
+        self.plan, self.survey, self.store, self.workers, self.show = (
+            plan,
+            survey,
+            store,
+            workers,
+            show,
+        )
         self.tiles: list[Job] = []  #: with points of their own, row by row
         self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
         self.cpu_seconds = 0.0  #: of tasks, including failed ones
@@ -279,7 +292,9 @@ class _Run:
         )
         for tile, points in survey.tiles().items():
             job = Job(grid.name(tile), points, tile)
-            job.mark = fingerprint(common, tile, survey.seen(survey.near(tile, max(sees, self.farthest))))
+            job.mark = fingerprint(
+                common, tile, survey.seen(survey.near(tile, max(sees, self.farthest)))
+            )
             if bad := [s.path for s in survey.near(tile, sees) if s.path in survey.unreadable]:
                 job.fail(f"an input here cannot be read: {bad[0]}", bad[0])
             self.tiles.append(job)
@@ -293,7 +308,9 @@ class _Run:
             out = Job(f"file-{source.key}", source=source, outputs=paths)
             if index := survey.indexes.get(source.path):
                 out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
-            out.mark = fingerprint(survey.seen([source]), tail, [job.mark for job in out.jobs], paths)
+            out.mark = fingerprint(
+                survey.seen([source]), tail, [job.mark for job in out.jobs], paths
+            )
             if source.path in survey.unreadable:
                 out.fail(f"its input cannot be read: {source.path}", source.path)
             self.outputs.append(out)
@@ -305,7 +322,10 @@ class _Run:
         for job in self.tiles:
             if job.state == "waiting" and job.outputs is None and job.name not in needed:
                 known = self.store.note(job.name)
-                job.state, job.record = "kept", known if known.get("fingerprint") == job.mark else {}
+                job.state, job.record = (
+                    "kept",
+                    known if known.get("fingerprint") == job.mark else {},
+                )
 
     def _unkept(self, jobs: Iterable[Job]) -> deque[Job]:
         """The waiting jobs that no earlier run has finished."""
@@ -341,24 +361,37 @@ class _Run:
                 results = [store.path(each.name) for each in job.jobs]
                 assert job.outputs is not None
                 plan, scratch = context.plan, context.scratch
-                return partial(write_file, plan, job.source, job.points, results, job.outputs, scratch)
+                return partial(
+                    write_file, plan, job.source, job.points, results, job.outputs, scratch
+                )
             sources = survey.near(job.tile, self.farthest)
-            complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
+            complete = (
+                math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
+            )
             given = survey.readable(sources)
             result = store.path(job.name)
             return partial(run_tile, context, job.tile, given, complete, result, job.outputs)
 
         for job in self._do("tiles", waiting, task_of):
-            if finished is not None and job.state == "done" and job.outputs and job.record["outputs"]:
+            if (
+                finished is not None
+                and job.state == "done"
+                and job.outputs
+                and job.record["outputs"]
+            ):
                 finished(job)
             for out in users.get(job.name, ()):
                 _make_ready(out, waiting)
 
     def forget(self) -> None:
         """Remove files that no job needs any more."""
-        needed = {f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs}
+        needed = {
+            f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs
+        }
         if any(job.state == "failed" for job in self.tiles):
-            needed |= {path.name for path in self.store.kept.glob("*.[bf]*.npz")}  # blocks and first rounds
+            needed |= {
+                path.name for path in self.store.kept.glob("*.[bf]*.npz")
+            }  # blocks and first rounds
         self.store.remove(".npz", needed)
         self.store.remove(".points")
 
@@ -388,13 +421,23 @@ class _Run:
             for block in near.keys() & blocks_around(context, tile, first.blocks.reach):
                 near[block].append(tile)
         head = self.plan.head[: first.at + 1]
-        common = [build(), head, survey.stamps_of(head), survey.grid.size, first.halo_m, unit, first.kept]
+        common = [
+            build(),
+            head,
+            survey.stamps_of(head),
+            survey.grid.size,
+            first.halo_m,
+            unit,
+            first.kept,
+        ]
 
         def sources(tile: tuple[int, int]) -> list[IndexedSource]:
             return survey.readable(survey.near(tile, first.halo_m / unit))
 
         def first_task(job: Job) -> Callable[[], Any]:
-            return partial(run_first_round, context, job.tile, sources(job.tile), store.path(job.name))
+            return partial(
+                run_first_round, context, job.tile, sources(job.tile), store.path(job.name)
+            )
 
         firsts: dict[tuple[int, int], Job] = {}
         for tile in sorted({tile for tiles in near.values() for tile in tiles}):

@@ -29,7 +29,9 @@ PARENT = 350 << 20
 #: Most points of a tile of automatic size: a failed tile is lost, and progress is counted in tiles.
 _MOST_OF_A_TILE = 3_000_000
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 800,000.
-_SIDES = [mantissa * 10**power for power in range(6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)]
+_SIDES = [
+    mantissa * 10**power for power in range(6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+]
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,11 @@ class TilingOptions:
             checks.whole("--memory", self.memory, 1, unit="bytes")
         if self.workers is not None:
             checks.whole("--workers", self.workers, 0, available_threads(), unit="cores")
-        if self.scheduler and "inproc" not in self.scheduler and not re.search(r":\d+$", self.scheduler):
+        if (
+            self.scheduler
+            and "inproc" not in self.scheduler
+            and not re.search(r":\d+$", self.scheduler)
+        ):
             raise OptionError(
                 "--scheduler needs an address with its port",
                 found=self.scheduler,
@@ -166,7 +172,9 @@ def settled(
             side = max([each for each in fitting if each <= few] or fitting[:1])
         # Most of a small tile is halo, which costs as much: rather fewer workers.
         if side >= halo_units or side == sides[-1] or fixed or workers == 1:
-            return replace(options, tile=side, workers=options.workers if options.scheduler else workers)
+            return replace(
+                options, tile=side, workers=options.workers if options.scheduler else workers
+            )
     if options.memory is None and options.tile is not None:
         return options  # as it was asked for
     least = needed(sides[0]) * max(1, local if fixed else 1) + (PARENT if local else 0)

@@ -147,7 +147,9 @@ def save_arrays(path: str | Path, arrays: Mapping[str, NDArray]) -> None:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def load_arrays(path: str | Path, only: Collection[str] | None = None, under: str = "") -> dict[str, NDArray]:
+def load_arrays(
+    path: str | Path, only: Collection[str] | None = None, under: str = ""
+) -> dict[str, NDArray]:
     """The arrays of a file, or those named in `only`; with `under`, those with this prefix, without it.
 
     A file that cannot be read is removed, so that a later run makes it again.

@@ -63,7 +63,9 @@ def run_head(
     needs = [0.0]
     views: list[dict[str, NDArray]] = []  # of the tile's own points only, to save memory
 
-    def reach(number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+    def reach(
+        number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
+    ) -> None:
         stage = ours[number].stage
         points = points_of(stage, module, ins)
         box = [side * points.units.horizontal for side in context.grid.box(tile)]
@@ -96,7 +98,9 @@ def run_head(
         far = next(one.stage for one in ours.values() if isinstance(one.stage, HagMorphological))
         far.from_blocks = before.blocks
     pipeline.execute(arrays=False)
-    reports = [report for _, reports in pipeline.reports for report in reports if report.beyond_halo]
+    reports = [
+        report for _, reports in pipeline.reports for report in reports if report.beyond_halo
+    ]
     if reports and not everything:
         needs += [plan.halo_m + report.reach for report in reports]
     return HeadRun(
@@ -108,7 +112,9 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     """Messages of a tile, worded the same for every tile, as a run repeats them once; none about files in `scratch`."""
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
-        if text.startswith(scratch) or NO_REFERENCE in text:  # about a piece; the input has its own message
+        if (
+            text.startswith(scratch) or NO_REFERENCE in text
+        ):  # about a piece; the input has its own message
             continue
         known = next((words for words in (TOUCH_NONE, HOLDS_NOWHERE) if words in text), "")
         lines.append(text[text.index(known) :])  # without its stage
@@ -123,7 +129,9 @@ def _marked(number: int, piece: Piece, unit: float, changed: Changed) -> NewValu
         INPUT: np.full(count, number, np.uint32),
         OUTSIDE: np.where(piece.away < 0, -1.0, piece.away * unit),
     }
-    return NewValues(np.ones(count, bool), {name: (None, values) for name, values in marks.items()} | changed)
+    return NewValues(
+        np.ones(count, bool), {name: (None, values) for name, values in marks.items()} | changed
+    )
 
 
 def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
@@ -147,8 +155,12 @@ def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceRe
                 "a stage creates new points, which belong to no input file",
                 cure="Run the pipeline without --tile",
             )
-        values = {name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names}
-        if flags_in_classes(piece.path) and "Classification" in values:  # which old PDAL reads as bits of it
+        values = {
+            name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names
+        }
+        if (
+            flags_in_classes(piece.path) and "Classification" in values
+        ):  # which old PDAL reads as bits of it
             values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
         results.append(PieceResults(piece, rows, values))
     return results
@@ -175,7 +187,9 @@ def run_first_round(
 
     before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
     head = HeadRun([])
-    with TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
+    with TemporaryDirectory(
+        prefix="first-", dir=context.scratch, ignore_cleanup_errors=True
+    ) as folder:
         cuts = cut_all(context.grid, tile, sources, first.halo_m / context.unit, folder)
         if cuts:
             head = run_head(replace(context, plan=before), tile, cuts, True, last=leave)
@@ -201,7 +215,9 @@ def run_tile(
 
     `sources` may have points in the tile or its halo; they are all inputs within `complete` meters around it.
     """
-    with TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True) as folder:
+    with TemporaryDirectory(
+        prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True
+    ) as folder:
         results, record = _settled(context, tile, sources, complete, folder)
         if outputs is not None:
             wrote = write_tile(results, context.plan, outputs, context.scratch)
@@ -254,7 +270,9 @@ def _settled(
         raise NoTerrainError(
             "no terrain: no point near the tile can be part of it", found=f"within {halo_m:.0f} m"
         )
-    classes = (one.values["Classification"] for one in head.results if "Classification" in one.values)
+    classes = (
+        one.values["Classification"] for one in head.results if "Classification" in one.values
+    )
     return head.results, {
         "points": own,
         "read": read,

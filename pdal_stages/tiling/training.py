@@ -64,15 +64,21 @@ def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, l
         name, mark, pattern = one.partition("=")
         if not (mark and name.strip() and pattern.strip()):
             raise OptionError(
-                "surveys are written NAME=PATTERN", found=one, cure="For example north='north/*.laz'"
+                "surveys are written NAME=PATTERN",
+                found=one,
+                cure="For example north='north/*.laz'",
             )
         parts = [part.strip() for part in pattern.split(",") if part.strip()]
         mine = [f for f in files if any(_like(f, part) for part in parts)]
         if not mine:
-            raise OptionError("a survey has no files", found=one, cure=f"There are {', '.join(files[:5])}")
+            raise OptionError(
+                "a survey has no files", found=one, cure=f"There are {', '.join(files[:5])}"
+            )
         for file in mine:
             if of.setdefault(file, name) != name:
-                raise OptionError("a file is in two surveys", found=f"{file}: {of[file]} and {name}")
+                raise OptionError(
+                    "a file is in two surveys", found=f"{file}: {of[file]} and {name}"
+                )
         out[name] = mine
     for file in files:
         if file not in of:
@@ -93,7 +99,9 @@ class TrainTask:
     files: Sequence[str]  #: labeled inputs
     model: str  #: the file to write
     overrides: Sequence[Override] = ()
-    given: Mapping[str, Any] = field(default_factory=dict)  #: options of ``writers.classifiermodel``
+    given: Mapping[str, Any] = field(
+        default_factory=dict
+    )  #: options of ``writers.classifiermodel``
     options: TilingOptions = field(default_factory=TilingOptions)
     #: the files of each survey, whose points are not neighbors of each other's
     surveys: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -103,7 +111,12 @@ class TrainTask:
     def _writer(self) -> dict[str, Any]:
         """The training stage as in a pipeline; several files are scored by file, unless specified otherwise."""
         files = list(self.files)
-        writer = {"type": ClassifierModel.type, "filename": self.model, "files": files, **self.given}
+        writer = {
+            "type": ClassifierModel.type,
+            "filename": self.model,
+            "files": files,
+            **self.given,
+        }
         writer = overridden(writer, self.overrides)
         told = {name: value for name in ("survey", "groups") if (value := writer.get(name))}
         if told and (self.surveys or self.survey):
@@ -119,7 +132,9 @@ class TrainTask:
     def _each(self) -> list[TrainTask]:
         """A task for each survey; this one where there are none."""
         named = self.surveys.items()
-        return [replace(self, files=files, surveys={}, survey=name) for name, files in named] or [self]
+        return [replace(self, files=files, surveys={}, survey=name) for name, files in named] or [
+            self
+        ]
 
     def _points(self) -> int:
         """The number of points of the files, from their headers."""
@@ -141,7 +156,9 @@ class TrainTask:
         if self.options.tile is not None:
             return False
         try:
-            return all(fits_whole(one._points(), self.options.memory, TRAIN_POINT) for one in self._each())
+            return all(
+                fits_whole(one._points(), self.options.memory, TRAIN_POINT) for one in self._each()
+            )
         except StageError:
             return True  # said when it is read
 
@@ -149,7 +166,9 @@ class TrainTask:
         """Train and write the model; returns messages."""
         stage = self.stage
         base = stage.training.base
-        made_by = preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+        made_by = (
+            preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+        )
         heights = [overridden(one, self.overrides) for one in made_by]
         told = [follows] if (follows := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
@@ -179,7 +198,10 @@ class TrainTask:
         if not any(map(len, pipeline.arrays)):
             raise StageError("there are no points to train on", where=", ".join(self.files[:3]))
         points = points_of_views(pipeline.arrays, pipeline.metadata, stage.points)
-        points.report.warnings += [*told, *(f"PDAL says: {line}" for line in pipeline.log_lines[:10])]
+        points.report.warnings += [
+            *told,
+            *(f"PDAL says: {line}" for line in pipeline.log_lines[:10]),
+        ]
         points.report.warnings += pipeline.messages
         return points
 
@@ -244,14 +266,18 @@ class TrainTask:
         if run.failures:
             named = "; ".join(f"{what}: {why}" for what, why in run.failures[:_NAMED])
             more = f", and {len(run.failures) - _NAMED} more" if len(run.failures) > _NAMED else ""
-            raise StageError("not all points could be read, so nothing was trained", found=named + more)
+            raise StageError(
+                "not all points could be read, so nothing was trained", found=named + more
+            )
         ignored = sum(job.record.get("ignored", 0) for job in run.tiles)
         report = Report({"points": run.summary["points"], "ignored": ignored}, list(run.messages))
         side = run.summary["tile"] * run.summary["meters_per_unit"]
         clouds: dict[float, TiledCloud] = {}
         dimensions: list[str] | None = None
         looked = (job.record["looked"] for job in run.tiles if "looked" in job.record)
-        choice = self.stage.choice(looked) or None  # what samples are drawn from, where a person checked any
+        choice = (
+            self.stage.choice(looked) or None
+        )  # what samples are drawn from, where a person checked any
         if choice:
             choice.report_to(report)
         for job in run.tiles:
@@ -259,7 +285,9 @@ class TrainTask:
                 assert job.outputs is not None
                 _check_same(job.record["dimensions"], dimensions or job.record["dimensions"])
                 dimensions = job.record["dimensions"]
-                for value, cloud in self.stage.surveys(_read_back(job.outputs[0], self.stage.named, choice)):
+                for value, cloud in self.stage.surveys(
+                    _read_back(job.outputs[0], self.stage.named, choice)
+                ):
                     if value not in clouds:
                         clouds[value] = TiledCloud(folder / f"cloud{len(clouds)}", side)
                     if self.survey:
@@ -268,7 +296,9 @@ class TrainTask:
             for path in job.outputs or ():
                 Path(path).unlink(missing_ok=True)
         if dimensions is None:
-            raise StageError("there are no points to train on", where=", ".join(self.files[:_NAMED]))
+            raise StageError(
+                "there are no points to train on", where=", ".join(self.files[:_NAMED])
+            )
         return report, [clouds[value] for value in sorted(clouds)], dimensions
 
 

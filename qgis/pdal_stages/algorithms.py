@@ -21,11 +21,15 @@ from .jobs import NOT_NOISE, class_map, plain_classes, raster, reader, writer
 
 _VECTORS = "GeoPackage (*.gpkg);;GeoJSON (*.geojson);;FlatGeobuf (*.fgb);;Shapefiles (*.shp)"
 _AREAS = "Polygons (*.gpkg *.geojson *.fgb *.shp);;All files (*)"
-_CORRECTED = "Point clouds, tables, layers (*.laz *.las *.csv *.gpkg *.geojson *.fgb *.shp);;All files (*)"
+_CORRECTED = (
+    "Point clouds, tables, layers (*.laz *.las *.csv *.gpkg *.geojson *.fgb *.shp);;All files (*)"
+)
 _MODELS = "Model files (*.model);;All files (*)"
 _PAGES = "Pages (*.html)"
 _SHOW = "Show the result on the map"
-_NO_CLOUDS = "This QGIS is built without support for LAS and LAZ files, so the point cloud is not shown: {}"
+_NO_CLOUDS = (
+    "This QGIS is built without support for LAS and LAZ files, so the point cloud is not shown: {}"
+)
 
 
 class _Showing(Algorithm):
@@ -60,7 +64,9 @@ class _Showing(Algorithm):
         return {}
 
     def add_raster(self, key, label, help, optional=True, default=True):
-        made = QgsProcessingParameterRasterDestination(key, label, optional=optional, createByDefault=default)
+        made = QgsProcessingParameterRasterDestination(
+            key, label, optional=optional, createByDefault=default
+        )
         made.setHelp(help)
         self.addParameter(made)
 
@@ -115,7 +121,9 @@ class ClassifyFile(_Classifying):
         self.add_declared()
         self.add_destination("OUTPUT", "Classified point cloud", "The same points with classes")
         self.add_raster(
-            "MAP", "Map of classes", "A picture of the result from above: the highest class code of each cell"
+            "MAP",
+            "Map of classes",
+            "A picture of the result from above: the highest class code of each cell",
         )
         self.add_cell("Cell of the map")
         self.add_show()
@@ -124,13 +132,17 @@ class ClassifyFile(_Classifying):
         source = self.parameterAsFile(parameters, "INPUT", context)
         target = self.destination(parameters, "OUTPUT", context)
         chosen = self.arguments(parameters, context)
-        self.execute(["classify", *chosen, *self.model(parameters, context), source, target], feedback)
+        self.execute(
+            ["classify", *chosen, *self.model(parameters, context), source, target], feedback
+        )
         self.show_clouds([target], parameters, context)
         out = {"OUTPUT": target}
         if parameters.get("MAP"):
             out["MAP"] = written(self.parameterAsOutputLayer(parameters, "MAP", context))
             side = self.parameterAsDouble(parameters, "RESOLUTION", context)
-            self.execute(["pipeline", "--stdin"], feedback, json.dumps(class_map(target, out["MAP"], side)))
+            self.execute(
+                ["pipeline", "--stdin"], feedback, json.dumps(class_map(target, out["MAP"], side))
+            )
             self.style(context, out["MAP"], results.classes_of(self.forms["classes"]))
         return out
 
@@ -150,7 +162,9 @@ class ClassifySurvey(_Classifying):
         self.add_inputs(self.help_of("inputs"))
         self.add_model()
         self.add_declared()
-        made = QgsProcessingParameterFolderDestination("OUTPUT", "Folder of classified point clouds")
+        made = QgsProcessingParameterFolderDestination(
+            "OUTPUT", "Folder of classified point clouds"
+        )
         self.addParameter(made)
         self.add_destination(
             "REPORT", "Report", self.help_of("report"), _PAGES, optional=True, createByDefault=False
@@ -166,12 +180,17 @@ class ClassifySurvey(_Classifying):
         before = set(os.listdir(target))
         # A folder is named by its end, where it is not there yet
         self.execute(
-            ["classify", *more, *self.inputs(parameters, context), os.path.join(target, "")], feedback
+            ["classify", *more, *self.inputs(parameters, context), os.path.join(target, "")],
+            feedback,
         )
         names = (
-            sorted(os.listdir(target)) if "RESUME" in parameters else sorted(set(os.listdir(target)) - before)
+            sorted(os.listdir(target))
+            if "RESUME" in parameters
+            else sorted(set(os.listdir(target)) - before)
         )
-        clouds = [os.path.join(target, name) for name in names if name.lower().endswith((".laz", ".las"))]
+        clouds = [
+            os.path.join(target, name) for name in names if name.lower().endswith((".laz", ".las"))
+        ]
         self.show_clouds(clouds, parameters, context)
         return {"OUTPUT": target, **({"REPORT": report} if report else {})}
 
@@ -204,7 +223,11 @@ class Heights(_Showing):
         if parameters.get("MAP"):
             out["MAP"] = written(self.parameterAsOutputLayer(parameters, "MAP", context))
             side = self.parameterAsDouble(parameters, "RESOLUTION", context)
-            job += [*plain_classes(source), NOT_NOISE, raster(out["MAP"], side, "HeightAboveGround", "max")]
+            job += [
+                *plain_classes(source),
+                NOT_NOISE,
+                raster(out["MAP"], side, "HeightAboveGround", "max"),
+            ]
         self.execute(["pipeline", "--stdin"], feedback, json.dumps(job))
         self.show_clouds([target], parameters, context)
         if "MAP" in out:
@@ -227,7 +250,9 @@ class TerrainModels(_Showing):
 
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Point cloud")
-        made = QgsProcessingParameterEnum("GROUND_FROM", "Ground", list(self.GROUND), defaultValue=0)
+        made = QgsProcessingParameterEnum(
+            "GROUND_FROM", "Ground", list(self.GROUND), defaultValue=0
+        )
         made.setHelp(
             "Which points the terrain goes through: those that the filter below finds, or those classified as ground"
         )
@@ -258,7 +283,13 @@ class TerrainModels(_Showing):
         stage = {"type": self.stage, **self.options(parameters, context), "ground": True}
         source = self.parameterAsFile(parameters, "INPUT", context)
         # One line: of several ends PDAL runs only the first
-        job = [reader(source), {"type": "filters.detachednoise"}, stage, *plain_classes(source), NOT_NOISE]
+        job = [
+            reader(source),
+            {"type": "filters.detachednoise"},
+            stage,
+            *plain_classes(source),
+            NOT_NOISE,
+        ]
         if "SURFACE" in chosen:
             job.append(raster(chosen["SURFACE"], side, "Z", "max"))
         if "HEIGHTS" in chosen:
@@ -314,12 +345,21 @@ class Accuracy(Algorithm):
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Classified point cloud")
         self.add_file(
-            "REFERENCE", "The same points with true classes", self.help_of("reference"), CLOUDS, optional=True
+            "REFERENCE",
+            "The same points with true classes",
+            self.help_of("reference"),
+            CLOUDS,
+            optional=True,
         )
         self.add_declared()
         self.add_destination("PAGE", "Report", files=_PAGES)
         self.add_destination(
-            "JSON", "Figures", self.help_of("json"), "JSON (*.json)", optional=True, createByDefault=False
+            "JSON",
+            "Figures",
+            self.help_of("json"),
+            "JSON (*.json)",
+            optional=True,
+            createByDefault=False,
         )
         self.addOutput(QgsProcessingOutputHtml("HTML", "Report"))
         self.addOutput(QgsProcessingOutputString("FIGURES", "Table"))
@@ -336,7 +376,12 @@ class Accuracy(Algorithm):
         text = self.execute(
             ["accuracy", *chosen, self.parameterAsFile(parameters, "INPUT", context)], feedback
         )
-        return {"PAGE": page, "HTML": page, "FIGURES": text, **({"JSON": figures} if figures else {})}
+        return {
+            "PAGE": page,
+            "HTML": page,
+            "FIGURES": text,
+            **({"JSON": figures} if figures else {}),
+        }
 
 
 class Objects(_Showing):
@@ -360,7 +405,12 @@ class Objects(_Showing):
     def processAlgorithm(self, parameters, context, feedback):
         target = self.destination(parameters, "OUTPUT", context)
         self.execute(
-            ["objects", *self.arguments(parameters, context), *self.inputs(parameters, context), target],
+            [
+                "objects",
+                *self.arguments(parameters, context),
+                *self.inputs(parameters, context),
+                target,
+            ],
             feedback,
         )
         if self.parameterAsBool(parameters, "SHOW", context):
@@ -371,7 +421,11 @@ class Objects(_Showing):
 class Review(_Showing):
     """Where to look."""
 
-    key, title, command = "review", "Where to look: likely errors of a classified point cloud", "review"
+    key, title, command = (
+        "review",
+        "Where to look: likely errors of a classified point cloud",
+        "review",
+    )
     about = (
         "Lists where a person should look in classified point clouds, worst first, as patches with the number of errors "
         "expected in each, and as a page. What is right or was corrected can be learned from: see Corrections."
@@ -383,7 +437,9 @@ class Review(_Showing):
         self.add_inputs(self.help_of("inputs"))
         self.add_declared()
         self.add_destination("OUTPUT", "Patches", self.help_of("output"), _VECTORS)
-        self.add_destination("PAGE", "Page", "The worst patches; under Processing > Results Viewer", _PAGES)
+        self.add_destination(
+            "PAGE", "Page", "The worst patches; under Processing > Results Viewer", _PAGES
+        )
         self.addOutput(QgsProcessingOutputHtml("HTML", "Page"))
         self.add_show()
 

@@ -73,7 +73,9 @@ class Algorithm(Named):
         lines = [f"<p>{self.about}</p>"]
         for parameter in self.parameterDefinitions():
             if parameter.help():
-                lines.append(f"<p><b>{parameter.description()}</b>: {_escaped(parameter.help())}</p>")
+                lines.append(
+                    f"<p><b>{parameter.description()}</b>: {_escaped(parameter.help())}</p>"
+                )
         return "".join(lines)
 
     def canExecute(self):
@@ -98,7 +100,11 @@ class Algorithm(Named):
                 ok, why = self.provider().isSupportedOutputValue(value, one, context)
                 if not ok:
                     return False, f"{key}: {why}. Give a name that ends in .tif."
-            if isinstance(one, QgsProcessingParameterNumber) and isinstance(value, str) and value.strip():
+            if (
+                isinstance(one, QgsProcessingParameterNumber)
+                and isinstance(value, str)
+                and value.strip()
+            ):
                 whole = one.dataType() == QgsProcessingParameterNumber.Integer
                 try:
                     int(value) if whole else float(value)
@@ -164,7 +170,10 @@ class Algorithm(Named):
         made.setHelp(help)
         self.addParameter(made)
         folder = QgsProcessingParameterFile(
-            "FOLDER", "Folder of point clouds", behavior=QgsProcessingParameterFile.Folder, optional=True
+            "FOLDER",
+            "Folder of point clouds",
+            behavior=QgsProcessingParameterFile.Folder,
+            optional=True,
         )
         folder.setHelp("All point clouds in it, in addition to the files above")
         self.addParameter(folder)

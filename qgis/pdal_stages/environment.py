@@ -23,7 +23,15 @@ _OF_QGIS = (
 )  # fmt: skip
 
 #: Folders of conda's kind in the user's own.
-_CONDA = ("miniforge3", "mambaforge", "miniconda3", "anaconda3", "micromamba", ".conda", ".virtualenvs")
+_CONDA = (
+    "miniforge3",
+    "mambaforge",
+    "miniconda3",
+    "anaconda3",
+    "micromamba",
+    ".conda",
+    ".virtualenvs",
+)
 
 
 class Missing(Exception):
@@ -52,7 +60,9 @@ def find(setting=""):
         one = Path(folder, _folder(), _NAME)
         if one.is_file() and os.access(one, os.X_OK):
             return str(one)
-    raise Missing(f"The program pdal-stages was not found on PATH or in an environment of conda. {INSTALL}.")
+    raise Missing(
+        f"The program pdal-stages was not found on PATH or in an environment of conda. {INSTALL}."
+    )
 
 
 def _folder():
@@ -67,7 +77,10 @@ def environments():
     usual = []
     for root in _CONDA:
         usual += [*sorted(glob.glob(str(home / root / "envs" / "*"))), str(home / root)]
-    usual += [str(home / ".local" / "share" / "pipx" / "venvs" / "pdal-stages"), str(home / ".local")]
+    usual += [
+        str(home / ".local" / "share" / "pipx" / "venvs" / "pdal-stages"),
+        str(home / ".local"),
+    ]
     usual += [str(home / name / ".venv") for name in ("pdal-stages", "pdal_stages")]
     every = dict.fromkeys([*listed, *usual])
     return sorted(every, key=lambda folder: "pdal" not in Path(folder).name.lower())
@@ -128,7 +141,13 @@ def forms(program, cache):
     root = Path(program).resolve().parent.parent
     # An upgrade in place leaves the program as it is, and changes the folder of packages
     sites = [*root.glob("lib/python3*/site-packages"), *root.glob("Lib/site-packages")]
-    key = [FORMAT, str(program), status.st_mtime, status.st_size, *[site.stat().st_mtime for site in sites]]
+    key = [
+        FORMAT,
+        str(program),
+        status.st_mtime,
+        status.st_size,
+        *[site.stat().st_mtime for site in sites],
+    ]
     kept = Path(cache, "commands.json")
     try:
         held = json.loads(kept.read_text(encoding="utf-8"))
@@ -153,9 +172,7 @@ def checked(text, program):
         answer = json.loads(text)
         if answer["format"] == FORMAT:
             return answer
-        said = (
-            f"the form {answer['format']} of its commands is not known here: update the plugin or pdal-stages"
-        )
+        said = f"the form {answer['format']} of its commands is not known here: update the plugin or pdal-stages"
     except (ValueError, KeyError, TypeError):
         said = "what it says about its commands cannot be read"
     raise Missing(f"{program}: {said}.")

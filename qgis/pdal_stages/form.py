@@ -13,7 +13,16 @@ from qgis.core import (
 #: One of several: blanks in it stand between quotes.
 _WORDS = re.compile(r'(?:"[^"]*"|[^\s"])+')
 #: Settings of a terminal, of a batch system, or that a dialog has its own widgets for.
-LEFT_OUT = ("log", "progress", "scheduler", "dry_run", "inputs", "output", "threads", "inputs_option")
+LEFT_OUT = (
+    "log",
+    "progress",
+    "scheduler",
+    "dry_run",
+    "inputs",
+    "output",
+    "threads",
+    "inputs_option",
+)
 
 
 def label_of(declared):
@@ -36,8 +45,12 @@ def parameter(declared, key, label="", advanced=False):
     optional = not declared["required"]
     if declared["choices"]:
         choices = [str(one) for one in declared["choices"]]
-        index = choices.index(str(default)) if default is not None and str(default) in choices else None
-        made = QgsProcessingParameterEnum(key, label, choices, defaultValue=index, optional=optional)
+        index = (
+            choices.index(str(default)) if default is not None and str(default) in choices else None
+        )
+        made = QgsProcessingParameterEnum(
+            key, label, choices, defaultValue=index, optional=optional
+        )
     elif kind == "boolean":
         made = QgsProcessingParameterBoolean(key, label, defaultValue=bool(default))
     elif kind in ("number", "integer"):
@@ -92,5 +105,7 @@ def words(algorithm, declared, key, parameters, context):
         return []
     if declared["kind"] == "boolean":
         return [declared["flag"] if value else declared["off"] or declared["flag"]]
-    several = [one.replace('"', "") for one in _WORDS.findall(value)] if declared["many"] else [value]
+    several = (
+        [one.replace('"', "") for one in _WORDS.findall(value)] if declared["many"] else [value]
+    )
     return [f"{declared['flag']}={one}" for one in several]

@@ -28,7 +28,8 @@ def shows_point_clouds():
 def categories(classes):
     """Classes as they are colored in all of pdal-stages' pictures."""
     return [
-        QgsPointCloudCategory(int(code), QColor(*one["color"]), one["name"]) for code, one in classes.items()
+        QgsPointCloudCategory(int(code), QColor(*one["color"]), one["name"])
+        for code, one in classes.items()
     ]
 
 
@@ -45,7 +46,9 @@ def vector_layers(path):
     stem, ending = os.path.splitext(str(path))
     layers = []
     for name in LAYERS:
-        source = f"{path}|layername={name}" if ending.lower() == ".gpkg" else f"{stem}_{name}{ending}"
+        source = (
+            f"{path}|layername={name}" if ending.lower() == ".gpkg" else f"{stem}_{name}{ending}"
+        )
         if ending.lower() != ".gpkg" and not os.path.exists(source):
             continue
         layer = QgsVectorLayer(source, name, "ogr")
@@ -97,9 +100,13 @@ def classes_of(classes):
 
     def act(layer):
         provider = layer.dataProvider()
-        there = {int(one.value) for one in QgsPalettedRasterRenderer.classDataFromRaster(provider, 1)}
+        there = {
+            int(one.value) for one in QgsPalettedRasterRenderer.classDataFromRaster(provider, 1)
+        }
         shown = [
-            QgsPalettedRasterRenderer.Class(int(code), QColor(*one["color"]), f"{code} {one['name']}")
+            QgsPalettedRasterRenderer.Class(
+                int(code), QColor(*one["color"]), f"{code} {one['name']}"
+            )
             for code, one in classes.items()
             if int(code) in there
         ]

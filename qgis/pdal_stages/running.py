@@ -148,4 +148,6 @@ def _kill(process):
 
 
 def _quoted(word):
-    return word if re.fullmatch(r"[\w@%+=:,./~#-]+", word) else "'" + word.replace("'", "'\\''") + "'"
+    return (
+        word if re.fullmatch(r"[\w@%+=:,./~#-]+", word) else "'" + word.replace("'", "'\\''") + "'"
+    )

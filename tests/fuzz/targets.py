@@ -51,7 +51,9 @@ def target(seeds: Callable[[], list[bytes]]):
             try:
                 return function(data)
             except StageError as error:
-                assert str(error).strip().endswith((".", "?", "!")) and "Traceback" not in str(error)
+                assert str(error).strip().endswith((".", "?", "!")) and "Traceback" not in str(
+                    error
+                )
                 return "refused"
 
         TARGETS[function.__name__] = call, cache(seeds)
@@ -64,7 +66,9 @@ def target(seeds: Callable[[], list[bytes]]):
 def folder() -> Path:
     """A folder in memory, until the process ends."""
     memory = Path("/dev/shm")
-    made = Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+    made = Path(
+        tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None)
+    )
     atexit.register(shutil.rmtree, made, ignore_errors=True)
     return made
 
@@ -105,7 +109,11 @@ def pipeline(data: bytes) -> str:
     expanded = expand(source)
     assert json.loads(json.dumps(expanded.stages, allow_nan=False)) == expanded.stages
     types = [str(stage.get("type", "")) for stage in expanded.stages]
-    assert not {"filters.hag_minima", "filters.multiscalefeatures", "writers.classifiermodel"} & set(types)
+    assert not {
+        "filters.hag_minima",
+        "filters.multiscalefeatures",
+        "writers.classifiermodel",
+    } & set(types)
     assert types.count("filters.python") >= len(expanded.ours) and len(types) >= len(source.stages)
     return "expanded"
 
@@ -135,7 +143,10 @@ def cloud(data: bytes) -> str:
     las.projection(path)
     las.extra_dimensions(path)
     found = inputs.las_extent(str(path))
-    assert sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"] == found.count
+    assert (
+        sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"]
+        == found.count
+    )
     las.supersede_copc(path)
     las.check_texts(path)
     return "read"
@@ -166,7 +177,13 @@ def ept(data: bytes) -> str:
 
 _NOTES = {
     "a": {"outputs": [["/no/such", 1, 2]], "points": 3, "fingerprint": "f"},
-    "b": {"count": 3, "box": [0, 0, 1, 1], "tiles": [[0, 0, 3]], "cells": [[0, 0, 0, 3]], "fingerprint": "g"},
+    "b": {
+        "count": 3,
+        "box": [0, 0, 1, 1],
+        "tiles": [[0, 0, 3]],
+        "cells": [[0, 0, 0, 3]],
+        "fingerprint": "g",
+    },
 }
 
 
@@ -236,7 +253,9 @@ def good_model() -> dict[str, bytes]:
     )  # fmt: skip
     labels = np.where(xyz[:, 2] > 6, 6, 2)
     model = train(
-        [TrainingCloud(xyz, labels, {"HeightAboveGround": xyz[:, 2]}, "fuzz")], options, progress=False
+        [TrainingCloud(xyz, labels, {"HeightAboveGround": xyz[:, 2]}, "fuzz")],
+        options,
+        progress=False,
     )
     model.info["preparation"] = [{"type": "filters.hag_minima", "cell": 5}]
     model.save(folder() / "good.model")
@@ -298,9 +317,13 @@ def model(data: bytes) -> str:
     made.importances()
     codes = [code for code, _ in made.classes]
     for one in made.passes:
-        values = np.random.default_rng(1).normal(size=(50, len(one.columns(codes)))).astype(np.float32)
+        values = (
+            np.random.default_rng(1).normal(size=(50, len(one.columns(codes)))).astype(np.float32)
+        )
         shares = one.probabilities(values)
-        assert shares.shape == (50, len(codes)) and np.isfinite(shares).all() and (shares >= 0).all()
+        assert (
+            shares.shape == (50, len(codes)) and np.isfinite(shares).all() and (shares >= 0).all()
+        )
         assert np.allclose(shares.sum(axis=1), 1, atol=1e-5)
     return "loaded"
 
@@ -321,6 +344,8 @@ def network(data: bytes) -> str:
     rng = np.random.default_rng(1)
     xyz = np.round(rng.uniform(0, 30, (200, 3)), 2)
     assert str(made) and made.halo_m >= 0
-    found = made.predict(xyz, {"Intensity": rng.uniform(0, 100, 200)}, threads=1, probabilities=True)
+    found = made.predict(
+        xyz, {"Intensity": rng.uniform(0, 100, 200)}, threads=1, probabilities=True
+    )
     assert np.isfinite(found.probabilities).all()
     return "loaded"

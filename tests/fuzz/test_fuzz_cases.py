@@ -16,7 +16,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from targets import TARGETS
 
-CASES = sorted(path for path in (Path(__file__).resolve().parent / "cases").rglob("*") if path.is_file())
+CASES = sorted(
+    path for path in (Path(__file__).resolve().parent / "cases").rglob("*") if path.is_file()
+)
 #: Changed inputs that are tried for each target, or seconds of them.
 TRIES = {"pipeline": 300, "model": 60, "cloud": 200, "index": 200, "ept": 200, "store": 200,
          "result": 150, "network": 25}  # fmt: skip

@@ -58,7 +58,11 @@ class Command:
         done = subprocess.run(
             [*(command or [sys.executable, "-m", "pdal_stages.cli"]), *map(str, words)],
             capture_output=True,
-            env={name: value for name, value in {**os.environ, **(env or {})}.items() if value is not None},
+            env={
+                name: value
+                for name, value in {**os.environ, **(env or {})}.items()
+                if value is not None
+            },
             timeout=300,
             **{"cwd": self.folder, **more},
         )
@@ -74,7 +78,9 @@ class Command:
         everything = done.out + done.err
         assert done.code in (1, 2), (done.code, everything)
         assert "Traceback" not in everything, everything
-        message = done.err[done.err.rindex("pdal-stages: " if done.code == 1 else "usage:") :].strip()
+        message = done.err[
+            done.err.rindex("pdal-stages: " if done.code == 1 else "usage:") :
+        ].strip()
         for text in says:
             assert text in message, (text, message)
         assert not self.files() - self.before, "left behind"
@@ -91,14 +97,22 @@ class Command:
 
 def job(folder: Path, *stages: object, name: str = "job.json") -> Path:
     """Write a pipeline, one stage a line."""
-    rows = ",\n".join("  " + json.dumps(str(one) if isinstance(one, Path) else one) for one in stages)
+    rows = ",\n".join(
+        "  " + json.dumps(str(one) if isinstance(one, Path) else one) for one in stages
+    )
     (folder / name).write_text("[\n" + rows + "\n]\n", encoding="utf-8")
     return folder / name
 
 
 def las(path: Path, **more: object) -> dict[str, object]:
     """A writer that keeps what the input had, and all dimensions."""
-    return {"type": "writers.las", "filename": str(path), "extra_dims": "all", "forward": "all", **more}
+    return {
+        "type": "writers.las",
+        "filename": str(path),
+        "extra_dims": "all",
+        "forward": "all",
+        **more,
+    }
 
 
 def scene(n: int = 600, seed: int = 1) -> dict[str, np.ndarray]:

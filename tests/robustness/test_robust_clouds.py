@@ -39,8 +39,12 @@ ODD = {
     "2 points": [[5.0, 5.0, 1.0], [5.5, 5.0, 2.0]],
     "3 points": [[5.0, 5.0, 1.0], [5.5, 5.0, 2.0], [5.5, 5.5, 1.5]],
     "all points equal": np.full((300, 3), 7.25),
-    "all points on a line along x": np.column_stack([np.arange(300) * 0.1, np.zeros(300), np.zeros(300)]),
-    "all points on a vertical line": np.column_stack([np.zeros(300), np.zeros(300), np.arange(300) * 0.05]),
+    "all points on a line along x": np.column_stack(
+        [np.arange(300) * 0.1, np.zeros(300), np.zeros(300)]
+    ),
+    "all points on a vertical line": np.column_stack(
+        [np.zeros(300), np.zeros(300), np.arange(300) * 0.05]
+    ),
     "a vertical wall": random(400, size=(0.0, 8.0, 20.0)) + [3.0, 0.0, 0.0],
     "a perfect plane on a grid": grid(),
     "points 100 m apart": grid(10, 100.0),
@@ -49,7 +53,9 @@ ODD = {
     "one stray point 1e6 m up": np.vstack([random(300), [[10.0, 10.0, 1e6]]]),
     "a gap of water wider than a cell": np.vstack([random(200), random(200) + [90.0, 0.0, 0.0]]),
     "coordinates one millimeter apart": random(300) / 1000.0,
-    "thousands of copies of one point": np.vstack([random(200), np.repeat([[5.0, 5.0, 1.0]], 5000, axis=0)]),
+    "thousands of copies of one point": np.vstack(
+        [random(200), np.repeat([[5.0, 5.0, 1.0]], 5000, axis=0)]
+    ),
 }
 
 
@@ -84,7 +90,9 @@ def test_odd_shapes(command, tmp_path, write_las, model, case):
     if case.startswith(("all points equal", "all points on a line", "a perfect plane")):
         assert np.allclose(out["HeightAboveGround"], 0)
     if case == "all points equal":
-        assert (np.asarray(out["Linearity_c1"]) == 0).all() and (np.asarray(out["HeightRange_c1"]) == 0).all()
+        assert (np.asarray(out["Linearity_c1"]) == 0).all() and (
+            np.asarray(out["HeightRange_c1"]) == 0
+        ).all()
     if case == "all points on a line along x":
         assert np.allclose(out["Linearity_c1"], 1)
     if case == "a vertical wall":
@@ -95,7 +103,10 @@ def test_odd_shapes(command, tmp_path, write_las, model, case):
         meta = json.loads((tmp_path / "m.json").read_text())["metadata"]
         assert meta["filters.hag_minima"]["interpolated_cells"] > 0
     if "copies" in case:
-        assert len(np.unique(out.classification[200:])) == 1 and len(np.unique(out["Reliability"][200:])) == 1
+        assert (
+            len(np.unique(out.classification[200:])) == 1
+            and len(np.unique(out["Reliability"][200:])) == 1
+        )
 
 
 def test_no_points(command, tmp_path, write_las, model):
@@ -113,13 +124,18 @@ def test_no_points(command, tmp_path, write_las, model):
 def test_training_on_odd_clouds(command, tmp_path, write_las):
     def words(xyz, more, options):
         source = written(tmp_path / "in.las", xyz, write_las, **more)
-        return ["pipeline", job(tmp_path, source, HAG, {**TRAIN, "filename": str(tmp_path / "m"), **options})]
+        return [
+            "pipeline",
+            job(tmp_path, source, HAG, {**TRAIN, "filename": str(tmp_path / "m"), **options}),
+        ]
 
     for code in (2, 0):  # one class, none
         command.refused(
             words(random(100), {"Classification": np.full(100, code, np.uint8)}, {}), TRAIN["type"]
         )
-    command.refused(words(ODD["2 points"], {}, {"passes": 2}), "too small to be cut", "set passes to 1")
+    command.refused(
+        words(ODD["2 points"], {}, {"passes": 2}), "too small to be cut", "set passes to 1"
+    )
     for case in ("2 points", "all points equal"):
         command.runs(words(ODD[case], {}, {}))
 
@@ -128,15 +144,26 @@ def test_thresholds_and_surveys_of_no_points(command, tmp_path, write_las):
     flight, bins = np.where(np.arange(300) < 9, np.nan, 1.0), tmp_path / "b.json"
     path = written(tmp_path / "in.las", random(300), write_las, Flight=flight)
     source = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
-    shapes = {"type": FEATURES["type"], "neighborhoods": "k5", "feature_set": "D1", "bins": str(bins)}
+    shapes = {
+        "type": FEATURES["type"],
+        "neighborhoods": "k5",
+        "feature_set": "D1",
+        "bins": str(bins),
+    }
     for none in ({"where": "Z > 99"}, {"ignore": [2, 6]}):
-        command.runs(["pipeline", job(tmp_path, source, {**shapes, **none}), "--metadata", tmp_path / "m"])
+        command.runs(
+            ["pipeline", job(tmp_path, source, {**shapes, **none}), "--metadata", tmp_path / "m"]
+        )
         assert bins.exists() == ("where" in none)
         bins.unlink(missing_ok=True)
     bins.write_text('{"bins": null, "copt_threshold": null}')
-    command.refused(["pipeline", job(tmp_path, source, shapes)], "does not hold the thresholds", "Delete it")
+    command.refused(
+        ["pipeline", job(tmp_path, source, shapes)], "does not hold the thresholds", "Delete it"
+    )
     train = {**TRAIN, "filename": str(tmp_path / "model"), "survey": "Flight"}
-    command.refused(["pipeline", job(tmp_path, source, HAG, train)], "Flight is not finite", "9 points")
+    command.refused(
+        ["pipeline", job(tmp_path, source, HAG, train)], "Flight is not finite", "9 points"
+    )
 
 
 def test_labels_that_are_none(command, tmp_path, write_las):
@@ -146,7 +173,12 @@ def test_labels_that_are_none(command, tmp_path, write_las):
         "Negative": np.full(100, -1, np.int8),
     }
     source = written(tmp_path / "in.las", random(100), write_las, **arrays)
-    for name, says in (("Weight", "2.5"), ("Big", "300"), ("Negative", "-1"), ("None", "is missing")):
+    for name, says in (
+        ("Weight", "2.5"),
+        ("Big", "300"),
+        ("Negative", "-1"),
+        ("None", "is missing"),
+    ):
         write = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m"), "label": name}
         read = {"type": "readers.las", "filename": str(source), "use_eb_vlr": True}
         command.refused(["pipeline", job(tmp_path, read, HAG, write)], name, says)
@@ -199,13 +231,17 @@ def test_stray_points_beyond_any_grid(command, tmp_path, model, far):
 def test_no_heights(command, tmp_path):
     (tmp_path / "flat.txt").write_text("X,Y\n1,2\n3,4\n")
     for stage in (HAG, {**FEATURES, "neighborhoods": "c1"}):
-        path = job(tmp_path, {"type": "readers.text", "filename": str(tmp_path / "flat.txt")}, stage)
+        path = job(
+            tmp_path, {"type": "readers.text", "filename": str(tmp_path / "flat.txt")}, stage
+        )
         command.refused(["pipeline", path], "the dimension 'Z' is missing")
 
 
 def test_noise_below_ground(command, tmp_path, write_las):
     """Noise forms no terrain, is counted, and gets its (negative) height."""
-    xyz = np.vstack([random(400, size=(40.0, 40.0, 0.1)), [[10.0, 10.0, -40.0], [30.0, 30.0, -35.0]]])
+    xyz = np.vstack(
+        [random(400, size=(40.0, 40.0, 0.1)), [[10.0, 10.0, -40.0], [30.0, 30.0, -35.0]]]
+    )
     codes = np.full(402, 2, np.uint8)
     codes[400:] = 7, 18
     out, meta = tmp_path / "out.las", tmp_path / "m.json"
@@ -232,7 +268,9 @@ METERS = (
 )
 FOOT = 0.304800609601219
 FEET = METERS.replace('UNIT["metre",1]', f'UNIT["US survey foot",{FOOT}]')
-GEOCENTRIC = 'GEOCCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],UNIT["metre",1]]'
+GEOCENTRIC = (
+    'GEOCCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],UNIT["metre",1]]'
+)
 
 
 def both(across, name, unit):
@@ -250,12 +288,18 @@ def test_references(command, tmp_path, write_las, wkt, across, up):
     source = write_las(tmp_path / "in.las", arrays, point_format=6, wkt=wkt, scale=1e-6)
     features = {**FEATURES, "neighborhoods": "s2", "feature_set": "HeightRange"}
     done = command.runs(
-        ["pipeline", job(tmp_path, source, HAG, features, las(tmp_path / "out.las", minor_version=4))]
+        [
+            "pipeline",
+            job(tmp_path, source, HAG, features, las(tmp_path / "out.las", minor_version=4)),
+        ]
     )
     assert ("meters were assumed" in done.err) == (wkt is None)
     out = laspy.read(tmp_path / "out.las")
     # A point on the border of a fine cell may fall on either side of it after conversion.
-    assert np.mean(np.abs(np.asarray(out["HeightAboveGround"]) - ps.hag_minima(*meters.T) / up) < 1e-3) > 0.97
+    assert (
+        np.mean(np.abs(np.asarray(out["HeightAboveGround"]) - ps.hag_minima(*meters.T) / up) < 1e-3)
+        > 0.97
+    )
     ranges = [np.ptp(meters[rows, 2]) for rows in cKDTree(meters).query_ball_point(meters, 2.0)]
     assert np.mean(np.abs(np.asarray(out["HeightRange_s2"]) - ranges) < 1e-3) > 0.97
 
@@ -269,12 +313,19 @@ def test_degrees(command, tmp_path, write_las):
         (GEOCENTRIC, "geocentric"),
     ):
         write_las(
-            tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), point_format=6, wkt=wkt, scale=1e-7
+            tmp_path / "in.las",
+            dict(zip("XYZ", xyz.T, strict=True)),
+            point_format=6,
+            wkt=wkt,
+            scale=1e-7,
         )
         command.refused(["pipeline", path], says, "filters.reprojection")
     xyz = random(1000, size=(0.001, 0.001, 5.0)) + [9.0, 50.0, 0.0]
     write_las(tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), scale=1e-7)
-    for words in (["pipeline", path], ["classify", tmp_path / "in.las", tmp_path / "o.las", "--tile", 100]):
+    for words in (
+        ["pipeline", path],
+        ["classify", tmp_path / "in.las", tmp_path / "o.las", "--tile", 100],
+    ):
         command.refused(words, "look like degrees", "in_srs=EPSG:4326")
     for text in ("PROJCS[" * 5000, 'PROJCS["a",' + 'UNIT["m",' * 5000 + "1" + "]" * 5001):
         assert units_of_wkt(text).horizontal == 1.0  # assumed, as where there is none
@@ -297,7 +348,11 @@ def test_boxes_and_tiles_of_odd_sizes(command, tmp_path, write_las, case):
     if side is not None:
         struct.pack_into("<4d", data, 179, side, -side, side, -side)
     (tmp_path / "in.las").write_bytes(data)
-    path = job(tmp_path, tmp_path / "in.las", {"type": "writers.las", "filename": str(tmp_path / "o_#.las")})
+    path = job(
+        tmp_path,
+        tmp_path / "in.las",
+        {"type": "writers.las", "filename": str(tmp_path / "o_#.las")},
+    )
     done = command("pipeline", path, "--tile", tile, "--workers", 0)
     if says is not None:
         assert done.code == 1 and "Traceback" not in done.err and says in done.err, done.err

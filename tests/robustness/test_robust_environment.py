@@ -16,7 +16,10 @@ import numpy as np
 import pytest
 from robustness_kit import HAG, Command, job, las, scene
 
-pytestmark = [pytest.mark.pdal, pytest.mark.skipif(os.name == "nt", reason="signals and mounts of Unix")]
+pytestmark = [
+    pytest.mark.pdal,
+    pytest.mark.skipif(os.name == "nt", reason="signals and mounts of Unix"),
+]
 
 
 def prepared(*lines: str) -> dict:
@@ -36,7 +39,10 @@ def without_rights() -> dict:
         pytest.skip("run by a superuser, whom no rights hold")
 
     def drop():
-        for capability in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, from the bounding set (24)
+        for capability in (
+            1,
+            2,
+        ):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, from the bounding set (24)
             libc.prctl(24, capability, 0, 0, 0)
 
     return {"preexec_fn": drop}
@@ -53,7 +59,9 @@ def mounted(folder: Path, options: str):
     try:
         yield folder
     finally:
-        subprocess.run(["umount", "-l", str(folder)], check=False)  # PDAL may hold a file of it open
+        subprocess.run(
+            ["umount", "-l", str(folder)], check=False
+        )  # PDAL may hold a file of it open
 
 
 # ---- PDAL and Python packages --------------------------------------------------------------------------------
@@ -63,7 +71,9 @@ def test_no_pdal(command, tmp_path, cloud):
     path = job(tmp_path, cloud, HAG, las(tmp_path / "out.las"))
     without = prepared("import sys", "sys.modules['pdal'] = None")
     command.refused(
-        command.process("pipeline", path, **without), "python-pdal cannot be imported", "conda install"
+        command.process("pipeline", path, **without),
+        "python-pdal cannot be imported",
+        "conda install",
     )
     alone = ("import sys; sys.modules['pdal'] = None\nimport pdal_stages as ps\n"
              "assert ps.hag_minima([1., 2.], [1., 2.], [3., 5.])[1] == 2")  # fmt: skip
@@ -73,7 +83,9 @@ def test_no_pdal(command, tmp_path, cloud):
         "sys.executable = '/nowhere/python'",
         "e.shutil.which = lambda *a: None",
     )
-    command.refused(command.process("validate", path, **nowhere), "'pdal' is not on PATH", "conda install")
+    command.refused(
+        command.process("validate", path, **nowhere), "'pdal' is not on PATH", "conda install"
+    )
 
 
 @pytest.mark.parametrize("kind", ["missing folder", "another Python"])
@@ -85,9 +97,7 @@ def test_driver_path(command, tmp_path, cloud, kind):
         compiler = shutil.which("cc") or shutil.which("gcc")
         if compiler is None:
             pytest.skip("no C compiler to build a plugin that needs a Python that is not here")
-        source = (
-            "extern void Py_NoSuchPython_Ever(void);\nvoid PF_initPlugin(void) { Py_NoSuchPython_Ever(); }\n"
-        )
+        source = "extern void Py_NoSuchPython_Ever(void);\nvoid PF_initPlugin(void) { Py_NoSuchPython_Ever(); }\n"
         words = [compiler, "-shared", "-fPIC", "-o", plugin, "-x", "c", "-"]
         subprocess.run(words, check=True, input=source, text=True)
     path = job(tmp_path, cloud, HAG, las(tmp_path / "out.las"))
@@ -113,7 +123,9 @@ def test_no_rights(capfd, write_las):
         def refused(*words, says):
             command.refused(command.process(*words, **nobody), *says)
 
-        refused("pipeline", job(folder, source, HAG, closed / "out.las"), says=["cannot be written to"])
+        refused(
+            "pipeline", job(folder, source, HAG, closed / "out.las"), says=["cannot be written to"]
+        )
         refused("train", source, "--model", closed / "m", says=["cannot be written to"])
         for path in (source, plain):
             path.chmod(0o000)
@@ -125,7 +137,9 @@ def test_no_rights(capfd, write_las):
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_disk_full(command, tmp_path, write_las, suffix):
-    arrays = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 300, (3, 60_000)).round(2), strict=True))
+    arrays = dict(
+        zip("XYZ", np.random.default_rng(0).uniform(0, 300, (3, 60_000)).round(2), strict=True)
+    )
     source = write_las(tmp_path / "big.las", arrays)
     with mounted(tmp_path / "small", "size=200k") as small:
         path = job(tmp_path, source, HAG, small / f"out.{suffix}")
@@ -166,7 +180,9 @@ def test_signals(command, tmp_path, name, ours):
     }
     slow = [{"type": "filters.sort", "dimension": axis} for axis in "XYZ" * 60]
     if ours:
-        slow = [{"type": "filters.multiscalefeatures", "neighborhoods": "c5,kopt", "feature_set": "all"}]
+        slow = [
+            {"type": "filters.multiscalefeatures", "neighborhoods": "c5,kopt", "feature_set": "all"}
+        ]
     path = job(tmp_path, faux, *slow, las(out, forward="header"))
     words = [sys.executable, "-m", "pdal_stages.cli", "pipeline", str(path)]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
@@ -183,7 +199,9 @@ def test_signals(command, tmp_path, name, ours):
 
 
 def test_a_closed_pipe(command):
-    done = command.process(command=["sh", "-c", f"{sys.executable} -m pdal_stages.cli drivers | head -1"])
+    done = command.process(
+        command=["sh", "-c", f"{sys.executable} -m pdal_stages.cli drivers | head -1"]
+    )
     assert "BrokenPipe" not in command.runs(done).err
 
 

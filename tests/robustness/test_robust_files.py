@@ -22,8 +22,12 @@ OWN = re.compile(
     r"/\.pdal-stages-partial-|/\.pdal-stages(/|$)|/__pycache__(/|$)|\.nb[ic]|/pdal-stages(/measured\.json)?$"
     r"|^/(tmp|var/tmp)/(pdal-stages-[^/]+|tmp\w+|[a-z0-9_]{8})(/|$)|^/dev/(null|tty|shm/)|^/proc/"
 )
-_OPENED = re.compile(r'\b(?:open|openat|creat)\((?:[^"]*)"((?:[^"\\]|\\.)*)", ([A-Z_|0-9a-fx]+).*\) = \d+')
-_CHANGED = re.compile(r"\b(rename\w*|link\w*|symlink\w*|truncate|unlink\w*|mkdir\w*|rmdir)\((.*)\) = 0")
+_OPENED = re.compile(
+    r'\b(?:open|openat|creat)\((?:[^"]*)"((?:[^"\\]|\\.)*)", ([A-Z_|0-9a-fx]+).*\) = \d+'
+)
+_CHANGED = re.compile(
+    r"\b(rename\w*|link\w*|symlink\w*|truncate|unlink\w*|mkdir\w*|rmdir)\((.*)\) = 0"
+)
 #: A name, and the folder that it is in, where that is open.
 _NAMED = re.compile(r'(?:\d+<([^>]*)>, )?"((?:[^"\\]|\\.)*)"')
 
@@ -32,7 +36,19 @@ def written(folder, *words: object) -> set[str]:
     """What a command opened for writing, made, renamed or removed beyond what is its own."""
     log = folder / "trace.txt"
     calls = "trace=open,openat,creat,rename,renameat,renameat2,link,linkat,symlink,symlinkat,truncate,unlink,unlinkat,mkdir,mkdirat,rmdir"
-    strace = ["strace", "-f", "--seccomp-bpf", "-qq", "-y", "-s", "4096", "-o", str(log), "-e", calls]
+    strace = [
+        "strace",
+        "-f",
+        "--seccomp-bpf",
+        "-qq",
+        "-y",
+        "-s",
+        "4096",
+        "-o",
+        str(log),
+        "-e",
+        calls,
+    ]
     done = ended(*strace, sys.executable, "-m", "pdal_stages.cli", *words, cwd=folder)
     if not log.exists() or "ptrace" in done.stderr:
         pytest.skip(f"nothing may be traced here: {done.stderr[:200]}")
@@ -50,8 +66,24 @@ def written(folder, *words: object) -> set[str]:
 
 def test_files_that_are_written(tmp_path, cloud, model):
     shutil.copy(cloud, tmp_path / "raw.las")
-    words = ["classify", "raw.las", "out.las", "--model", model, "--metadata", "m.json", "--log", "run.log"]
+    words = [
+        "classify",
+        "raw.las",
+        "out.las",
+        "--model",
+        model,
+        "--metadata",
+        "m.json",
+        "--log",
+        "run.log",
+    ]
     assert written(tmp_path, *words) == {"out.las", "m.json", "run.log"}
-    path = job(tmp_path, "raw.las", HAG, {"type": "filters.modelclassifier", "model": str(model)}, "o_#.las")
+    path = job(
+        tmp_path,
+        "raw.las",
+        HAG,
+        {"type": "filters.modelclassifier", "model": str(model)},
+        "o_#.las",
+    )
     words = ["pipeline", path, "--tile", "15", "--workers", "2", "--report", "r.html"]
     assert written(tmp_path, *words) == {"o_raw.las", "r.html"}

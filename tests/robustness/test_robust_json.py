@@ -78,7 +78,8 @@ def test_files_that_cannot_be_read(command, tmp_path):
     command.refused(["pipeline", "x" * 5000], "File name too long")
     text = b'[\n"a.las",\n{"type": "filters.hag_minima", "cell": 0}]'
     command.refused(
-        command.process("expand", "--stdin", input=text), "standard input, line 3: filters.hag_minima"
+        command.process("expand", "--stdin", input=text),
+        "standard input, line 3: filters.hag_minima",
     )
 
 
@@ -124,11 +125,18 @@ def test_any_json_is_expanded_or_refused(given_stages, as_object, indent):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.text(max_size=10).filter(lambda s: "\0" not in s), min_size=1, max_size=5), st.data())
+@given(
+    st.lists(st.text(max_size=10).filter(lambda s: "\0" not in s), min_size=1, max_size=5),
+    st.data(),
+)
 def test_comments_between_change_nothing(texts, data):
     comment = st.sampled_from(["", " ", "\n", '// c " [ /*\n', '/* " // \n ] */', "/**/"])
-    parts = (part for at, word in enumerate(texts) for part in (("," if at else "["), json.dumps(word)))
-    read = parse_pipeline("".join(data.draw(comment) + part for part in parts) + data.draw(comment) + "]")
+    parts = (
+        part for at, word in enumerate(texts) for part in (("," if at else "["), json.dumps(word))
+    )
+    read = parse_pipeline(
+        "".join(data.draw(comment) + part for part in parts) + data.draw(comment) + "]"
+    )
     assert read.stages == texts
     assert read.lines == sorted(read.lines)
 

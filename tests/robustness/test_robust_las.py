@@ -16,7 +16,10 @@ from pdal_stages.pipeline.references import reference_of, reference_of_file
 
 pytestmark = pytest.mark.pdal
 
-STAGES = [HAG, {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"}]
+STAGES = [
+    HAG,
+    {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "feature_set": "Linearity"},
+]
 
 
 def pipeline(tmp_path, source, model, *stages):
@@ -46,7 +49,10 @@ def test_versions_and_formats(command, tmp_path, write_las, model, version, poin
         pytest.skip("lazrs and laspy do not write such LAZ")
     written = max(version, 3 if waves else 2)
     rng = np.random.default_rng(point_format)
-    arrays = scene() | {"Intensity": rng.integers(0, 65535, 600), "UserData": rng.integers(0, 255, 600)}
+    arrays = scene() | {
+        "Intensity": rng.integers(0, 65535, 600),
+        "UserData": rng.integers(0, 255, 600),
+    }
     arrays |= {name: rng.random(600) < 0.1 for name in ("Synthetic", "KeyPoint", "Withheld")}
     if point_format not in (0, 2):
         arrays["GpsTime"] = rng.uniform(0, 1e6, 600)
@@ -57,7 +63,9 @@ def test_versions_and_formats(command, tmp_path, write_las, model, version, poin
         "minor_version": written,
         "wkt": METERS if point_format > 5 else None,
     }
-    source = write_las(tmp_path / f"in{suffix}", {**arrays, "Mine": np.arange(600, dtype=np.int32)}, **how)
+    source = write_las(
+        tmp_path / f"in{suffix}", {**arrays, "Mine": np.arange(600, dtype=np.int32)}, **how
+    )
     if version <= 1:
         data = bytearray(source.read_bytes())
         data[25] = version
@@ -70,14 +78,19 @@ def test_versions_and_formats(command, tmp_path, write_las, model, version, poin
     out, before = check(tmp_path), laspy.read(source)
     for name in set(before.point_format.dimension_names) - {"classification"}:
         assert np.array_equal(np.asarray(out[name]), np.asarray(before[name])), name
-    assert out.header.point_format.id == point_format and out.header.parse_crs() == before.header.parse_crs()
+    assert (
+        out.header.point_format.id == point_format
+        and out.header.parse_crs() == before.header.parse_crs()
+    )
     assert np.array_equal(
         [out.header.scales, out.header.offsets], [before.header.scales, before.header.offsets]
     )
     # PDAL writes no LAS 1.0, newer PDAL LAS 1.4 where it is not told otherwise
     assert out.header.version.minor == version if version else out.header.version.minor in (2, 4)
     if version <= 1:
-        command.runs(["classify", source, tmp_path / "t.las", "--model", model, "--tile", 20, "--workers", 0])
+        command.runs(
+            ["classify", source, tmp_path / "t.las", "--model", model, "--tile", 20, "--workers", 0]
+        )
         assert len(laspy.read(tmp_path / "t.las")) == 600
 
 
@@ -85,7 +98,9 @@ def test_extra_bytes_of_every_type(command, tmp_path, write_las, model):
     kinds = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
     extra = {f"Mine_{kind}": np.arange(600).astype(kind) for kind in kinds}
     source = write_las(
-        tmp_path / "in.las", {**scene(), **extra, "GpsTime": np.linspace(1e8, 1e8 + 5, 600)}, point_format=6
+        tmp_path / "in.las",
+        {**scene(), **extra, "GpsTime": np.linspace(1e8, 1e8 + 5, 600)},
+        point_format=6,
     )
     command.runs(pipeline(tmp_path, source, model))
     out = check(tmp_path)
@@ -117,7 +132,12 @@ OURS = ["HeightAboveGround", "Reliability", "Linearity_c1", "Margin", "Probabili
 def test_dimensions_named_like_ours(command, tmp_path, write_las, model, kind):
     """An earlier run's, or another program's: overwritten, with the fractions kept whatever the type was."""
     before = {name: np.full(600, 77).astype(kind) for name in OURS}
-    classify = {"type": "filters.modelclassifier", "model": str(model), "margin": True, "probabilities": True}
+    classify = {
+        "type": "filters.modelclassifier",
+        "model": str(model),
+        "margin": True,
+        "probabilities": True,
+    }
     words, found = pipeline(tmp_path, tmp_path / "in.las", model, *STAGES, classify), []
     for arrays in ({**scene(), **before}, scene()):
         write_las(tmp_path / "in.las", arrays, point_format=6)
@@ -229,7 +249,9 @@ DAMAGED = {
 def test_damaged(command, tmp_path, write_las, model, case):
     kind, edit, says = DAMAGED[case]
     suffix, point_format = kind.split()
-    source = damaged(write_las(tmp_path / f"in{suffix}", scene(), point_format=int(point_format)), edit)
+    source = damaged(
+        write_las(tmp_path / f"in{suffix}", scene(), point_format=int(point_format)), edit
+    )
     command.refused(pipeline(tmp_path, source, model), f"in{suffix}", says)
     if case in ("cut in the points", "a text file", "LAZ: another count in the header"):
         path = job(tmp_path, source, HAG, tmp_path / "out.las")
@@ -259,7 +281,11 @@ def test_fewer_points_in_the_header(command, tmp_path, good, model):
 
 def test_a_record_after_the_points(command, tmp_path, write_las, model):
     command.runs(
-        pipeline(tmp_path, damaged(write_las(tmp_path / "in.las", scene(), point_format=6), after()), model)
+        pipeline(
+            tmp_path,
+            damaged(write_las(tmp_path / "in.las", scene(), point_format=6), after()),
+            model,
+        )
     )
     check(tmp_path)
 
@@ -279,7 +305,9 @@ def test_header_texts_in_latin_1(command, tmp_path, good, model, pdal_program):
     if done.code:  # not every PDAL stumbles
         said = "the system identifier", "not UTF-8", "Vermessungsb", "pdal translate"
         command.refused(done, *said)
-        command.refused(["classify", good, tmp_path / "o.las", "--model", model, "--tile", "20"], *said)
+        command.refused(
+            ["classify", good, tmp_path / "o.las", "--model", model, "--tile", "20"], *said
+        )
         subprocess.run([pdal_program, "translate", good, tmp_path / "clean.las"], check=True)
         command.runs(pipeline(tmp_path, tmp_path / "clean.las", model))
     check(tmp_path)

@@ -23,7 +23,9 @@ def test_accuracy_without_z(command, tmp_path):
 
 
 def _features(*names: object) -> bytes:
-    rows = [{"type": "Feature", "geometry": None, "properties": {"location": name}} for name in names]
+    rows = [
+        {"type": "Feature", "geometry": None, "properties": {"location": name}} for name in names
+    ]
     return json.dumps({"type": "FeatureCollection", "features": rows}).encode()
 
 

@@ -87,7 +87,11 @@ def trained(target, source, *before, **more):
     write = {"type": "writers.classifiermodel", "filename": str(target), "neighborhoods": "c1,s2", "trees": 5, "folds": 0,
              "passes": 1, "feature_set": "covariance,geometric", "count": 100, **more}  # fmt: skip
     ps.run_pipeline(
-        [{"type": "readers.las", "filename": str(source), "use_eb_vlr": True}, *(before or (HAG,)), write]
+        [
+            {"type": "readers.las", "filename": str(source), "use_eb_vlr": True},
+            *(before or (HAG,)),
+            write,
+        ]
     )
     return target
 
@@ -110,20 +114,37 @@ def test_other_dimensions(command, tmp_path, write_las, cloud):
 
 
 def test_units_of_training_points_stay_there(command, tmp_path, write_las, cloud):
-    feet = {name: values / FOOT if name in "XYZ" else values for name, values in scene(seed=5).items()}
+    feet = {
+        name: values / FOOT if name in "XYZ" else values for name, values in scene(seed=5).items()
+    }
     source = write_las(tmp_path / "feet.las", feet, point_format=6, wkt=FEET, scale=1e-4)
     model = trained(tmp_path / "m.model", source)
     command.runs(["classify", cloud, tmp_path / "out.las", "--model", model])
     assert right(tmp_path / "out.las") > 0.9
-    model = trained(tmp_path / "u.model", cloud, {**HAG, "vertical_unit": "foot"}, vertical_unit="foot")
+    model = trained(
+        tmp_path / "u.model", cloud, {**HAG, "vertical_unit": "foot"}, vertical_unit="foot"
+    )
     assert ps.load_model(model).info["preparation"] == [HAG]
 
 
 def test_the_label_as_a_dimension_and_more_samples_than_points(command, tmp_path, cloud):
     target = tmp_path / "m.model"
-    words = ["train", cloud, "--model", target, "--neighborhoods", "c1", "--trees", 3, "--count", 99999999]
+    words = [
+        "train",
+        cloud,
+        "--model",
+        target,
+        "--neighborhoods",
+        "c1",
+        "--trees",
+        3,
+        "--count",
+        99999999,
+    ]
     command.refused(
-        [*words, "--writers.classifiermodel.dimensions=Classification"], "the label itself", "Leave it out"
+        [*words, "--writers.classifiermodel.dimensions=Classification"],
+        "the label itself",
+        "Leave it out",
     )
     command.runs(words)  # the largest class bounds what is drawn
     large, small = sorted(ps.load_model(target).info["classes"], key=lambda c: -c["available"])
@@ -162,7 +183,10 @@ def test_names_that_command_a_terminal_or_pass_for_lines(command, tmp_path, clou
 
 def test_figures_of_any_size(command, tmp_path, model):
     for edit in (
-        lambda h, _: (h["training"].update(huge=10**400), h["passes"][0]["parameters"].update(trees=10**400)),
+        lambda h, _: (
+            h["training"].update(huge=10**400),
+            h["passes"][0]["parameters"].update(trees=10**400),
+        ),
         lambda h, _: h["training"].update(curve=[10**400]),
     ):
         done = command("model", repack(model, tmp_path / "odd.model", edit))
@@ -187,8 +211,12 @@ def test_a_preparation_that_does_more_than_heights(command, tmp_path, cloud, mod
     victim = tmp_path / "victim.txt"
     victim.write_text("--cell=1\n")
     stage = json.loads(json.dumps(HOSTILE[what]).replace("FILE", str(victim)))
-    target = repack(model, tmp_path / "evil.model", lambda head, _: head.update(preparation=[HAG, stage]))
-    apply = job(tmp_path, cloud, HAG, {"type": "filters.modelclassifier", "model": str(target)}, "out.las")
+    target = repack(
+        model, tmp_path / "evil.model", lambda head, _: head.update(preparation=[HAG, stage])
+    )
+    apply = job(
+        tmp_path, cloud, HAG, {"type": "filters.modelclassifier", "model": str(target)}, "out.las"
+    )
     for words in (
         ["classify", cloud, tmp_path / "out.las", "--model", target],
         ["pipeline", apply],
@@ -209,7 +237,10 @@ def test_training_on_heights_that_a_model_cannot_carry(command, tmp_path, cloud)
     done = command.runs(["pipeline", job(tmp_path, cloud, KEEP, *made, write)])
     assert "'filters.pmf'" in done.err and "Write a pipeline with the same stages" in done.err
     found = ps.load_model(target)
-    assert found.info["preparation"] == [] and found.info["by_hand"] == ["filters.pmf", "filters.hag_nn"]
+    assert found.info["preparation"] == [] and found.info["by_hand"] == [
+        "filters.pmf",
+        "filters.hag_nn",
+    ]
     says = "filters.pmf, filters.hag_nn"
     command.refused(["classify", cloud, out, "--model", target], says, "Write a pipeline")
     apply = {"type": "filters.modelclassifier", "model": str(target)}
@@ -222,7 +253,13 @@ def test_heights_of_pdal_are_carried(command, tmp_path, cloud):
     smrf = {"type": "filters.smrf", "cell": "2", "ignore": "Classification[7:7]", "tag": "ground"}
     nearest = {"type": "filters.hag_nn", "count": 2}
     target = trained(
-        tmp_path / "m.model", cloud, KEEP, smrf, nearest, label="Reference", dimensions="HeightAboveGround"
+        tmp_path / "m.model",
+        cloud,
+        KEEP,
+        smrf,
+        nearest,
+        label="Reference",
+        dimensions="HeightAboveGround",
     )
     carried = [{"type": "filters.smrf", "cell": 2, "ignore": ["Classification[7:7]"]}, nearest]
     assert ps.load_model(target).info["preparation"] == carried

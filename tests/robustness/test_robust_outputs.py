@@ -14,7 +14,10 @@ from robustness_kit import HAG, job
 
 from pdal_stages import load_model, run_tiled
 
-pytestmark = [pytest.mark.pdal, pytest.mark.skipif(os.name == "nt", reason="devices and links of Unix")]
+pytestmark = [
+    pytest.mark.pdal,
+    pytest.mark.skipif(os.name == "nt", reason="devices and links of Unix"),
+]
 
 SMALL = ["--neighborhoods", "c1", "--count", "20", "--writers.classifiermodel.trees=2",
          "--writers.classifiermodel.feature_set=covariance", "--writers.classifiermodel.dimensions=Intensity"]  # fmt: skip
@@ -24,11 +27,17 @@ def test_devices(command, tmp_path, cloud):
     """Of a superuser too, they stay what they are."""
     watched = ["/dev/null", "/dev/stdout"]
     before = [(found.st_ino, found.st_mode, found.st_rdev) for found in map(os.lstat, watched)]
-    done = command.runs(command.process("pipeline", job(tmp_path, cloud, HAG), "--metadata", "/dev/stdout"))
+    done = command.runs(
+        command.process("pipeline", job(tmp_path, cloud, HAG), "--metadata", "/dev/stdout")
+    )
     assert "filters.hag_minima" in json.loads(done.out)["metadata"]
     command.runs(["train", cloud, "--model", "/dev/null", *SMALL])
-    command.runs(["pipeline", job(tmp_path, cloud, {"type": "writers.las", "filename": "/dev/null"})])
-    assert [(found.st_ino, found.st_mode, found.st_rdev) for found in map(os.lstat, watched)] == before
+    command.runs(
+        ["pipeline", job(tmp_path, cloud, {"type": "writers.las", "filename": "/dev/null"})]
+    )
+    assert [
+        (found.st_ino, found.st_mode, found.st_rdev) for found in map(os.lstat, watched)
+    ] == before
     done = command.runs(command.process("pipeline", job(tmp_path, cloud, "STDOUT")))
     assert done.out.count("\n") == 601 and '"X"' in done.out and not (tmp_path / "STDOUT").exists()
 
@@ -55,7 +64,10 @@ def test_pipe(command, tmp_path, cloud):
 def files(tmp_path, cloud, model, monkeypatch):
     """A cloud, another, a model and a page in the test's own folder, and a check that they are what they were."""
     monkeypatch.chdir(tmp_path)
-    for source, names in ((cloud, ("a.las", "b.las", "t_1.las")), (model, ("m.model", "other.laz"))):
+    for source, names in (
+        (cloud, ("a.las", "b.las", "t_1.las")),
+        (model, ("m.model", "other.laz")),
+    ):
         for name in names:
             shutil.copy(source, tmp_path / name)
     (tmp_path / "page.html").write_text("<!DOCTYPE html>\n<p>mine</p>\n")
@@ -69,7 +81,12 @@ def files(tmp_path, cloud, model, monkeypatch):
 
 
 WRITE = {"type": "writers.las"}
-BINS = {"type": "filters.multiscalefeatures", "neighborhoods": "c1", "bins": "b.json", "feature_set": "D1"}
+BINS = {
+    "type": "filters.multiscalefeatures",
+    "neighborhoods": "c1",
+    "bins": "b.json",
+    "feature_set": "D1",
+}
 PIPELINES = {
     "p.json": ["a.las", HAG],
     "bins.json": ["a.las", BINS],
@@ -111,7 +128,9 @@ REPLACING = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("words", "says"), REPLACING, ids=[" ".join(words[:6]) for words, _ in REPLACING])
+@pytest.mark.parametrize(
+    ("words", "says"), REPLACING, ids=[" ".join(words[:6]) for words, _ in REPLACING]
+)
 def test_files_that_must_not_be_replaced(command, files, words, says):
     for name, stages in PIPELINES.items():
         job(files, *stages, name=name)
@@ -134,9 +153,15 @@ def test_a_lock_that_only_writers_can_hold(tmp_path, cloud):
     path, lock = job(tmp_path, cloud, HAG, tmp_path / "o.las"), tmp_path / ".pdal-stages" / "lock"
     before = os.umask(0o022)
     try:
-        for mask, older, mode in ((0o022, None, 0o600), (0o002, None, 0o660), (0o002, 0o644, 0o600)):
+        for mask, older, mode in (
+            (0o022, None, 0o600),
+            (0o002, None, 0o660),
+            (0o002, 0o644, 0o600),
+        ):
             os.umask(mask)
-            lock.chmod(older) if older else lock.unlink(missing_ok=True)  # of an older release, or a new one
+            lock.chmod(older) if older else lock.unlink(
+                missing_ok=True
+            )  # of an older release, or a new one
             run_tiled(path, 20, workers=0, progress=False)
             assert stat.S_IMODE(lock.stat().st_mode) == mode
     finally:

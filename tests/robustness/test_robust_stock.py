@@ -33,7 +33,10 @@ def test_errors_through_stock_pdal(tmp_path, pdal_program, cloud, model):
         (tmp_path / "plain.json").write_text(pipeline)
         done = ended(pdal_program, "pipeline", tmp_path / "plain.json")
         text = done.stdout + done.stderr
-        assert done.returncode == 1, (done.returncode, text)  # not a signal: PDAL's own filters abort on NaN
+        assert done.returncode == 1, (
+            done.returncode,
+            text,
+        )  # not a signal: PDAL's own filters abort on NaN
         assert says in text and message_of(text), text
 
 
