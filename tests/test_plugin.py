@@ -6,6 +6,7 @@ matter.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -13,11 +14,14 @@ import subprocess
 import time
 from pathlib import Path
 
+import laspy
+import numpy as np
 import processes
 import pytest
 from processes import ended
 
 import pdal_stages as ps
+from pdal_stages.classifier.recipes import RECIPES
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.read import apply_overrides, parse_overrides
 from pdal_stages.plugin import answers, building
@@ -185,6 +189,39 @@ def test_a_ready_pipeline_gives_the_same_bytes(
     assert written and written == sorted(path.name for path in (tmp_path / "stock").iterdir())
     for file in written:
         assert_same(tmp_path / "stock" / file, tmp_path / "ours" / file)
+
+
+#: Smaller than the papers' experiments, so that a test is short.
+QUICK_RECIPES = {
+    "blomley2016": ["count=60", "trees_grid=4,8"],
+    "weinmann2018": ["count=60", "trees=8"],
+    "weinmann2018-binary": ["count=60", "trees=8"],
+    "he2017": ["count=60", "trees=20"],
+    "winiwarter2019": ['alsnet={"configuration": "tiny", "points": 512, "epochs": 1}'],
+}
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_the_papers_pipelines_train_and_apply(pipeline, ready_town, tmp_path, recipe):
+    """Each recipe's ready pipeline through stock `pdal`, and the model it trains applied by it."""
+    if recipe == "winiwarter2019" and importlib.util.find_spec("torch") is None:
+        pytest.skip("PyTorch is not installed (extra 'deep'): training is not tested")
+    model, out = tmp_path / "paper.model", tmp_path / "out.las"
+    words = [f"--stage.input.filename={ready_town}", f"--stage.model.filename={model}"]
+    words += [f"--stage.model.{word}" for word in (*QUICK_RECIPES[recipe], "classes=2,5,6")]
+    if recipe.endswith("binary"):
+        words.remove("--stage.model.classes=2,5,6")
+    stages = with_words(f"paper-{recipe}", *words)
+    pipeline(stages)
+    apply = {"type": "filters.modelclassifier", "model": str(model)}
+    pipeline(las([*stages[:-1], apply], out))
+    before, after = laspy.read(ready_town), laspy.read(out)
+    judged = np.isin(before.classification, [2, 5, 6])
+    truth = np.asarray(before.classification)[judged]
+    if recipe.endswith("binary"):
+        truth = np.where(truth == 6, 6, 1)
+    right = np.mean(np.asarray(after.classification)[judged] == truth)
+    assert right > (0.3 if recipe == "winiwarter2019" else 0.8)
 
 
 # ---- views -------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pdal_stages import run_tiled
+from pdal_stages.classifier.recipes import RECIPES
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.read import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
@@ -33,13 +34,22 @@ def test_none_is_forgotten():
         "noise", "normalize", "features", "features-for-viewers", "train", "train-binary", "classify",
         "classify-with-rejection", "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
         "copc-to-tiles", "tile-index-to-tiles", "raw-to-footprints", "terrain-and-surface",
+        "classify-regularized", *(f"paper-{recipe}" for recipe in RECIPES),
     }  # fmt: skip
     assert {f.stem for f in FILES} == tested
     listed = (FOLDER.parent / "docs" / "how-to.md").read_text()
     assert all(f"`{f.name}`" in listed for f in FILES)
 
 
-@pytest.mark.parametrize("name", ["classify", "classify-with-rejection", "classify-on-smrf-ground"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "classify",
+        "classify-with-rejection",
+        "classify-on-smrf-ground",
+        "classify-regularized",
+    ],
+)
 def test_classify(ready_town, ready_models, tmp_path, name):
     out = tmp_path / "o.laz"
     model = ready_models / ("smrf.model" if "smrf" in name else "classes.model")

@@ -147,14 +147,20 @@ class AlsNet:
         )
         figures = request.report.figures
         if request.count:
-            mean, counted = self._means(request, values)
+            mean, variance, counted = self._means(request, values)
             figures.update(counted)
-            yield slice(None) if request.rows is None else request.rows, finish(mean)
+            made = finish(mean)
+            if request.variance:
+                made["variance"] = variance
+            yield slice(None) if request.rows is None else request.rows, made
 
     def _means(
         self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]
-    ) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
-        """Mean probabilities over the batches, and counts."""
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
+        """Return the mean probabilities over the batches, their variance, and counts.
+
+        The variance (n,) of a class's probability over the batches, mean over the classes, marks errors [WM19 5].
+        """
         from threadpoolctl import threadpool_limits
 
         rows, progress = request.rows, request.progress
@@ -165,7 +171,7 @@ class AlsNet:
         m = request.count
         place = np.full(len(xyz), -1)
         place[slice(None) if rows is None else rows] = np.arange(m)
-        total = np.zeros((m, self.n_classes))
+        total, squares = np.zeros((m, self.n_classes)), np.zeros(m)
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
         side_by_side = max(1, min(resolve_threads(request.threads), int(request.memory_mb / each)))
@@ -187,6 +193,7 @@ class AlsNet:
                 at, p = at[mine], p[mine]
                 new = int(np.count_nonzero(count[at] == 0))
                 total[at] += p
+                squares[at] += (p * p).sum(axis=1)
                 count[at] += 1
                 seen += new
                 if progress is not None:
@@ -199,7 +206,9 @@ class AlsNet:
             "batches": len(numbers),
             "batches_per_point": {"mean": round(float(count.mean()), 2), "least": int(count.min())},
         }
-        return total / count[:, None], counted
+        mean = total / count[:, None]
+        variance = (squares / count - (mean * mean).sum(axis=1)) / self.n_classes
+        return mean, np.maximum(variance, 0.0), counted
 
 
 def scaled(

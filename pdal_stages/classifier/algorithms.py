@@ -89,6 +89,8 @@ class PredictRequest:
     memory_mb: float = 256.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
+    #: whether a network adds "variance", (b,) float64, to the mapping that `finish` makes
+    variance: bool = False
     report: Report = field(
         default_factory=Report
     )  #: what is counted, complete when all blocks are read
@@ -107,6 +109,7 @@ class PredictionOptions(Settings):
     memory_mb: float = setting(256.0, "number", "Memory for blocks of points", 1, None, unit="MB")
     probabilities: bool = False  #: whether to return them
     margin: bool = False
+    variance: bool = False  #: of the probabilities over a network's batches
     #: points less reliable do not get the winning class, and are counted
     reject_below: float | None = setting(
         None, "number", "Points with a lower Reliability are rejected", 0, 1
@@ -127,6 +130,8 @@ class Prediction:
     unsure: npt.NDArray[np.int64]  #: (m,) points that were not reliable enough, and so rejected
     report: Report  #: counts, notes and warnings for the metadata
     margin: npt.NDArray[np.float32] | None = None  #: (n,) winning minus second probability
+    #: (n,) variance of a class's probability over a network's batches, mean over the classes
+    variance: npt.NDArray[np.float32] | None = None
     #: (n, classes) in the order of ``Model.classes``
     probabilities: npt.NDArray[np.float32] | None = None
 

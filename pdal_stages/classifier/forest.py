@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -183,16 +183,18 @@ def grow_forest(
     values: npt.NDArray[np.float32],
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
-    trees: int,
+    trees: int | Sequence[int],
     *,
     seed: int,
     min_samples_leaf: int = 1,
     max_samples: float = 1.0,
     max_features: str | int | float = "auto",
+    max_depth: str | int | None = None,
+    vote: str = "mean",
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[Forest, npt.NDArray[np.float64]]:
-    """A random forest, each tree of its own bootstrap sample, and (features,) importances that sum to 1, or to 0.
+    """Grow a random forest, each tree on its own bootstrap sample.
 
     Parameters
     ----------
@@ -202,8 +204,15 @@ def grow_forest(
         Class positions; every class occurs, if only with weight 0.
     weight : (n,) int
         Times a row counts; rows of weight 0 take no part.
-    min_samples_leaf, max_samples, max_features
+    trees : int or sequence of int
+        Number of trees; of several numbers the one with the highest out-of-bag accuracy [B16 4.2].
+    min_samples_leaf, max_samples, max_features, max_depth, vote
         See ``TrainingOptions``.
+
+    Returns
+    -------
+    Forest, (features,) float64
+        The forest, and the features' importances, which sum to 1, or to 0.
     """
     from sklearn.tree import DecisionTreeClassifier
 
@@ -213,25 +222,55 @@ def grow_forest(
         max_features = max(1, math.isqrt(features), features // 10)
     elif isinstance(max_features, int | np.integer):
         max_features = min(int(max_features), features)
+    if max_depth == "sqrt":
+        max_depth = max(1, math.isqrt(features))
+    counts = [trees] if isinstance(trees, int) else sorted(trees)
 
-    def one(number: int) -> tuple[Any, npt.NDArray[np.float64]]:
+    def grow_tree(number: int) -> tuple[Any, npt.NDArray[np.bool_]]:
         random = np.random.default_rng([seed, number])
         drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
         bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
         state = int(random.integers(0, 2**31 - 1))
         tree = DecisionTreeClassifier(
-            max_features=max_features, min_samples_leaf=min_samples_leaf, random_state=state
+            max_features=max_features,
+            max_depth=max_depth,
+            min_samples_leaf=min_samples_leaf,
+            random_state=state,
         )
         tree.fit(values, label, sample_weight=bag, check_input=False)
-        return tree.tree_, tree.feature_importances_
+        return tree, (bag == 0) & (weight > 0)
 
-    grown, total = [], np.zeros(features)
-    for tree, importances in map_blocks(one, range(trees), threads):
+    grown: list[Any] = []
+    accuracy: dict[int, float] = {}
+    shares = np.zeros((len(label) if len(counts) > 1 else 0, int(label.max()) + 1))
+    for tree, out_of_bag in map_blocks(grow_tree, range(counts[-1]), threads):
         grown.append(tree)
-        total += importances
+        if len(shares):
+            shares[out_of_bag] += tree.predict_proba(values[out_of_bag])
+            if len(grown) in counts:
+                judged = weight * shares.any(axis=1)
+                right = shares.argmax(axis=1) == label
+                accuracy[len(grown)] = float(right @ judged) / max(1, int(judged.sum()))
         if progress is not None:
             progress.update(1)
-    return Forest.from_sklearn(grown, features), total / (total.sum() or 1.0)
+    if accuracy:
+        grown = grown[: max(accuracy, key=lambda count: (accuracy[count], -count))]
+    importances = np.sum([tree.feature_importances_ for tree in grown], axis=0)
+    forest = Forest.from_sklearn([tree.tree_ for tree in grown], features)
+    if vote == "majority":
+        forest = replace(forest, leaf_counts=_winners(forest.leaf_counts))
+    return forest, importances / (importances.sum() or 1.0)
+
+
+def _winners(leaf_counts: npt.NDArray[np.uint32]) -> npt.NDArray[np.uint32]:
+    """Give all samples of each leaf (leaves, classes) to its most frequent class.
+
+    A tree then casts one vote, and the mean over the trees is the share of votes.
+    """
+    out = np.zeros_like(leaf_counts)
+    rows = np.arange(len(out))
+    out[rows, leaf_counts.argmax(axis=1)] = leaf_counts.sum(axis=1)
+    return out
 
 
 def _laid_out(

@@ -175,6 +175,12 @@ class Model:
             See :class:`PredictionOptions`.
         """
         how = PredictionOptions(**options)
+        if how.variance and not self.gives_variance:
+            raise OptionError(
+                "only a network gives a variance over batches",
+                found=", ".join(one.name for one in self.passes),
+                cure="Ask for the margin, which every model gives",
+            )
         xyz = check_xyz(xyz)
         n = len(xyz)
         given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads)
@@ -200,7 +206,11 @@ class Model:
         out: dict[str, npt.NDArray[Any]] = {
             "classification": np.zeros(n, np.uint8) if now is None else now.copy(),
             "reliability": np.zeros(n, np.float32),
-            **({"margin": np.zeros(n, np.float32)} if how.margin else {}),
+            **{
+                name: np.zeros(n, np.float32)
+                for name in ("margin", "variance")
+                if getattr(how, name)
+            },
             **(
                 {"probabilities": np.zeros((n, len(codes)), np.float32)}
                 if how.probabilities
@@ -228,7 +238,9 @@ class Model:
             needed = (*self.required_dimensions, *self.optional_dimensions)
             given = {name: np.asarray(given[name])[taken] for name in needed if name in given}
         shown = progress if representatives is None else None
-        request = PredictRequest(xyz, given, rows, how.threads, how.memory_mb, shown, grid)
+        request = PredictRequest(
+            xyz, given, rows, how.threads, how.memory_mb, shown, grid, variance=how.variance
+        )
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
         for at, decided in predict(
@@ -263,6 +275,11 @@ class Model:
         )
         report.merge(request.report)
         return Prediction(**out, unsure=unsure, report=report)
+
+    @property
+    def gives_variance(self) -> bool:
+        """Whether the model is a network alone, which sees each point in several batches."""
+        return len(self.passes) == 1 and self.passes[0].features is None
 
     def _prepared(
         self,

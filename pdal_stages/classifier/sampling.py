@@ -85,14 +85,18 @@ def draw_samples(
     seed: int,
     groups: Sequence[str] | None = None,
     *,
+    random_order: bool = False,
     progress: Progress | None = None,
 ) -> Samples:
     """Draw `count` samples of each class from several clouds.
 
-    `clouds` are pairs of (n, 3) coordinates in meters and (n,) class positions, -1 to leave the point out. No more samples
-    are drawn than the largest class has points; a class with fewer gives each of them count/n times, rounded down or up.
-    Clouds of one of the `groups` give as many of a class as those of the others, as far as they have them. `progress` is
-    updated with the points looked at: all of them once, and once more for each class.
+    `clouds` are pairs of (n, 3) coordinates in meters and (n,) class positions, -1 to leave the
+    point out. No more samples are drawn than the largest class has points; a class with fewer gives
+    each of them count/n times, rounded down or up. With `random_order` samples are drawn at random
+    from all points of a class instead of spread over the ground, and each class gives `count`, if
+    only as duplicates. Clouds of one of the `groups` give as many of a class as those of the
+    others, as far as they have them. `progress` is updated with the points looked at: all of them
+    once, and once more for each class.
     """
     names, of_cloud = np.unique(groups or [""] * len(clouds), return_inverse=True)
     there = np.zeros((len(names), n_classes), np.int64)
@@ -105,7 +109,8 @@ def draw_samples(
         raise OptionError(
             "a class has no samples", found=f"class position {int(np.argmin(available))}"
         )
-    count = min(count, int(available.max()))
+    if not random_order:
+        count = min(count, int(available.max()))
     alone = np.count_nonzero(there.any(axis=1)) == 1
     parts = []
     for position in range(n_classes):
@@ -127,7 +132,8 @@ def draw_samples(
                 if progress is not None:
                     progress.update(len(label))
             found, row, cloud = np.concatenate(keys), np.concatenate(rows), np.concatenate(where)
-            order = np.lexsort((found["hash"], found["cell"]))
+            cell = np.zeros_like(found["cell"]) if random_order else found["cell"]
+            order = np.lexsort((found["hash"], cell))
             place, weight = spread(len(order), int(quota[group]), np.random.default_rng(random))
             chosen = order[place]
             parts.append(

@@ -20,6 +20,7 @@ from ..features.cells import LARGEST, check_side
 from .algorithms import ALGORITHMS, trainer
 from .classes import MAX_LABEL
 from .context import OWN, Context
+from .recipes import with_recipe
 
 #: Most passes a model can have.
 MOST_PASSES = 3
@@ -76,10 +77,45 @@ class TrainingOptions(Settings):
         1,
         10**8,
     )
+    sampling: str = setting(
+        "spread",
+        "string",
+        "How samples are drawn: spread evenly over the ground, or at random from all points of a class",
+        choices=("spread", "random"),
+    )
     seed: int = setting(
         0, "integer", "Seed for sampling, trees and shape distributions", 0, 2**31 - 1
     )
     trees: int = setting(50, "integer", "Number of trees", 1, 10_000)
+    trees_grid: Sequence[int] = setting(
+        (),
+        "numbers",
+        "Numbers of trees to choose from by out-of-bag accuracy on the samples, instead of 'trees'",
+    )
+    max_depth: str | int | None = setting(
+        None,
+        "string",
+        "Maximum depth of a tree: a number, or sqrt for the root of the number of features; default: no limit",
+    )
+    vote: str = setting(
+        "mean",
+        "string",
+        "How trees decide: by the mean of their class probabilities, or by majority vote",
+        choices=("mean", "majority"),
+    )
+    scaling: str = setting(
+        "none",
+        "string",
+        "percentiles: limit shape measures and heights to their 1st and 99th percentile among the samples, which is "
+        "what scaling to [0, 1] changes for trees",
+        choices=("none", "percentiles"),
+    )
+    copt_threshold: float | None = setting(
+        None,
+        "number",
+        "Curvature from which on copt treats a point as scattered; default: by 2-means over the training clouds",
+        *(0, 1),
+    )
     min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", 1, 10**6)
     max_samples: float | None = setting(
         None,
@@ -229,6 +265,15 @@ class TrainingOptions(Settings):
                 "'max_features' must be auto, sqrt, log2, a number of features, or a share up to 1.0",
                 found=repr(m),
             )
+        depth = self.max_depth
+        if not (
+            depth in (None, "sqrt")
+            or (isinstance(depth, int | np.integer) and not isinstance(depth, bool) and depth >= 1)
+        ):
+            raise OptionError(
+                "'max_depth' must be a whole number of at least 1, or sqrt", found=repr(depth)
+            )
+        put("trees_grid", lambda what, _: _tree_numbers(what, self.trees_grid))
         put("dimensions", checks.names)
         thin = [self.thin] if isinstance(self.thin, int | float) else self.thin
         put(
@@ -252,10 +297,23 @@ class TrainingOptions(Settings):
         if own is not None:
             object.__setattr__(self, self.algorithm, own)
 
+    @classmethod
+    def from_recipe(cls, recipe: str, **options: Any) -> TrainingOptions:
+        """Return the options of a paper's experiment, a key of ``recipes.RECIPES``; `options` replace some."""
+        values = with_recipe({"recipe": recipe, **options})
+        del values["recipe"]
+        return cls(**values)
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Dimensions of the points that the classifier will use, X, Y and Z among them."""
         return trainer(self.algorithm).inputs(self)
+
+
+def _tree_numbers(what: str, numbers: Any) -> tuple[int, ...]:
+    """Return the candidates of a grid of numbers of trees, ascending; OptionError for other values."""
+    numbers = [numbers] if isinstance(numbers, int | float) else numbers
+    return tuple(sorted({checks.whole(what, number, 1, 10_000) for number in numbers}))
 
 
 def feature_plan(options: TrainingOptions) -> FeaturePlan:

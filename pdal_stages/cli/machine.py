@@ -129,6 +129,8 @@ def _options(options: argparse.Namespace) -> None:
             + ("  (required)" if option.required else f" [{default}]" * bool(default))
         )
         print(textwrap.indent(textwrap.fill(text, 74), " " * 6) + "\n")
+    if text := stage.describe_choices():
+        print(text)
 
 
 def _commands(parser: Parser, options: argparse.Namespace) -> None:

@@ -12,7 +12,16 @@ from ..base.messages import print_messages
 from . import INPUTS, Parser, takes_options, tiles
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
-_OF_TRAINING = ("base", "passes", "classes", "neighborhoods", "feature_set", "count", "trees")
+_OF_TRAINING = (
+    "recipe",
+    "base",
+    "passes",
+    "classes",
+    "neighborhoods",
+    "feature_set",
+    "count",
+    "trees",
+)
 
 
 def add_commands(parser: Parser) -> None:

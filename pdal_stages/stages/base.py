@@ -130,6 +130,11 @@ class Stage(ABC):
         every[where] = replace(every[where], help=f"{every[where].help}. {cls.where_help}")
         return tuple(every)
 
+    @classmethod
+    def describe_choices(cls) -> str:
+        """Return text on options whose words stand for more than a value, shown after them."""
+        return ""
+
     def check(self) -> None:
         """Refuse options that contradict each other; read the files they name."""
 

@@ -29,6 +29,7 @@ from ..classifier.clouds import TrainingCloud
 from ..classifier.foresttraining import SHORT
 from ..classifier.model import Model, loaded_model
 from ..classifier.modelfile import digest_of, find
+from ..classifier.recipes import RECIPES, describe_recipes, with_recipe
 from ..classifier.sureness import of_the_base
 from ..classifier.training import train
 from ..classifier.trainoptions import TrainingOptions
@@ -64,6 +65,12 @@ class ClassifierModel(Stage):
     needs_points = "train on"
     filename: str = option("filename", None, "The model file to write", required=True)
     label: str = option("string", "Classification", "Dimension that holds the labels")
+    recipe: str | None = option(
+        "string",
+        None,
+        "Set the options as a paper does; options given beside it replace the paper's",
+        choices=tuple(RECIPES),
+    )
     base: str | None = trained("base")
     algorithm: str = trained("algorithm", choices=tuple(ALGORITHMS))
     alsnet: dict | None = trained("alsnet")
@@ -81,8 +88,14 @@ class ClassifierModel(Stage):
     target: int | None = trained("target")
     background: int = trained("background")
     count: int = trained("count")
+    sampling: str = trained("sampling")
     seed: int = trained("seed")
     trees: int = trained("trees")
+    trees_grid: list = trained("trees_grid", may_be_empty=True)
+    max_depth: str | None = trained("max_depth")
+    vote: str = trained("vote")
+    scaling: str = trained("scaling")
+    copt_threshold: float | None = trained("copt_threshold")
     min_samples_leaf: int = trained("min_samples_leaf")
     max_samples: float | None = trained("max_samples")
     max_features: str = trained("max_features")
@@ -125,14 +138,15 @@ class ClassifierModel(Stage):
     )
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
-        given = dict(given)
-        classes, share = given.get("classes"), given.get("max_features")
+        given = with_recipe(given)
+        classes = given.get("classes")
         if isinstance(classes, str) and not classes.lstrip().startswith("{"):
             classes = [code.strip() for code in classes.split(",") if code.strip()]
         if isinstance(classes, list):  # of codes: as good as a mapping
             given["classes"] = {str(code): _number(code) for code in classes}
-        if isinstance(share, int | float) and not isinstance(share, bool):
-            given["max_features"] = str(share)
+        for name in ("max_features", "max_depth"):
+            if isinstance(given.get(name), int | float) and not isinstance(given[name], bool):
+                given[name] = str(given[name])
         self._preparation: list[dict[str, Any]] = []
         self._by_hand: list[str] = []
         super().__init__(given, place)
@@ -142,6 +156,10 @@ class ClassifierModel(Stage):
         cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
         return {"files": files_read(before)}
+
+    @classmethod
+    def describe_choices(cls) -> str:
+        return describe_recipes()
 
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
         self._preparation, self._by_hand = [], []
@@ -160,7 +178,8 @@ class ClassifierModel(Stage):
     def training(self) -> TrainingOptions:
         """The trainer's options."""
         values = {name: value for name, value in self.options.items() if name in _TRAINING}
-        values["max_features"] = _number(values["max_features"])
+        for name in ("max_features", "max_depth"):
+            values[name] = _number(values[name])
         if self.automatic:
             values["dimensions"] = DEFAULT_DIMENSIONS
         values["ignore"] = self.ignore.codes
@@ -257,6 +276,9 @@ class ClassifierModel(Stage):
         model.save(self.filename)
         shown = {key: model.info[key] for key in _SHOWN if key in model.info}
         report.figures |= {"model": self.filename, **shown}
+        threshold = getattr(model.passes[0].features, "copt_threshold", None)
+        if threshold is not None:
+            report.figures["copt_threshold"] = threshold
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
                 f"the base assigns {held:,} of {all_:,} samples of class {code} to classes without labels, where they stay: "

@@ -46,6 +46,11 @@ class ModelClassifier(Stage):
     margin: bool = option(
         "boolean", False, "Also write Margin: the winning probability minus the second highest"
     )
+    variance: bool = option(
+        "boolean",
+        False,
+        "Also write Variance: how much the probabilities vary over a network's batches (networks only)",
+    )
     reject_below: float | None = option(
         "number",
         None,
@@ -90,6 +95,12 @@ class ModelClassifier(Stage):
     def check(self) -> None:
         self.limits  # noqa: B018  refused here where nothing is known of the model
         codes = [code for code, _ in self.model.classes]
+        if self.variance and not self.model.gives_variance:
+            raise OptionError(
+                "option 'variance' is for networks",
+                found=f"{self.model_file}, a forest",
+                cure="Use 'margin'",
+            )
         if self.vegetation_heights and (HIGH_VEGETATION not in codes or {LOW, MEDIUM} & set(codes)):
             raise OptionError(
                 "option 'vegetation_heights' is for models that know vegetation as one class, 5",
@@ -151,7 +162,7 @@ class ModelClassifier(Stage):
         )
 
     def creates(self) -> dict[str, str]:
-        more = ["Margin"] if self.margin else []
+        more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
         if self.probabilities:
             more += [f"Probability_{code}" for code, _ in self.model.classes]
         return {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
@@ -190,6 +201,7 @@ class ModelClassifier(Stage):
                 memory_mb=self.memory,
                 probabilities=self.probabilities,
                 margin=self.margin,
+                variance=self.variance,
                 reject_below=self.reject_below,
                 rejected_code=self._rejected,
                 limits={code: one.reliability for code, one in (self.limits or {}).items()},
@@ -207,6 +219,8 @@ class ModelClassifier(Stage):
         }
         if found.margin is not None:
             values["Margin"] = found.margin
+        if found.variance is not None:
+            values["Variance"] = found.variance
         if found.probabilities is not None:
             columns = zip(self.model.codes, found.probabilities.T, strict=True)
             values |= {f"Probability_{code}": column for code, column in columns}

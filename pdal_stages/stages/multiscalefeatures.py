@@ -58,6 +58,13 @@ class MultiscaleFeatures(Stage):
     ignore: Selection = ignore_option(
         "Points that are left out, even as neighbors, and get no features"
     )
+    copt_threshold: float | None = option(
+        "number",
+        None,
+        "Curvature from which on copt treats a point as scattered; default: by 2-means over the points, or that of 'bins'",
+        minimum=0,
+        maximum=1,
+    )
     voxel: float = option(
         "number",
         0.0,
@@ -87,14 +94,14 @@ class MultiscaleFeatures(Stage):
 
     def check(self) -> None:
         check_side(self.voxel)
-        plan, (bins, threshold) = self.plan, _read_bins(self.bins)
+        plan, (bins, threshold) = self.plan, self._thresholds()
         if self.bins and Path(self.bins).exists():
             if (plan.shapes and bins is None) or (plan.copt and threshold is None):
                 raise _not_thresholds(self.bins, "none of what these features need")
             for part in plan.layout:
                 if part.shapes and bins is not None:
                     bins.thresholds(part.neighborhood.token)  # refused where there are none
-        elif plan.shapes or plan.copt:
+        elif plan.shapes or (plan.copt and threshold is None):
             self.instead_of_tiles = (
                 'Thresholds are fitted to the points: give "bins": "thresholds.json", and run the pipeline once without '
                 "--tile on one typical file, which writes it"
@@ -105,6 +112,11 @@ class MultiscaleFeatures(Stage):
                     f"the dimension name '{name}' is longer than the {_NAME_BYTES} bytes LAS allows",
                     cure="Use shorter neighborhood tokens",
                 )
+
+    def _thresholds(self) -> tuple[ShapeBins | None, float | None]:
+        """Return the thresholds of shape distributions and the curvature threshold, None where the points decide."""
+        bins, threshold = _read_bins(self.bins)
+        return bins, threshold if self.copt_threshold is None else self.copt_threshold
 
     def outputs(self) -> list[Output]:
         return (
@@ -119,7 +131,7 @@ class MultiscaleFeatures(Stage):
 
     def run(self, points: Points) -> dict[str, NDArray]:
         plan, names = self.plan, self.columns
-        bins, threshold = _read_bins(self.bins)
+        bins, threshold = self._thresholds()
         ignored = points.ignored(self.ignore)
         there = np.flatnonzero(~ignored)  # rows of the points that are seen
         xyz = points.xyz[there] if ignored.any() else points.xyz
@@ -158,6 +170,7 @@ class MultiscaleFeatures(Stage):
             {
                 "neighborhoods": len(plan.neighborhoods),
                 "features": len(names),
+                **({"copt_threshold": engine.copt_threshold} if plan.copt else {}),
                 **(
                     {}
                     if representatives is None

@@ -1,0 +1,165 @@
+"""Recipes: the papers' experiments by one word, held to the numbers in the papers' texts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pdal_stages import TrainingCloud, TrainingOptions, train
+from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier.forest import grow_forest
+from pdal_stages.classifier.foresttraining import limit_to_percentiles
+from pdal_stages.classifier.recipes import NOT_STATED, RECIPES, describe_recipes, with_recipe
+from pdal_stages.classifier.sampling import draw_samples
+from pdal_stages.classifier.trainoptions import feature_plan
+from pdal_stages.features import FeaturePlan
+from pdal_stages.stages.base import stage_from
+
+#: What the texts say, by recipe: [B16 3.1, 3.2.1, 4.2], [W18 3.1, 3.2, 4.3], [H17 2.2, 2.3, 3.1], [WM19 4.1].
+TEXTS = {
+    "blomley2016": {"count": 1000, "features": 312, "scaling": "percentiles", "vote": "majority"},
+    "weinmann2018": {
+        "count": 100_000,
+        "features": 560,
+        "scaling": "percentiles",
+        "vote": "majority",
+    },
+    "weinmann2018-binary": {"count": 100_000, "features": 560, "strategy": "binary"},
+    "he2017": {"count": 1000, "features": 6, "trees": 200, "max_depth": "sqrt"},
+}
+EVERYWHERE = {"sampling": "random", "passes": 1, "voxel": 0.0, "prior_weight": 0.0}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_recipe_is_what_the_text_says(name):
+    target = {"target": 6} if name.endswith("binary") else {}
+    options = TrainingOptions.from_recipe(name, **target)
+    wanted = {**EVERYWHERE, **TEXTS[name]}
+    assert len(feature_plan(options).names) == wanted.pop("features")
+    assert {key: getattr(options, key) for key in wanted} == wanted
+    assert not options.trees_grid or name == "blomley2016"
+
+
+def test_the_networks_recipe():
+    stage = stage_from(
+        {"type": "writers.classifiermodel", "filename": "a.model", "recipe": "winiwarter2019"}
+    )
+    assert stage.algorithm == "alsnet"
+    assert stage.alsnet["histogram_threshold"] == 20  # [WM19 4.1]
+    assert stage.alsnet["configuration"] == "alsnet4"
+    merged = with_recipe({"recipe": "winiwarter2019", "alsnet": {"epochs": 2}})["alsnet"]
+    assert merged == {**stage.alsnet, "epochs": 2}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_what_is_given_beside_a_recipe_replaces_its_value(name):
+    given = {"type": "writers.classifiermodel", "filename": "a.model", "recipe": name, "target": 6}
+    if "binary" not in name:
+        del given["target"]
+    stage = stage_from({**given, "voxel": 0.5, "count": 77})
+    assert (stage.voxel, stage.count) == (0.5, 77)
+    for option, (value, where) in RECIPES[name].options.items():
+        assert where
+        if option not in ("voxel", "alsnet"):
+            found = stage.options[option]
+            assert found == (77 if option == "count" else _plain(value)), option
+    assert f"  {name} " in describe_recipes() and NOT_STATED in describe_recipes()
+
+
+def _plain(value):
+    return list(value) if isinstance(value, tuple) else value
+
+
+def test_a_binary_recipe_asks_for_its_class():
+    with pytest.raises(OptionError, match="needs the option 'target'"):
+        with_recipe({"recipe": "weinmann2018-binary"})
+    with pytest.raises(OptionError, match="'recipe' must be one of"):
+        with_recipe({"recipe": "weinman2018"})
+
+
+def test_random_samples_and_duplicates_beyond_the_largest_class():
+    """[W18 4.3]: as many of each class as asked for, those of a class with fewer several times."""
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(0, 100, (3000, 3))
+    position = np.repeat([0, 1], [2900, 100])
+    samples = draw_samples([(xyz, position)], 2, 5000, 0, random_order=True)
+    for label, available in ((0, 2900), (1, 100)):
+        weight = samples.weight[samples.label == label]
+        assert weight.sum() == 5000 and len(weight) == available
+        assert weight.max() - weight.min() <= 1
+    few = draw_samples([(xyz, position)], 2, 50, 0, random_order=True)
+    again = draw_samples([(xyz[::-1], position[::-1])], 2, 50, 0, random_order=True)
+    assert {tuple(xyz[row]) for row in few.row} == {tuple(xyz[::-1][row]) for row in again.row}
+    # Samples spread over the ground take each quarter alike; at random they need not.
+    quarters = np.bincount((xyz[few.row[few.label == 0], 0] // 25).astype(int), minlength=4)
+    assert quarters.sum() == 50
+
+
+def test_scaling_is_the_papers_mapping_to_trees():
+    """A forest on limited features decides like one on features mapped to [0, 1] and cut off."""
+    rng = np.random.default_rng(1)
+    plan = FeaturePlan.parse("c1", feature_set="Linearity,HeightRange,D2")
+    values = rng.gamma(2.0, 2.0, (400, len(plan.names))).astype(np.float32)
+    values[5, 0] = 0.0
+    limited = values.copy()
+    limit_to_percentiles(limited, plan)
+    low, high = np.percentile(values, [1, 99], axis=0)
+    low[values.min(axis=0) == 0] = 0
+    for column, name in enumerate(plan.names):
+        expected = np.clip(values[:, column], low[column], high[column])
+        if name.startswith("D2"):
+            expected = values[:, column]
+        assert np.allclose(limited[:, column], expected)
+    label = (values[:, 0] + values[:, 1] > 8).astype(int)
+    forest, _ = grow_forest(limited, label, np.ones(400, int), 10, seed=0)
+    assert (
+        forest.predict_proba(values).argmax(axis=1) == forest.predict_proba(limited).argmax(axis=1)
+    ).all()
+
+
+def test_depth_votes_and_the_number_of_trees():
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(600, 6)).astype(np.float32)
+    label = (values[:, 0] + rng.normal(0, 0.7, 600) > 0).astype(int)
+    weight = np.ones(600, int)
+    forest, _ = grow_forest(values, label, weight, 20, seed=0, max_depth="sqrt")
+    assert forest.depths.max() == 2  # the root of six features
+    voting, _ = grow_forest(values, label, weight, 20, seed=0, vote="majority", min_samples_leaf=30)
+    mean, _ = grow_forest(values, label, weight, 20, seed=0, min_samples_leaf=30)
+    shares = voting.predict_proba(values)
+    assert np.allclose(shares * 20, np.rint(shares * 20))  # whole votes of 20 trees
+    assert not np.allclose(
+        mean.predict_proba(values) * 20, np.rint(mean.predict_proba(values) * 20)
+    )
+    # The grid takes the number whose forest is right about most samples that its trees have not seen.
+    chosen, _ = grow_forest(values, label, weight, (1, 5, 60), seed=0)
+    assert chosen.n_trees == 60
+    clear = (values[:, 0] > 0).astype(int)
+    assert grow_forest(values, clear, weight, (5, 60), seed=0)[0].n_trees in (5, 60)
+    whole, _ = grow_forest(values, label, weight, 60, seed=0)
+    assert np.array_equal(chosen.threshold, whole.threshold)  # of more trees the first ones
+
+
+def test_he2017_trains_and_classifies():
+    rng = np.random.default_rng(3)
+    ground = np.column_stack([rng.uniform(0, 30, (4000, 2)), rng.normal(0, 0.02, 4000)])
+    trees = np.column_stack([rng.uniform(0, 30, (2000, 2)), rng.uniform(1, 6, 2000)])
+    xyz, labels = np.concatenate([ground, trees]), np.repeat([2, 5], [4000, 2000])
+    options = TrainingOptions.from_recipe("he2017", count=300, folds=0)
+    model = train(TrainingCloud(xyz, labels), options, progress=False)
+    assert model.passes[0].forest.n_trees == 200 and model.passes[0].forest.depths.max() <= 2
+    assert (model.predict(xyz).classification == labels).mean() > 0.97
+    assert model.info["training"]["max_depth"] == "sqrt"
+
+
+def test_a_given_curvature_threshold_is_used_and_stored():
+    rng = np.random.default_rng(4)
+    xyz = np.concatenate(
+        [rng.uniform(0, 20, (3000, 3)) * [1, 1, 0.001], rng.uniform(0, 20, (2000, 3))]
+    )
+    labels = np.repeat([2, 5], [3000, 2000])
+    options = TrainingOptions.from_recipe(
+        "he2017", count=100, trees=5, folds=0, copt_threshold=0.05
+    )
+    model = train(TrainingCloud(xyz, labels), options, progress=False)
+    assert model.passes[0].features.copt_threshold == 0.05
