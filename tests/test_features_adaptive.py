@@ -286,6 +286,35 @@ def test_ropt_is_the_oracle_s(cloud):
             assert table[RADIUS, i] == r or abs(mine - min(entropies)) < 2e-9, f"query {i}"
 
 
+def dimensionality(members):
+    """Demantke et al. 2011: the entropy of (s1 - s2, s2 - s3, s3) / s1."""
+    values = np.linalg.eigvalsh(np.cov(members.T, bias=True))[::-1]
+    s1, s2, s3 = np.sqrt(np.maximum(values, 0))
+    shares = np.array([s1 - s2, s2 - s3, s3]) / s1
+    return -sum(share * np.log(share) for share in shares if share > 0)
+
+
+def test_rdim_has_the_lowest_entropy_of_dimensionality():
+    radii = radii_of(0.25, 2.0, 0.05)
+    other = 0
+    for xyz in CLOUDS.values():
+        queries = some(xyz, 25)
+        table, by_eigenentropy = choose(xyz, queries, "rdim", 10), choose(xyz, queries, "ropt", 10)
+        other += np.count_nonzero(table[RADIUS] != by_eigenentropy[RADIUS])
+        for i, q in enumerate(queries):
+            spheres = [oracle.sphere(xyz, q, radius) for radius in radii]
+            entropies = [
+                dimensionality(one) if len(one) >= 10 and np.ptp(one, axis=0).max() > 0 else np.inf
+                for one in spheres
+            ]
+            chosen = list(radii).index(table[RADIUS, i])
+            if np.isinf(entropies).all():
+                assert chosen == len(radii) - 1
+            else:
+                assert entropies[chosen] < min(entropies) + 1e-6, f"query {i}"
+    assert other > 20  # it is another neighborhood
+
+
 def test_members_at_exactly_a_radius_are_inside():
     xyz = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3], [0, 0, -0.3]])
     table = choose(xyz, xyz[:1], "ropt", 3)

@@ -153,41 +153,6 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     assert all(one["points"] == one["scattered"] for one in shares.values())
 
 
-def test_h17_radii_by_dimensionality(town):
-    """Against the definition, point by point; members, radius and features."""
-    cloud = clouds.Cloud("town", town.xyz, town.labels)
-    both = h17_oakland.by_dimensionality(cloud, kit.Cache(None), 1)
-    made, regular = both[h17_oakland.BY_DIMENSIONALITY], both[h17_oakland.V_C_BY_DIMENSIONALITY]
-    radii = np.round(np.arange(0.25, 2.001, 0.05), 9)
-    fewest = []
-    for i in np.random.default_rng(0).choice(len(town), 60, replace=False):
-        away = np.linalg.norm(town.xyz - town.xyz[i], axis=1)
-        entropies = {}
-        for radius in radii:
-            members = town.xyz[away <= radius]
-            if len(members) < 10:
-                continue
-            s3, s2, s1 = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(members.T, bias=True)), 0))
-            shares = np.array([s1 - s2, s2 - s3, s3]) / s1
-            entropies[radius] = -(shares * np.log(np.maximum(shares, 1e-300))).sum()
-        chosen = round(float(made[i, 6]), 2)
-        if entropies:
-            assert entropies[chosen] == pytest.approx(min(entropies.values()), abs=1e-3)
-        else:
-            assert chosen == 2.0
-        within = {radius: entropy for radius, entropy in entropies.items() if radius >= 0.5}
-        other = round(float(regular[i, 6]), 2)
-        assert (
-            other == 2.0
-            if not within
-            else within[other] == pytest.approx(min(within.values()), abs=1e-3)
-        )
-        fewest.append((away <= chosen).sum())
-        members = town.xyz[away <= chosen]
-        assert made[i, 1] == pytest.approx(np.ptp(members[:, 2]), abs=1e-5)
-    assert min(n for n in fewest if n >= 10) < 30
-
-
 def test_h17_score_and_report(town, monkeypatch):
     monkeypatch.setattr(h17_oakland, "COUNT", 50)
     monkeypatch.setattr(h17_oakland, "TREES", 5)

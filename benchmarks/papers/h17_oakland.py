@@ -40,9 +40,9 @@ from kit import (
 from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.features import FeatureEngine, FeaturePlan
-from pdal_stages.features.adaptive import curvature_threshold, radii_of
-from pdal_stages.features.neighborhoods import LEAST_MEMBERS, ROPT_DEFAULT
+from pdal_stages.features import FeaturePlan
+from pdal_stages.features.adaptive import curvature_threshold
+from pdal_stages.features.neighborhoods import LEAST_MEMBERS
 
 CLASSES = {2: "Ground", 5: "Vegetation", 6: "Facade", 14: "Wire", 15: "Pole/trunk"}
 SIX = ("Verticality", "HeightRange", "Linearity", "Planarity", "Scattering", "SurfaceVariation")
@@ -51,8 +51,8 @@ TOKENS = {"v_k": "kopt", "v_r": "ropt", "v_c": "copt"}
 BY_DIMENSIONALITY = "v_r by dimensionality"
 #: v_c, whose regular half is v_r within other radii, read the same way.
 V_C_BY_DIMENSIONALITY = "v_c by dimensionality"
-#: The smallest radius of v_c's regular half, meters.
-LEAST_REGULAR = 0.5
+#: The neighborhoods by dimensionality; v_c's regular half has radii from 0.5 m on.
+DIMENSIONALITY = {BY_DIMENSIONALITY: "rdim", V_C_BY_DIMENSIONALITY: "rdim(0.5,2,0.05)"}
 #: What v_c takes for scattered and for regular points, each for all points.
 HALVES = {"scattered": "k in 10..50 within 3 m", "regular": "r in 0.5..2.0 m"}
 EVERY = {*TOKENS, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY, *HALVES}
@@ -121,6 +121,7 @@ def compute(
     """The tables of Part that some names of neighborhoods need, cloud by cloud."""
     words = (*SIX, "Radius")
     tokens = {"v_k": ["kopt"], "v_r": ["ropt"], "v_c": ["copt"], "regular": ["copt"]}
+    tokens |= {name: [token] for name, token in DIMENSIONALITY.items()}
     wanted = sorted({token for name in needed for token in tokens.get(name, [])})
     # Without a threshold above 1/3 a point is regular, with one of 0 it is scattered.
     plans = {
@@ -139,9 +140,11 @@ def compute(
         parts.setdefault("curvature", []).append(
             np.where(members < LEAST_MEMBERS, 1.0 / 3.0, curvature)
         )
-        for token, name in (("kopt", "kopt"), ("ropt", "ropt"), ("copt", "regular")):
-            if token in wanted:
-                columns = [names.index(f"{word}_{token}") for word in words]
+        kept = {"kopt": "kopt", "ropt": "ropt", "copt": "regular"}
+        kept |= {token: name for name, token in DIMENSIONALITY.items()}
+        for one in plans[""][0].neighborhoods:
+            if name := kept.get(one.token):
+                columns = [names.index(f"{word}_{one.suffix}") for word in words]
                 parts.setdefault(name, []).append(np.array(first[:, columns]))
         columns = [
             plans["scattered"][0].names.index(f"{word}_copt") for word in words
@@ -149,9 +152,6 @@ def compute(
         column = features(cloud, FeaturePlan.parse("c1", "HeightRange"), cache, threads=threads)
         parts.setdefault("column", []).append(np.array(column[:, 0]))
         parts.setdefault("scattered", []).append(np.array(second[:, columns]))
-        if needed & {BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY}:
-            for name, one in by_dimensionality(cloud, cache, threads).items():
-                parts.setdefault(name, []).append(one)
     joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     return Part(
         np.concatenate([cloud.labels for cloud in clouds]),
@@ -163,50 +163,6 @@ def compute(
         joined.pop("column"),
         joined,
     )
-
-
-def by_dimensionality(cloud: Cloud, cache: Cache, threads: int | None) -> dict[str, np.ndarray]:
-    """The six features and the radius, (n, 7), of the radius whose entropy of dimensionality is the lowest.
-
-    By name: of v_r, and of those of its radii that v_c's regular half has. With s1 >= s2 >= s3 the roots of the
-    eigenvalues, that is the entropy of (s1 - s2, s2 - s3, s3) / s1 [Demantke et al. 2011]. Radii with fewer than
-    LEAST_MEMBERS points are no candidates; where all are, the largest is taken.
-    """
-    radii = radii_of(*ROPT_DEFAULT)
-    plan = FeaturePlan.parse([f"s{radius:g}" for radius in radii], (*SIX, "Density"))
-    columns = {
-        one: [plan.names.index(f"{one}_{n.suffix}") for n in plan.neighborhoods]
-        for one in (*SIX, "Density")
-    }
-    volume = 4.0 / 3.0 * np.pi * radii**3
-
-    def apply(values: np.ndarray, _: np.ndarray) -> np.ndarray:
-        third = np.sqrt(values[:, columns["Scattering"]].astype(np.float64))
-        second = np.sqrt(values[:, columns["Planarity"]] + third**2)
-        shares = np.stack([1.0 - second, second - third, third])
-        entropy = -(shares * np.log(np.maximum(shares, 1e-300))).sum(axis=0)
-        members = np.rint(values[:, columns["Density"]] * volume)
-        entropy[members < LEAST_MEMBERS] = np.inf
-        rows, out = np.arange(len(values)), []
-        for least in (0.0, LEAST_REGULAR):
-            entropy[:, radii < least - 1e-9] = np.inf
-            best = np.where(np.isinf(entropy).all(axis=1), len(radii) - 1, entropy.argmin(axis=1))
-            out += [*(values[rows, np.array(columns[one])[best]] for one in SIX), radii[best]]
-        return np.column_stack(out).astype(np.float32)
-
-    def make() -> np.ndarray:
-        note(f"radii of {cloud.name} by dimensionality")
-        out = np.empty((len(cloud), 2 * (len(SIX) + 1)), np.float32)
-        for rows, made in FeatureEngine(cloud.xyz, plan, threads=threads).blocks(apply=apply):
-            out[rows] = made
-        return out
-
-    both = cache.array(
-        {"what": "dimensionality twice", "cloud": fingerprint(cloud.xyz), "least": LEAST_MEMBERS},
-        make,
-    )
-    names = (BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY)
-    return {name: np.array(part) for name, part in zip(names, np.hsplit(both, 2), strict=True)}
 
 
 def matrix(part: Part, six: np.ndarray, height: str) -> np.ndarray:

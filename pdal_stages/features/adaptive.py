@@ -1,14 +1,16 @@
-"""Neighborhoods whose size adapts to the points: the k nearest, ``kopt``, ``ropt`` and ``copt``.
+"""Neighborhoods whose size adapts to the points: the k nearest, ``kopt``, ``ropt``, ``rdim`` and ``copt``.
 
-All are chosen among nested ones, made of a query's neighbors in the order of distance, whose moments are summed up once. The
-k nearest are the point and its k nearest: n = k + 1 members, as in Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the
-radius with the lowest eigenentropy. ``copt`` looks at the curvature (surface variation) of the sphere of 1 m first: where
-it is at least c_t the point is *scattered* and takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes
-the best radius of 0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
+All are chosen among nested ones, made of a query's neighbors in the order of distance, whose
+moments are summed up once. The k nearest are the point and its k nearest: n = k + 1 members, as in
+Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest eigenentropy,
+``rdim`` the radius with the lowest entropy of dimensionality. ``copt`` looks at the curvature
+(surface variation) of the sphere of 1 m first: where it is at least c_t the point is *scattered* and
+takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of
+0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
 
-A candidate needs members that do not all coincide, three of them, among radii ``neighborhoods.LEAST_MEMBERS``. Where none
-qualifies (a lone point, copies of one point) the largest is taken; its eigen-features then say "no structure". The
-curvature of a sphere with fewer is 1/3.
+A candidate needs members that do not all coincide, three of them, among radii
+``neighborhoods.LEAST_MEMBERS``. Where none qualifies (a lone point, copies of one point) the largest
+is taken; its eigen-features then say "no structure". The curvature of a sphere with fewer is 1/3.
 """
 
 from __future__ import annotations
@@ -21,7 +23,13 @@ import numpy as np
 from ..base.jit import device, njit
 from ..base.resources import map_blocks
 from .bins import ShapeBins
-from .entropy import add_up, eigenvalues_of, lowest_entropy, write_moments
+from .entropy import (
+    add_up,
+    eigenvalues_of,
+    lowest_dimensionality,
+    lowest_entropy,
+    write_moments,
+)
 from .index import CellGrid, build_tree
 from .moments import COINCIDENT, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
 from .neighborhoods import AROUND, COPT_REACH
@@ -96,7 +104,8 @@ class Search:
     ks: np.ndarray  # neighbors besides the point itself, ascending
     within2: float  # all points within this squared distance are wanted
     cap2: float  # and of those within this one as many as the last of `ks` says
-    # (numbers, 3) int64: first and end of the candidates among radii and ks; members they need
+    # (numbers, 4) int64: first and end of the candidates among radii and ks, members they need, and
+    # 1 where the entropy of dimensionality chooses, 0 where the eigenentropy does
     choices: np.ndarray
     curved: bool = False  # copt: radii where it is regular
 
@@ -155,7 +164,7 @@ class AdaptiveNeighborhoods:
         curvatures = np.empty(len(self.grid))
         radius = np.array([CURVATURE_RADIUS])
         search = Search(
-            (), radius, np.zeros(0, np.int64), 1.0, 1.0, np.zeros((0, 3), np.int64), True
+            (), radius, np.zeros(0, np.int64), 1.0, 1.0, np.zeros((0, 4), np.int64), True
         )
         self._for_all(
             lambda part: self.choose(
@@ -248,11 +257,11 @@ def _by_number(ranges: dict[int, tuple[int, int]], around: bool) -> Search:
     all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
     ks = np.array(sorted(all_ks | ({AROUND} if around else set())), np.int64)
     choices = [
-        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST]
+        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST, 0]
         for first, last in ranges.values()
     ]
     return Search(
-        tuple(ranges), np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 3)
+        tuple(ranges), np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 4)
     )
 
 
@@ -265,7 +274,7 @@ def _searches(chosen: list[Columns], least: int) -> list[Search]:
             continue
         radii = radii_of(*(one.parameters or COPT_RADII))
         within2 = float(radii[-1] * radii[-1])
-        choices = np.array([[0, len(radii), least]], np.int64)
+        choices = np.array([[0, len(radii), least, one.kind == "rdim"]], np.int64)
         search = Search((number,), radii, np.zeros(0, np.int64), within2, within2, choices)
         if one.kind == "copt":
             ks = np.arange(COPT_K[0], COPT_K[1] + 1)
@@ -386,7 +395,10 @@ def _adaptive(
                     first, last, members = choices[j, 0], choices[j, 1], choices[j, 2]
                     if curved and curvature[q] >= threshold:
                         first, last, members = shells, count, LEAST
-                    best = lowest_entropy(s, first, last, members)
+                    if choices[j, 3]:
+                        best = lowest_dimensionality(s, first, last, members)
+                    else:
+                        best = lowest_entropy(s, first, last, members)
                     n = ends[best]
                     write_moments(s, best, table[j], q)
                     reach = 0.0

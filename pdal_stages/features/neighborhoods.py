@@ -28,6 +28,9 @@ PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 KOPT_DEFAULT = (10.0, 100.0)  # k_min, k_max [B16]
 ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in meters [H17]
+#: Kinds that choose a radius: by the lowest eigenentropy, or by the lowest entropy of dimensionality
+#: (Demantke et al. 2011, which [H17] cites).
+BY_RADIUS = ("ropt", "rdim")
 #: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with fewer are not
 #: candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t of 0.03 and the counts of its
 #: Table 1 come out (docs/papers.md), with three they do not.
@@ -45,13 +48,13 @@ MOST = 64
 #: Sides of cells of an absolute grid that can be asked for, meters: powers of two, so that corners are exact.
 SIDES = tuple(2.0**k for k in range(-3, 7))
 
-_KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
+_KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "rdim", "copt", *PRESETS)
 _TOKEN = re.compile(
-    r"(?P<head>kopt|ropt|copt|c|s|k)(?P<value>\d+(?:\.\d*)?|\.\d+)?(?:\((?P<inner>[^()]*)\))?"
+    r"(?P<head>kopt|ropt|rdim|copt|c|s|k)(?P<value>\d+(?:\.\d*)?|\.\d+)?(?:\((?P<inner>[^()]*)\))?"
 )
 _CURE = (
     "Write c2 (vertical cylinder of 2 m radius), s1 (sphere of 1 m), k50 (50 nearest), "
-    "kopt, kopt(10,100), ropt, ropt(0.25,2,0.05), copt, or a preset: " + ", ".join(PRESETS)
+    "kopt, kopt(10,100), ropt, ropt(0.25,2,0.05), rdim, copt, or a preset: " + ", ".join(PRESETS)
 )
 
 
@@ -59,10 +62,10 @@ _CURE = (
 class Neighborhood:
     """One neighborhood definition. Make it with :func:`parse_neighborhoods`."""
 
-    #: ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt`` or ``copt``.
+    #: ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt``, ``rdim`` or ``copt``.
     kind: str
-    #: Cylinder and sphere: (radius in meters,); knn: (k,); kopt: (k_min, k_max); ropt: (r_min, r_max, step) in meters;
-    #: copt: ().
+    #: Cylinder and sphere: (radius in meters,); knn: (k,); kopt: (k_min, k_max); ropt and rdim:
+    #: (r_min, r_max, step) in meters; copt: ().
     parameters: tuple[float, ...] = ()
 
     @property
@@ -71,7 +74,9 @@ class Neighborhood:
         values = [_number(value) for value in self.parameters]
         if self.kind in ("cylinder", "sphere", "knn"):
             return {"cylinder": "c", "sphere": "s", "knn": "k"}[self.kind] + values[0]
-        default = {"kopt": KOPT_DEFAULT, "ropt": ROPT_DEFAULT}.get(self.kind, ())
+        default = {"kopt": KOPT_DEFAULT, **dict.fromkeys(BY_RADIUS, ROPT_DEFAULT)}.get(
+            self.kind, ()
+        )
         if self.parameters == default:
             return self.kind
         return f"{self.kind}({','.join(values)})"
@@ -86,14 +91,14 @@ class Neighborhood:
         """The farthest a member can be, in meters; ``None`` where a number of points decides."""
         if self.kind in ("cylinder", "sphere"):
             return self.parameters[0]
-        if self.kind == "ropt":
+        if self.kind in BY_RADIUS:
             return self.parameters[1]
         return COPT_REACH if self.kind == "copt" else None
 
     @property
     def adaptive(self) -> bool:
         """Whether the size is chosen point by point (and so is a feature, ``Radius``)."""
-        return self.kind in ("kopt", "ropt", "copt")
+        return self.kind in ("kopt", *BY_RADIUS, "copt")
 
     def __str__(self) -> str:
         return self.token
@@ -201,18 +206,18 @@ def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
                 f"kopt takes two whole numbers, kopt(k_min,k_max), 2 <= k_min <= k_max <= {MAX_K}",
                 found=text,
             )
-    elif head == "ropt":
+    elif head in BY_RADIUS:
         values = values or ROPT_DEFAULT
         if len(values) != 3 or not (
             MIN_RADIUS <= values[0] <= values[1] <= MAX_RADIUS and values[2] >= MIN_RADIUS
         ):
             raise OptionError(
-                f"ropt takes meters, ropt(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max",
+                f"{head} takes meters, {head}(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max",
                 found=text,
             )
         if (values[1] - values[0]) / values[2] > 1000:
             raise OptionError(
-                "ropt may try at most 1000 radii", found=text, cure="Make the step larger"
+                f"{head} may try at most 1000 radii", found=text, cure="Make the step larger"
             )
     elif values:
         raise OptionError("copt takes no values", found=text, cure="Write copt")

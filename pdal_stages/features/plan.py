@@ -15,6 +15,7 @@ from ..base.errors import OptionError, suggest
 from . import returns
 from .neighborhoods import (
     AROUND,
+    BY_RADIUS,
     LEAST_MEMBERS,
     Neighborhood,
     parse_neighborhoods,
@@ -37,7 +38,7 @@ GEOMETRIC = {
     "Verticality": "1 - |nz|, n the unit eigenvector of l3",
     "HeightRange": "highest minus lowest z, meters",
     "HeightStd": "standard deviation of z (divisor n), meters",
-    "Radius": "the chosen size in meters; kopt, ropt and copt only",
+    "Radius": "the chosen size in meters; kopt, ropt, rdim and copt only",
 }
 #: What the papers' sets of features lack, and "all" therefore leaves out.
 RELATIVE = {
@@ -247,7 +248,9 @@ class FeaturePlan:
             raise OptionError(
                 f"none of the neighborhoods has the feature '{', '.join(self.features)}'",
                 found=", ".join(n.token for n in self.neighborhoods),
-                cure="Radius exists for kopt, ropt and copt only" if "Radius" in wanted else cure,
+                cure="Radius exists for kopt, ropt, rdim and copt only"
+                if "Radius" in wanted
+                else cure,
             )
         if clash := {*names} & {*self.dimensions}:
             raise OptionError(f"the dimension '{min(clash)}' is also a computed feature")
@@ -311,7 +314,7 @@ class FeaturePlan:
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able description; :meth:`from_dict` reads it."""
-        by_radius = any(one.kind in ("ropt", "copt") for one in self.neighborhoods)
+        by_radius = any(one.kind in (*BY_RADIUS, "copt") for one in self.neighborhoods)
         return {
             "neighborhoods": [n.token for n in self.neighborhoods],
             "features": list(self.features),
