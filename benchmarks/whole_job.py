@@ -35,7 +35,6 @@ from pdal_stages.base.version import __version__
 from pdal_stages.classifier import context as contexts
 from pdal_stages.classifier.forest import Forest
 from pdal_stages.features import engine as feature_engine
-from pdal_stages.objects.consistency import consistent
 from pdal_stages.synthetic import make_town, write_town
 from pdal_stages.terrain import detached_noise, filtered_ground
 
@@ -147,10 +146,8 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
     xyz = np.column_stack([las.x, las.y, las.z])
     axes = np.ascontiguousarray(xyz.T)
     some = axes[:, :2000]  # kernels
-    kinds = np.full(some.shape[1], 6)
     detached_noise(*some)
-    few = filtered_ground(*some, openings=(5, 17), threads=1)
-    consistent(some.T, kinds, height=few["HeightAboveGround"], ground=few["Ground"])
+    filtered_ground(*some, openings=(5, 17), threads=1)
     timed("noise", detached_noise)(*axes)
     dimensions = timed("heights", filtered_ground)(*axes, openings=(5, 17), threads=1)
     dimensions["ReturnNumber"] = np.asarray(las.return_number)
@@ -173,10 +170,7 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
         finally:
             Forest.predict_proba, contexts.cell_means = forest, around  # type: ignore[method-assign]
             feature_engine.Run.compute = compute  # type: ignore[method-assign]
-        ground, height = dimensions["Ground"], dimensions["HeightAboveGround"]
-        las.classification, _ = timed("consistency", consistent)(
-            xyz, found.classification, height=height, ground=ground
-        )
+        las.classification = found.classification
         timed("writing", las.write)(Path(folder, "out.laz"))
     inside = ("features", "forests", "context")
     spent["the rest of classification"] = spent.pop("classification") - sum(

@@ -18,6 +18,7 @@ from block_scene import QUICK_TRAINING, ground_and_block
 from pdal_stages.base.errors import PipelineError
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.inputs_outputs import outputs_of
 
 pytestmark = pytest.mark.pdal
@@ -335,3 +336,12 @@ def test_points_beyond_the_box_of_the_header(folder, classify, tmp_path, tile):
     (tmp_path / "odd.laz").write_bytes(content)
     code, _, err = classify(tmp_path / "odd.laz", tmp_path / "out.laz", *tile)
     assert code == 0 and "odd.laz: points lie outside the bounding box in the header" in err, err
+
+
+def test_heights_of_vegetation_reach_the_classifier():
+    (classifier,) = [
+        stage
+        for stage in ClassifyRequest(vegetation_heights="0.5,2").stages
+        if stage["type"] == "filters.modelclassifier"
+    ]
+    assert classifier["vegetation_heights"] == "0.5,2"

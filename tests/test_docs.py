@@ -153,7 +153,6 @@ def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it(monkeypatch
     words = ["--model", ROOT / "pdal_stages" / "models" / "standard.model"]
     for option, name in (
         ("scores", ""),
-        ("rules", "-rules"),
         ("unseen", "-unseen"),
         ("places", "-places"),
     ):

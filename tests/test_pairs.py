@@ -301,7 +301,6 @@ def run(row, files, model, folder):
             "--model",
             model,
             "--no-noise",
-            "--no-consistency",
             *words,
         ]
         command += [

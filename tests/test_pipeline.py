@@ -120,7 +120,7 @@ def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     }
     classifier = {"type": "filters.modelclassifier", "model": str(model)}
     ours = [{"type": "filters.detachednoise"}, heights, classifier, {"type": "filters.bridges"}]
-    stages = [str(cloud), *ours, {"type": "filters.consistency"}]
+    stages = [str(cloud), *ours, {"type": "filters.wires"}]
     alone = [stages[0], *({**stage, "tag": f"t{n}"} for n, stage in enumerate(stages[1:]))]
     pipelines = [ps.Pipeline(each) for each in (stages, alone)]
     plain, tagged = (merge_filters(pipeline.expanded.stages) for pipeline in pipelines)

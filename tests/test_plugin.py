@@ -125,7 +125,6 @@ EVERY = [
     },
     {"type": "filters.wires", "code": 13},
     {"type": "filters.bridges", "code": 18},
-    {"type": "filters.consistency", "lone": False, "where": "X > 500030 && Classification != 6"},
     {"type": "filters.objects", "refuse": ["low", "small"]},
     {"type": "filters.accuracy", "reference": "Classification", "print": False},
 ]

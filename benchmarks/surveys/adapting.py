@@ -4,7 +4,7 @@
 
 Each survey is classified by the model that has not seen it (MODELS is what ``leave_one_out.py --save`` filled), that model
 is adapted to the survey, which shows no labels, and the survey is classified again. Scored as in ``leave_one_out.py``, with
-all that ``classify`` does: noise, decks, rules.
+all that ``classify`` does: noise and decks.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The card of a shipped model: what it was trained on, how it does survey by survey, where it fails.
 
-    python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE --rules RULES \\
+    python benchmarks/surveys/card.py --model pdal_stages/models/standard.model --scores FILE \\
         --unseen UNSEEN --places PLACES > docs/models.md
 
-FILE is what leave_one_out.py wrote, RULES what rules.py wrote, UNSEEN what unseen.py wrote, PLACES what places.py wrote.
+FILE is what leave_one_out.py wrote, UNSEEN what unseen.py wrote, PLACES what places.py wrote.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from leave_one_out import NAMES, THINNED, tables
 from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS, SLOPES
-from rules import table
 from sources import SOURCES
 from surveys import SHIPPED, SURVEYS, UNLIKE
 
@@ -89,7 +88,6 @@ def main() -> None:
     )
     options.add_argument("--model", type=Path, required=True)
     options.add_argument("--scores", type=Path, required=True)
-    options.add_argument("--rules", type=Path, required=True)
     options.add_argument("--unseen", type=Path, required=True)
     options.add_argument("--places", type=Path, required=True)
     args = options.parse_args()
@@ -133,7 +131,6 @@ def main() -> None:
             others=len(at(unseen["surveys"], None)),
             left=", ".join(UNLIKE),
             surveys="\n".join(surveys),
-            rules=table(json.loads(args.rules.read_text())),
             count=OPTIONS.count,
             most=MOST,
             below=BELOW,

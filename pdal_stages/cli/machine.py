@@ -250,7 +250,6 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..classifier.clouds import TrainingCloud
     from ..classifier.training import train
     from ..classifier.trainoptions import TrainingOptions
-    from ..objects.consistency import consistent
     from ..objects.crowns import crown_cells
     from ..objects.roofs import roof_planes
     from ..synthetic import make_town
@@ -289,7 +288,6 @@ def _warmup(options: argparse.Namespace) -> None:
     classes = np.where(xyz[:, 2] > 6.0, 6, 2)
     model = train(TrainingCloud(xyz, classes, dimensions), how, progress=False)
     model.predict(xyz, dimensions, threads=1)
-    consistent(xyz, classes)
     crown_cells(np.ones((9, 9)), 0.5, 0.5, 2.0)
     roof_planes(np.ones((9, 9)), 0.5)
     if options.all:

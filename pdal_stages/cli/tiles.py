@@ -36,7 +36,7 @@ _MOST_FAILURES, _MOST_TILES = 20, 50
 def add_commands(parser: Parser) -> None:
     """``classify``."""
     what = "Classify point clouds: ground, vegetation, buildings and more"
-    rare = ("dimensions", "bridges", "consistency", "metadata", "scheduler", "per")
+    rare = ("dimensions", "bridges", "metadata", "scheduler", "per")
     takes = parser.command("classify", _classify, what, overrides=True, logged=True, rare=rare)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("output", help="A file, a folder, or a name with # for the input's")
@@ -52,7 +52,6 @@ def add_commands(parser: Parser) -> None:
         ("--bridges", True, "Find bridge decks, class 17 (default: on)"),
         ("--wires", False, "Find wires, class 14; without it they become building"),
         ("--towers", False, "Find wires, and towers and poles, class 15"),
-        ("--consistency", True, "Correct classes that contradict their surroundings (default: on)"),
     ):
         takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
     takes(
@@ -85,7 +84,7 @@ def _classify(options: argparse.Namespace) -> int:
         if listed is None
         else tuple(name.strip() for name in listed.split(",") if name.strip())
     )
-    same = ("noise", "bridges", "towers", "consistency", "keep_sure")
+    same = ("noise", "bridges", "towers", "keep_sure")
     request = ClassifyRequest(
         options.model,
         tuple(others),

@@ -41,7 +41,6 @@ class ClassifyRequest:
     )
     wires: bool = False  #: find wires, where heights are computed
     towers: bool = False  #: find wires, and towers and poles
-    consistency: bool = True  #: correct classes that contradict their surroundings
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     #: Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
     vegetation_heights: str = ""
@@ -130,7 +129,6 @@ class ClassifyRequest:
     @property
     def _corrections(self) -> list[dict[str, Any]]:
         """The corrections after the classifier, for models with the classes they need, and polygons last."""
-        known = {code for code, _ in self.loaded.classes}
         if self._by_class and self.polygons:
             raise OptionError(
                 "--where by Classification cannot be combined with --polygons: the classes are new by then",
@@ -144,7 +142,6 @@ class ClassifyRequest:
         wanted = {
             "filters.bridges": self._with_bridges,
             "filters.wires": self.wires and not self._by_class,
-            "filters.consistency": self.consistency and known >= {2, 6} and not self._by_class,
             "filters.polygons": bool(self.polygons),
         }
         stages = [
@@ -153,8 +150,6 @@ class ClassifyRequest:
         for stage in stages:
             if stage["type"] == "filters.wires" and self.towers:
                 stage["towers"] = True
-            if stage["type"] == "filters.consistency" and settled.get("vegetation_heights"):
-                stage["vegetation_heights"] = settled["vegetation_heights"]
         if self.polygons:
             stages[-1]["polygons"] = list(self.polygons)
         return stages

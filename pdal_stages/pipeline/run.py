@@ -41,7 +41,6 @@ LEFT_ALONE = {
     "decks": "bridge decks (bridges)",
     "wires": "wires (wires)",
     "towers": "towers and poles (wires)",
-    "changed": "corrected by rules (consistency)",
 }
 
 

@@ -244,7 +244,7 @@ class _Types(UserDict):
 
 _TYPES = _Types(
     {f"filters.{name}": name for name in (
-        "accuracy", "bridges", "consistency", "detachednoise", "hag_minima", "hag_morphological", "modelclassifier",
+        "accuracy", "bridges", "detachednoise", "hag_minima", "hag_morphological", "modelclassifier",
         "multiscalefeatures", "objects", "polygons", "wires",
     )} | {"writers.classifiermodel": "classifiermodel", "writers.objects": "objectswriter"}
 )  # fmt: skip

@@ -16,7 +16,7 @@ from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.modelfile import find
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
 from .base import Stage
-from .options import code_option, ignore_option, keep_option, option, vegetation_heights_option
+from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
 from .preparation import as_json, same
 from .selection import Selection
@@ -75,8 +75,11 @@ class ModelClassifier(Stage):
         "Points that are neighbors but keep their class, written as for ignore; default: 12, overlap of strips, which "
         "classifying would overwrite"
     )
-    vegetation_heights: tuple[float, float] | None = vegetation_heights_option(
-        "vegetation (5) below them becomes low (3) and medium (4)"
+    vegetation_heights: tuple[float, float] | None = option(
+        "bands",
+        None,
+        "Two heights in meters, e.g. 0.5,2: vegetation (5) below them becomes low (3) and medium (4)",
+        may_be_empty=True,
     )
     compact: bool = option(
         "boolean",

@@ -212,11 +212,6 @@ def keep_option(points: str = "Points that are neighbors but keep their class") 
     return option("selection", (OVERLAP,), points, may_be_empty=True)
 
 
-def vegetation_heights_option(points: str) -> Any:
-    """The option `vegetation_heights`; says what becomes of which `points`."""
-    return option("bands", None, f"Two heights in meters, e.g. 0.5,2: {points}", may_be_empty=True)
-
-
 def split_list(text: str) -> list[str]:
     """Split at commas outside parentheses: ``c1,kopt(10,50)`` is two tokens."""
     return [part.strip() for part in re.split(r",(?![^(]*\))", text) if part.strip()]
