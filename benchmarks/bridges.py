@@ -19,11 +19,11 @@ import laspy
 import numpy as np
 from scipy.spatial import cKDTree
 
+from pdal_stages.structures.towers import find_towers
+from pdal_stages.structures.wires import find_wires
 from pdal_stages.synthetic import make_town
 from pdal_stages.terrain.decks import find_decks
 from pdal_stages.terrain.morphological import filtered_ground
-from pdal_stages.terrain.towers import find_towers
-from pdal_stages.terrain.wires import find_wires
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bridge_scenes import SCENES, scan

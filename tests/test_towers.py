@@ -11,11 +11,11 @@ from corridor_scenes import CORRIDORS
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from pdal_stages.stages.wires import Wires
-from pdal_stages.terrain import towers
-from pdal_stages.terrain import wires as lines
+from pdal_stages.structures import towers
+from pdal_stages.structures import wires as lines
+from pdal_stages.structures.towers import find_towers
+from pdal_stages.structures.wires import find_wires
 from pdal_stages.terrain.morphological import filtered_ground
-from pdal_stages.terrain.towers import find_towers
-from pdal_stages.terrain.wires import find_wires
 
 
 @functools.cache

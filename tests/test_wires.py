@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 import pdal_stages.synthetic
 from pdal_stages.stages.wires import Wires
-from pdal_stages.terrain import wires
+from pdal_stages.structures import wires
+from pdal_stages.structures.wires import find_wires
 from pdal_stages.terrain.morphological import filtered_ground
-from pdal_stages.terrain.wires import find_wires
 
 
 def edge(kind, density, seed=0):

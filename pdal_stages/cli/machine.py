@@ -252,10 +252,10 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..classifier.trainoptions import TrainingOptions
     from ..objects.crowns import crown_cells
     from ..objects.roofs import roof_planes
+    from ..structures.towers import find_towers
+    from ..structures.wires import find_wires
     from ..synthetic import make_town
     from ..terrain import detached_noise, filtered_ground, hag_minima
-    from ..terrain.towers import find_towers
-    from ..terrain.wires import find_wires
 
     make_town(20.0, 1.0, threads=1, progress=False)
     # A deck over a valley, with land at both ends, so that the kernels for decks run as well.

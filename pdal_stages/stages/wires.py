@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.las import TOWER, WIRE
-from ..terrain import towers
-from ..terrain.towers import find_towers
-from ..terrain.wires import REACH, find_wires
+from ..structures import towers
+from ..structures.towers import find_towers
+from ..structures.wires import REACH, find_wires
 from .base import ClassStage
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts

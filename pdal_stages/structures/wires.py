@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import CellWindow, cell_numbers, levels, longest_sides, number_sets, patches
+from ..terrain.cells import CellWindow, cell_numbers, levels, longest_sides, number_sets, patches
 
 #: Side of the cells, meters.
 CELL = 1.0

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from .cells import CellWindow, cell_numbers, keys_of, patches
+from ..terrain.cells import CellWindow, cell_numbers, keys_of, patches
 
 #: Side of the cells, meters.
 CELL = 1.0
