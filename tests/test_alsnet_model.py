@@ -92,8 +92,9 @@ def test_probabilities_belong_to_points_not_to_their_order(seed, n):
 def test_averages_equal_a_hand_computation():
     xyz, _, dimensions = scene(1500, 20.0)
     net = net_with()
-    request = PredictRequest(xyz, dimensions)
-    ((_, found),) = net.predict(request, lambda p: p)
+    request = PredictRequest(xyz, dimensions, variance=True)
+    ((_, made),) = net.predict(request, lambda p: {"mean": p})
+    found, variance = made["mean"], made["variance"]
     columns = scaled(xyz, dimensions, net.inputs, net.mean, net.scale)
     np.testing.assert_allclose(
         columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5
@@ -108,6 +109,7 @@ def test_averages_equal_a_hand_computation():
     assert [len(part) for part in each] == coverage(circles).tolist()
     for i, part in enumerate(each):
         np.testing.assert_allclose(found[i], np.mean(part, axis=0), rtol=1e-9)
+        np.testing.assert_allclose(variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
     assert request.report.figures["batches"] == len(circles)
     assert request.report.figures["batches_per_point"]["least"] == coverage(circles).min()
 

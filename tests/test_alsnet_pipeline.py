@@ -50,15 +50,23 @@ def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
     ps.run_pipeline(
         [
             str(path),
-            {"type": "filters.modelclassifier", "model": str(model), "margin": True},
+            {
+                "type": "filters.modelclassifier",
+                "model": str(model),
+                "margin": True,
+                "variance": True,
+            },
             las_writer(out),
         ]
     )
     las = laspy.read(out)
     read = np.column_stack([las.x, las.y, las.z])
-    found = load_model(model).predict(read, {"Intensity": np.asarray(las.intensity)}, margin=True)
+    found = load_model(model).predict(
+        read, {"Intensity": np.asarray(las.intensity)}, margin=True, variance=True
+    )
     assert np.array_equal(np.asarray(las.classification), found.classification)
     assert np.array_equal(np.asarray(las["Margin"]), found.margin)
+    assert np.array_equal(np.asarray(las["Variance"]), found.variance) and found.variance.max() > 0
     assert len(np.unique(found.classification)) > 1
 
 

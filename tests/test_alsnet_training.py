@@ -29,8 +29,9 @@ from pdal_stages.alsnet.batches import (
 from pdal_stages.alsnet.circles import Circles
 from pdal_stages.alsnet.configuration import Configuration, Level
 from pdal_stages.alsnet.geometry import build
-from pdal_stages.base.errors import ModelError, OptionError
+from pdal_stages.base.errors import DependencyError, ModelError, OptionError
 from pdal_stages.base.files import CHECKPOINT, kind_of
+from pdal_stages.classifier.algorithms import PredictRequest
 
 needs_torch = pytest.mark.skipif(
     importlib.util.find_spec("torch") is None,
@@ -142,21 +143,38 @@ def test_augmentation_turns_shakes_and_thins(seed, n):
 
 @needs_torch
 def test_torch_and_numpy_agree():
-    import torch
-
-    from pdal_stages.alsnet.network import Network, tensors
+    from pdal_stages.alsnet.network import Network, applied_on
 
     net = random_net(("Z", "Intensity"), 4)
     xyz, _, values = scene(256, 7.0)
     inputs = np.column_stack([xyz[:, 2], values["Intensity"] / 100.0]).astype(np.float32)
     pyramid = build(xyz, inputs, TINY)
-    network = Network(TINY, 2, 4).load(net.weights).eval()
-    with torch.no_grad():
-        found = torch.softmax(network(tensors(pyramid)), dim=1).numpy()
+    network = Network(TINY, 2, 4).load(net.weights)
+    found = applied_on("cpu", net.weights, TINY, 2, 4)(pyramid)
     np.testing.assert_allclose(found, net.folded(pyramid), atol=2e-6)
     again = network.dump()
     assert list(again) == list(net.weights)
     assert all(np.array_equal(again[name], net.weights[name]) for name in again)
+
+
+@needs_torch
+@pytest.mark.parametrize("device", ["auto", "cuda"])
+def test_a_device_for_applying(device):
+    """Without a GPU auto is NumPy, and cuda says what is missing."""
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU here")
+    xyz, _, values = scene(600, 12.0)
+    net = random_net(("Z", "Intensity"), 4)
+    request = PredictRequest(xyz, values, device=device)
+    if device == "cuda":
+        with pytest.raises(DependencyError, match="no CUDA device"):
+            list(net.predict(request, lambda p: p))
+        return
+    ((_, found),) = net.predict(request, lambda p: p)
+    ((_, expected),) = net.predict(PredictRequest(xyz, values), lambda p: p)
+    assert np.array_equal(found, expected)
 
 
 @needs_torch

@@ -154,6 +154,18 @@ class AlsNet:
                 made["variance"] = variance
             yield slice(None) if request.rows is None else request.rows, made
 
+    def _apply_on(self, device: str) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
+        """Return what gives a batch's probabilities: NumPy, or PyTorch where a GPU is asked for."""
+        if device == "cpu":
+            return self.folded
+        from .network import applied_on, chosen_device
+
+        if chosen_device(device) == "cpu":
+            return self.folded
+        return applied_on(
+            "cuda", self.weights, self.configuration, len(self.inputs), self.n_classes
+        )
+
     def _means(
         self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
@@ -175,7 +187,7 @@ class AlsNet:
         count = np.zeros(m, np.int64)
         each = self.configuration.memory_mb(len(self.inputs))
         side_by_side = max(1, min(resolve_threads(request.threads), int(request.memory_mb / each)))
-        apply = self.folded  # once, before there are threads
+        apply = self._apply_on(request.device)  # once, before there are threads
 
         def one(number: int):
             members = circles.members(number)

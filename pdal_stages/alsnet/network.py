@@ -1,19 +1,23 @@
-"""The network in PyTorch, for training it."""
+"""The network in PyTorch, for training it, and for applying it on a GPU."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import optional_import
+from ..base.errors import DependencyError, optional_import
 from .configuration import Configuration
 from .geometry import Pyramid, Step
 from .weights import EPSILON, Weights, forward
 
-torch: Any = optional_import("torch", "deep", "training an alsNet")
+# OpenMP's threads spin while they wait, a third of all CPU time beside threads that prepare batches;
+# on a busy machine training took many times as long. Read when PyTorch loads its OpenMP.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+torch: Any = optional_import("torch", "deep", "training an alsNet, or applying one on a GPU")
 nn: Any = torch.nn
 
 #: Share of a batch's statistics in the running ones.
@@ -74,6 +78,34 @@ class Network(nn.Module):
         return {
             name: torch.cat(parts, dim=1).detach().cpu().numpy() for name, parts in self._parts()
         }
+
+
+def applied_on(
+    device: str, weights: Weights, configuration: Configuration, inputs: int, classes: int
+) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
+    """Return what gives the class probabilities (n, classes) of a batch, computed on a device of PyTorch.
+
+    They equal those of ``weights.Folded`` up to rounding.
+    """
+    network = Network(configuration, inputs, classes).load(weights).to(device).eval()
+
+    def probabilities(pyramid: Pyramid) -> npt.NDArray[np.float64]:
+        with torch.no_grad():
+            scores = network(tensors(pyramid, device))
+            return torch.softmax(scores.double(), dim=1).cpu().numpy()
+
+    return probabilities
+
+
+def chosen_device(device: str) -> str:
+    """Return ``cuda`` or ``cpu`` for a device option; DependencyError for cuda where there is none."""
+    cuda = torch.cuda.is_available()
+    if device == "cuda" and not cuda:
+        raise DependencyError(
+            "'device' is cuda, but PyTorch sees no CUDA device",
+            cure="Install a CUDA build of PyTorch and the driver, or use device auto",
+        )
+    return "cuda" if cuda and device != "cpu" else "cpu"
 
 
 def tensors(pyramid: Pyramid, device: str = "cpu") -> Pyramid:

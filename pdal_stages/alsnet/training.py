@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.arrays import hash_of
-from ..base.errors import DependencyError, ModelError, OptionError
+from ..base.errors import ModelError, OptionError
 from ..base.files import CHECKPOINT, Output, write_whole
 from ..base.messages import Progress
 from ..base.resources import map_blocks, resolve_threads
@@ -89,7 +89,7 @@ class _Session:
     """One training: its data, the network, the optimizer, what has been reached."""
 
     def __init__(self, clouds: Sequence[TrainingCloud], training: TrainingOptions) -> None:
-        from .network import Network, torch
+        from .network import Network, chosen_device, torch
 
         self.torch, self.options, self.seed = torch, training.alsnet, training.seed
         self.threads, self.inputs = resolve_threads(training.threads), inputs(training)
@@ -107,13 +107,7 @@ class _Session:
         values = {
             name: np.concatenate([own[name] for own in each]).astype(np.float64) for name in each[0]
         }
-        cuda = torch.cuda.is_available()
-        if options.device == "cuda" and not cuda:
-            raise DependencyError(
-                "'device' is cuda, but PyTorch sees no CUDA device",
-                cure="Install a CUDA build of PyTorch and the driver, or use device auto",
-            )
-        self.device = "cuda" if cuda and options.device != "cpu" else "cpu"
+        self.device = chosen_device(options.device)
         source = None if options.start_from is None else _source(options, names)
         self.mean: tuple[float, ...]
         self.scale: tuple[float, ...]

@@ -91,6 +91,7 @@ class PredictRequest:
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
     #: whether a network adds "variance", (b,) float64, to the mapping that `finish` makes
     variance: bool = False
+    device: str = "cpu"  #: where a network is applied
     report: Report = field(
         default_factory=Report
     )  #: what is counted, complete when all blocks are read
@@ -110,6 +111,12 @@ class PredictionOptions(Settings):
     probabilities: bool = False  #: whether to return them
     margin: bool = False
     variance: bool = False  #: of the probabilities over a network's batches
+    device: str = setting(
+        "cpu",
+        "string",
+        "Where a network is applied: cpu (NumPy, the same bits everywhere), cuda, or auto",
+        choices=("cpu", "cuda", "auto"),
+    )
     #: points less reliable do not get the winning class, and are counted
     reject_below: float | None = setting(
         None, "number", "Points with a lower Reliability are rejected", 0, 1

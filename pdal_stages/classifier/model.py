@@ -239,7 +239,7 @@ class Model:
             given = {name: np.asarray(given[name])[taken] for name in needed if name in given}
         shown = progress if representatives is None else None
         request = PredictRequest(
-            xyz, given, rows, how.threads, how.memory_mb, shown, grid, variance=how.variance
+            xyz, given, rows, how.threads, how.memory_mb, shown, grid, how.variance, how.device
         )
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0

@@ -51,6 +51,12 @@ class ModelClassifier(Stage):
         False,
         "Also write Variance: how much the probabilities vary over a network's batches (networks only)",
     )
+    device: str = option(
+        "string",
+        "cpu",
+        "Where a network is applied: with NumPy, which gives the same bits everywhere, or with PyTorch on a GPU",
+        choices=("cpu", "cuda", "auto"),
+    )
     reject_below: float | None = option(
         "number",
         None,
@@ -205,6 +211,7 @@ class ModelClassifier(Stage):
                 probabilities=self.probabilities,
                 margin=self.margin,
                 variance=self.variance,
+                device=self.device,
                 reject_below=self.reject_below,
                 rejected_code=self._rejected,
                 limits={code: one.reliability for code, one in (self.limits or {}).items()},
