@@ -28,7 +28,7 @@ from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier.algorithms import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS
 from pdal_stages.classifier.model import load_model
-from pdal_stages.features.plan import SURFACES
+from pdal_stages.features.registry import SURFACE_FEATURES
 from pdal_stages.terrain import filtered_ground
 
 #: What ``pdal-stages train`` takes where points have it.
@@ -68,7 +68,9 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "agreement and lowest of k20": {
             "feature_set": (*FEATURES, "NormalAgreement_k20", "SurfaceVariationMin_k20")
         },
-        "all four of k20": {"feature_set": (*FEATURES, *(f"{name}_k20" for name in SURFACES))},
+        "all four of k20": {
+            "feature_set": (*FEATURES, *(f"{name}_k20" for name in SURFACE_FEATURES))
+        },
     },
     "samples": {
         "10,000, own and around": FORMER,

@@ -38,7 +38,7 @@ def manifest(**changes):
     only = {
         "algorithm": "random_forest",
         "parameters": {"trees": 4},
-        "features": {"anything": "the engine writes"},
+        "neighborhoods": ["s1"],
         "feature_names": [f"Feature{i}" for i in range(FEATURES)],
         "dimensions": [],
         "context": [],
@@ -262,7 +262,8 @@ def changed(path, edit, rehash=True):
     ("key", "value", "text"),
     [
         ("format", "something else", "not a model"),
-        ("version", 3, "version"),
+        ("version", 4, "version"),
+        ("version", 1, "version"),
         ("version", True, "version"),
         ("algorithm", "magic", "does not know"),
         ("algorithm", None, "algorithm"),

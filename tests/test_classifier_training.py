@@ -290,8 +290,8 @@ def test_prior_weight(other):
 @pytest.mark.parametrize(
     "edit",
     [
-        lambda m: m["passes"][0]["features"].update(neighborhoods=["c9"]),
-        lambda m: m["passes"][0].update(features={}),
+        lambda m: m["passes"][0].update(neighborhoods=["c9"]),
+        lambda m: m["passes"][0].update(neighborhoods=[]),
         lambda m: m["passes"][0].update(feature_names=m["passes"][0]["feature_names"][::-1]),
         lambda m: m["passes"][0].update(dimensions=[]),
         lambda m: m["passes"][0].update(context=["box1"]),

@@ -15,7 +15,7 @@ from processes import printed, python
 from pdal_stages.base.errors import DimensionError, OptionError, StageError
 from pdal_stages.base.messages import Progress
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins, compute_features
-from pdal_stages.features.plan import GROUPS
+from pdal_stages.features.registry import GROUPS
 
 #: Every kind of neighborhood, small enough for small clouds.
 TOKENS = "c1,c2.5,s1.5,s4,k8,kopt(5,30),ropt(0.5,1.5,0.25),copt"

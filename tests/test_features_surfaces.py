@@ -11,13 +11,13 @@ from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features
 from pdal_stages.features.eigen import eigen3
-from pdal_stages.features.plan import SURFACES
+from pdal_stages.features.registry import SURFACE_FEATURES
 
 TOKENS = "k3,k20"
 
 
 def test_names_are_the_oracle_s():
-    assert tuple(SURFACES) == oracle.SURFACES
+    assert SURFACE_FEATURES == oracle.SURFACES
 
 
 @pytest.mark.parametrize("cloud", CLOUDS)
@@ -177,12 +177,12 @@ def test_the_second_step_is_counted():
 def test_plans():
     plan = FeaturePlan.parse("s1,k10,k20,kopt", "Linearity,surfaces")
     assert [name for name in plan.names if "Linearity" not in name] == [
-        f"{name}_{token}" for token in ("k10", "k20") for name in SURFACES
+        f"{name}_{token}" for token in ("k10", "k20") for name in SURFACE_FEATURES
     ]
     assert FeaturePlan.parse("k10,k20", "surfacevariationstd_K20").names == (
         "SurfaceVariationStd_k20",
     )
-    assert not {*SURFACES} & {name.split("_")[0] for name in FeaturePlan.parse("k10").names}
+    assert not {*SURFACE_FEATURES} & {name.split("_")[0] for name in FeaturePlan.parse("k10").names}
     assert FeaturePlan.from_dict(plan.to_dict()) == plan
     for spec in ("s1", "kopt", "ropt"):
         with pytest.raises(OptionError, match="k20 and the like"):

@@ -20,7 +20,7 @@ from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.base.las import class_name
-from pdal_stages.features.plan import GROUPS
+from pdal_stages.features.registry import GROUPS
 
 NEIGHBORHOODS = {
     "c1": ("c1",),

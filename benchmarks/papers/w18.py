@@ -23,7 +23,7 @@ from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.base.las import class_name
-from pdal_stages.features.plan import GROUPS
+from pdal_stages.features.registry import GROUPS
 
 EXPERIMENT = 3  # raised when runs mean something else than before, so that none is resumed
 #: Scene -> classes found by themselves, against all others; several labels may be one target.

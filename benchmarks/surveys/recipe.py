@@ -115,5 +115,5 @@ def training_clouds(data: Path, survey: str) -> list[TrainingCloud]:
 def train_on(data: Path, surveys: Iterable[str], options: TrainingOptions = OPTIONS) -> Model:
     """The model of these surveys."""
     model = train([one for name in surveys for one in training_clouds(data, name)], options)
-    model.info["preparation"] = list(PREPARATION)
+    model.record_preprocessing(PREPARATION)
     return model

@@ -110,7 +110,7 @@ class AlsNet:
                 ],
                 "weights": int(sum(array.size for array in self.weights.values())),
             },
-            "features": {"neighborhoods": [], "features": [], "dimensions": list(self.inputs)},
+            "neighborhoods": [],
             "feature_names": list(self.inputs),
             "dimensions": list(self.inputs),
             "context": [],

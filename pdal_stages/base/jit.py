@@ -203,7 +203,7 @@ def _file_digest(path: str) -> str:
 
 
 def _sources(kernel: Any) -> set[str]:
-    """Digests of the sources that the code of a kernel is made of: its own, and of all that it calls.
+    """Return digests of what a kernel's code is made of: its source, constants, and those of all that it calls.
 
     Asked when the kernel is first called, since what it calls may stand below it.
     """
@@ -213,6 +213,8 @@ def _sources(kernel: Any) -> set[str]:
         digests.add(_file_digest(function.__code__.co_filename))
         for name in function.__code__.co_names:
             called = function.__globals__.get(name)
+            if isinstance(called, (int, float, tuple)):  # compiled in, from whatever module
+                digests.add(hashlib.sha256(f"{name}={called!r}".encode()).hexdigest()[:16])
             try:
                 if called in _functions and called not in seen:
                     seen.add(called)

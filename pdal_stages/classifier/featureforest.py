@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.plan import GROUPS, RELATIVE
+from ..features.registry import BY_NAME
 from .algorithms import REFINED, ArrayRule, Column, PredictRequest, gather, with_returns
 from .context import OWN, Context
 from .forest import Forest
@@ -47,20 +47,22 @@ class Features:
                 raise ModelError("the model lacks the curvature threshold of copt")
 
     def to_dict(self) -> dict[str, Any]:
-        """As a manifest has it."""
+        """Return what a manifest stores beside the names of the columns."""
+        plan = self.plan.to_dict()
+        del plan["features"], plan["dimensions"]
         return {
-            "features": self.plan.to_dict(),
+            **plan,
             "shape_bins": None if self.bins is None else self.bins.to_dict(),
             "copt_threshold": self.copt_threshold,
             "feature_seed": self.seed,
         }
 
     @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Features:
-        """From what a manifest says of a pass."""
+    def from_dict(cls, entry: Mapping[str, Any], names: Sequence[str]) -> Features:
+        """Return the features of a pass of a manifest, whose full `names` are in the order of its columns."""
         bins = entry["shape_bins"]
         return cls(
-            FeaturePlan.from_dict(entry["features"]),
+            FeaturePlan.from_dict({**entry, "features": list(names)}),
             None if bins is None else ShapeBins.from_dict(bins),
             entry["copt_threshold"],
             entry["feature_seed"],
@@ -199,6 +201,7 @@ def on_top(
         "priors": None,
         "densities": densities,
         "preparation": base.info.get("preparation") or [],
+        "algorithms": base.info.get("algorithms", {}),
         "passes": [*scores, *info["passes"]],
     }
 
@@ -229,30 +232,24 @@ class FeatureForest:
     def from_file(
         cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
     ) -> FeatureForest:
-        """Made from what a model file says of a pass, everything checked."""
-        features = Features.from_dict(entry)
+        """Return the forest that a model file describes as one of its passes, everything checked."""
         context = Context(tuple(entry["context"])) if entry["context"] else None
         blend = None
         if entry["algorithm"] == REFINED:
             blend = Blend.from_dict(entry["parameters"], codes)
             if context is None or OWN not in context.tokens:
                 raise ModelError(f"a refined forest must read '{OWN}'", found=entry["context"][:10])
-        labeled = codes if blend is None else blend.labeled
-        forest = Forest.from_arrays(arrays, len(entry["feature_names"]), len(labeled))
-        made = cls(features, forest, context, blend)
-        names, expected = entry["feature_names"], [column.name for column in made.columns(codes)]
-        if expected != names or list(made.plan.dimensions) != entry["dimensions"]:
-            odd = [
-                f"'{a}' where '{b}' belongs"
-                for a, b in zip(names, expected, strict=False)
-                if a != b
-            ]
+        before, labeled = (codes, codes) if blend is None else (blend.before, blend.labeled)
+        names = entry["feature_names"]
+        others = [*entry["dimensions"], *(() if context is None else context.names(before))]
+        if names[max(len(names) - len(others), 0) :] != others:
             raise ModelError(
-                "the model's features, or their order, are not those its neighborhoods give in this release",
-                found=odd[0] if odd else f"{len(names)} features, {len(expected)} belong",
-                cure="Train the model again with this release",
+                "the model's last columns must be the points' dimensions and what it reads of the pass before",
+                found=", ".join(names[-3:]),
             )
-        return made
+        features = Features.from_dict(entry, names[: len(names) - len(others)])
+        forest = Forest.from_arrays(arrays, len(names), len(labeled))
+        return cls(features, forest, context, blend)
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """What a model file says of it beside its arrays."""
@@ -274,21 +271,15 @@ class FeatureForest:
         return list(codes if self.blend is None else self.blend.before)
 
     def columns(self, codes: Sequence[int]) -> list[Column]:
-        """The features; a histogram's bins are one feature."""
-        group_of = {
-            name: group
-            for group in ("covariance", "geometric", "shapes", "surfaces")
-            for name in GROUPS[group]
-        }
-        group_of.update(dict.fromkeys(RELATIVE, "geometric"))
-        found = []
+        """Return the features; a histogram's bins count as one feature."""
+        found = {}
         for part in self.plan.layout:
-            for name in part.at:
-                group = group_of[name]
+            for name, column in part.at.items():
+                group = BY_NAME[name].group
                 feature = name.split("_")[0] if group == "shapes" else name
-                found.append((feature, group, part.neighborhood.token))
-        found += [(name, "dimension", "(dimension)") for name in self.plan.dimensions]
-        columns = [Column(name, *rest) for name, rest in zip(self.plan.names, found, strict=True)]
+                found[column] = (feature, group, part.neighborhood.token)
+        columns = [Column(name, *found[number]) for number, name in enumerate(self.plan.features)]
+        columns += [Column(name, name, "dimension", "(dimension)") for name in self.plan.dimensions]
         codes = self.classes_before(codes)
         for token in () if self.context is None else self.context.tokens:
             for name, code in zip(Context((token,)).names(codes), codes, strict=True):

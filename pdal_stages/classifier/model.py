@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -17,6 +17,7 @@ from ..base.messages import Report
 from ..features import FeaturePlan
 from ..features.cells import check_side, density, represent
 from ..features.index import build_grid, check_xyz
+from ..features.registry import ALGORITHM_VERSION
 from . import modelfile, summary
 from .algorithms import (
     InputPlan,
@@ -101,6 +102,33 @@ class Model:
     def halo_m(self) -> float:
         """Meters around a tile whose points a tile's results depend on."""
         return self.plan.halo_m + self.voxel
+
+    @property
+    def algorithm_versions(self) -> dict[str, int]:
+        """Stages that compute what the model reads -> version of their algorithm in this release."""
+        computed = any(one.features is not None for one in self.passes)
+        features = {"filters.multiscalefeatures": ALGORITHM_VERSION} if computed else {}
+        preparation = self.info.get("preparation") or []
+        return preparation_module().algorithm_versions(preparation) | features
+
+    def record_preprocessing(self, preparation: Sequence[Mapping[str, Any]]) -> None:
+        """Store the stages that made the training's dimensions, and the versions of the algorithms in this release."""
+        self.info["preparation"] = [dict(stage) for stage in preparation]
+        self.info["algorithms"] = self.algorithm_versions
+
+    @property
+    def outdated(self) -> list[str]:
+        """Warnings: algorithms of this release that differ from those the model was trained with."""
+        stored, told = self.info.get("algorithms", {}), []
+        for kind, version in self.algorithm_versions.items():
+            if (then := stored.get(kind)) != version:
+                what = "an unknown version" if then is None else f"version {then}"
+                told.append(
+                    f"the model was trained with {what} of {kind}, and this release has version {version}, whose "
+                    "results differ: expect lower accuracy. Train the model again, or install the release that it was "
+                    f"trained with (pdal_stages {self.info['created_by'].get('pdal_stages', 'unknown')})"
+                )
+        return told
 
     def importances(self, by: str = "feature", number: int = -1) -> dict[str, float]:
         """Mean decrease in impurity, summing to 1, largest first.
@@ -256,6 +284,7 @@ class Model:
             for name, values in decided.items():
                 out[name][at] = values[place]
         self._report_density(request.report, found, request.count)
+        request.report.warnings.extend(self.outdated)
         if len(xyz) < n - ignored:
             request.report.figures["representatives"] = len(xyz)
         unsure = _reject(out, asked, now, how)
@@ -377,7 +406,8 @@ def load_model(path: str | os.PathLike) -> Model:
             model.info["preparation"] = preparation_module().check(asked)
         return model
     except ModelError as error:
-        near = "" if os.path.lexists(name) else suggest(name, modelfile.shipped())
+        others = [one for one in modelfile.shipped() if one != name]
+        near = "" if os.path.lexists(name) else suggest(name, others)
         error.cure = f"{near}{error.cure or modelfile.CURE}"
         raise error.at(file) from error.__cause__
     except OptionError as error:  # a feature of another release, say

@@ -35,8 +35,8 @@ Arrays = list[dict[str, npt.NDArray[Any]]]
 #: What is used where no model is named.
 STANDARD = "standard"
 FORMAT = "pdal-stages model"
-#: Of the format; a file of another is refused.
-VERSION = 2
+#: Of the format that is written, and of those that are read; a file of another is refused.
+VERSION, READABLE = 3, (2, 3)
 MANIFEST = "manifest.json"
 
 #: A manifest's largest size in bytes, unpacked.
@@ -263,15 +263,28 @@ def parse(data: bytes, own: bool = False) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
     version = manifest.get("version")
-    if type(version) is not int or version != VERSION:  # True is 1
+    if type(version) is not int or version not in READABLE:  # True is 1
         raise ModelError(
-            f"the model file has a version this release does not know (it knows {VERSION})",
+            f"the model file has a version this release does not know (it knows {READABLE})",
             found=f"version {str(version)[:20]}",
             cure="Update pdal-stages",
         )
     if not own:  # the validator takes 0.07 s and 10 MB to import
         validate(manifest)
-    return manifest
+    return _upgraded(manifest)
+
+
+def _upgraded(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Return a manifest of version 2 as one of version 3.
+
+    Version 2 had groups of features beside their names. The names alone say what a column is.
+    """
+    for entry in manifest["passes"] if manifest["version"] == 2 else ():
+        described = entry.pop("features", {})
+        entry["neighborhoods"] = described.get("neighborhoods")
+        if "least_members" in described:
+            entry["least_members"] = described["least_members"]
+    return {**manifest, "version": VERSION}
 
 
 def validate(manifest: Mapping[str, Any]) -> None:

@@ -64,7 +64,7 @@ def text(info: Mapping[str, Any]) -> str:
         numbers = [f"{v:,} {k}" for k, v in one["parameters"].items() if isinstance(v, int)]
         lines += [
             f"{name}: {', '.join(numbers)}",
-            f"features       {len(one['feature_names'])}: {' '.join(one['features']['neighborhoods'])}",
+            f"features       {len(one['feature_names'])}: {' '.join(one['neighborhoods'])}",
             f"context        {' '.join(one['context']) or '-'}",
         ]
     clouds = info["training"]["clouds"]

@@ -90,8 +90,8 @@ def train(
                 cure=f"Give some; those of labels {left_out} are left out ('ignore') unless 'classes' names them",
             )
         model = trainer(options.algorithm).train(made, options, progress)
-    if preparation:
-        model.info["preparation"] = preparation
+    if options.base is None:
+        model.record_preprocessing(preparation)
     return model
 
 

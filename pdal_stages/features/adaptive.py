@@ -33,7 +33,8 @@ from .entropy import (
 from .index import CellGrid, build_tree
 from .moments import COINCIDENT, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
 from .neighborhoods import AROUND, COPT_REACH
-from .plan import MOMENT_FEATURES, SURFACES, Columns, FeaturePlan, columns_of
+from .plan import Columns, FeaturePlan, columns_of
+from .registry import MOMENT_FEATURES, SURFACE_FEATURES
 from .search import (
     CROWD,
     FIRST2,
@@ -124,7 +125,7 @@ class AdaptiveNeighborhoods:
         #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
         self.tokens = [c.neighborhood.token for c in self.chosen]
         self.columns = columns_of(self.chosen, MOMENT_FEATURES)
-        self.surface_columns = columns_of(self.chosen, SURFACES)
+        self.surface_columns = columns_of(self.chosen, SURFACE_FEATURES)
         self.searches = _searches(self.chosen, plan.least_members)
         self.tree = build_tree(grid.x, grid.y, grid.z, threads)
         self._surfaces = np.zeros((0, SURFACE), np.float32)
@@ -280,7 +281,7 @@ def _searches(chosen: list[Columns], least: int) -> list[Search]:
             ks = np.arange(COPT_K[0], COPT_K[1] + 1)
             search = replace(search, ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
         found.append(search)
-    around = any(name in columns.at for columns in chosen for name in SURFACES)
+    around = any(name in columns.at for columns in chosen for name in SURFACE_FEATURES)
     return ([_by_number(ranges, around)] if ranges else []) + found
 
 

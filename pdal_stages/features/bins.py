@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import OptionError
-from .plan import SHAPE_BINS, SHAPES
+from .registry import SHAPE_BINS, SHAPES
 
 #: The metrics, in the order of the rows of all threshold arrays.
 METRICS = tuple(SHAPES)

@@ -173,31 +173,3 @@ def eigenentropy(l1, l2, l3):
     total = l1 + l2 + l3
     scale = 1.0 / (total if total > 0.0 else 1.0)
     return entropy_term(l1 * scale) + entropy_term(l2 * scale) + entropy_term(l3 * scale)
-
-
-@device(forceinline=True)
-def covariance_features(n, l1, l2, l3):
-    """The eight eigen-features of eigenvalues l1 >= l2 >= l3 of `n` points.
-
-    Returns
-    -------
-    linearity, planarity, scattering, omnivariance, anisotropy, eigenentropy, eigenvalue sum, surface
-    variation. For n < 3, or points that all coincide, they are 0 and the surface variation is 1/3 [H17].
-    """
-    total = l1 + l2 + l3
-    real = (n >= 3) & (total > 0.0)
-    scale = 1.0 / (total if real else 1.0)
-    e1, e2, e3 = l1 * scale, l2 * scale, l3 * scale
-    inverse = 1.0 / (l1 if real else 1.0)
-    omnivariance = cbrt_fast(e1 * e2 * e3)
-    entropy = entropy_term(e1) + entropy_term(e2) + entropy_term(e3)
-    return (
-        (l1 - l2) * inverse if real else 0.0,
-        (l2 - l3) * inverse if real else 0.0,
-        l3 * inverse if real else 0.0,
-        omnivariance if real else 0.0,
-        (l1 - l3) * inverse if real else 0.0,
-        entropy if real else 0.0,
-        total if real else 0.0,
-        e3 if real else 1.0 / 3.0,
-    )

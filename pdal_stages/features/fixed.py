@@ -14,7 +14,8 @@ from ..base.jit import device, njit
 from .bins import ShapeBins
 from .index import CellGrid
 from .moments import ROWS, SX, SY, SZ, N, distance2, finish, height_key, sums_within
-from .plan import MOMENT_FEATURES, FeaturePlan, columns_of
+from .plan import FeaturePlan, columns_of
+from .registry import MOMENT_FEATURES
 from .shapes import Axes, shapes_of, write_shapes
 
 #: Candidates are filled up to a multiple of so many, by points so far away, meters: a vector loop leaves none over.

@@ -7,17 +7,18 @@ import math
 import numpy as np
 
 from ..base.jit import FAST, device, njit
-from .eigen import bits_of, covariance_features, eigen3, from_bits
+from .eigen import bits_of, cbrt_fast, eigen3, entropy_term, from_bits
 from .neighborhoods import LEAST_RADIUS
+from .registry import MOMENT_FEATURES, rows_of
 
 #: Rows of a table of moments about the queries: count, sums, products, lowest and highest height; and, where it is chosen
 #: query by query, the radius (meters) and how far away points matter to the choice.
 N, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ, LOW, HIGH, RADIUS, REACH = range(14)
 MOMENTS, ROWS = 12, 14
 
-#: Features made of them: ``names.MOMENT_FEATURES``, and the unit normal.
-FEATURES = 17
-NORMAL = (14, 15, 16)
+#: Rows of the features that :func:`finish` computes, and of the unit normal.
+ROW = rows_of(*MOMENT_FEATURES, "NormalX", "NormalY", "NormalZ")
+FEATURES = len(ROW)
 
 #: Queries finished at a time: small enough for the second-level cache. And columns of their scratch: not a power of two,
 #: whose rows would compete for the same cache lines.
@@ -79,6 +80,31 @@ def sums_within(px, py, pz, keys, count, qx, qy, qz, spherical, r2, out, j):
     out[LOW, j], out[HIGH, j] = height_of(low), height_of(high)
 
 
+@device(forceinline=True)
+def write_eigen_features(made, j, n, l1, l2, l3, nz):
+    """Write the features of eigenvalues l1 >= l2 >= l3 of `n` points to column `j` of `made`, rows as of :data:`ROW`.
+
+    `nz` is the height of the unit eigenvector of l3. With fewer than three points, or points that all coincide, features are
+    0 and the surface variation is 1/3 [H17].
+    """
+    total = l1 + l2 + l3
+    real = (n >= 3) & (total > 0.0)
+    scale = 1.0 / (total if real else 1.0)
+    e1, e2, e3 = l1 * scale, l2 * scale, l3 * scale
+    inverse = 1.0 / (l1 if real else 1.0)
+    omnivariance = cbrt_fast(e1 * e2 * e3)
+    entropy = entropy_term(e1) + entropy_term(e2) + entropy_term(e3)
+    made[ROW.Linearity, j] = (l1 - l2) * inverse if real else 0.0
+    made[ROW.Planarity, j] = (l2 - l3) * inverse if real else 0.0
+    made[ROW.Scattering, j] = l3 * inverse if real else 0.0
+    made[ROW.Omnivariance, j] = omnivariance if real else 0.0
+    made[ROW.Anisotropy, j] = (l1 - l3) * inverse if real else 0.0
+    made[ROW.Eigenentropy, j] = entropy if real else 0.0
+    made[ROW.EigenvalueSum, j] = total if real else 0.0
+    made[ROW.SurfaceVariation, j] = e3 if real else 1.0 / 3.0
+    made[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= 3.0 else 0.0
+
+
 @njit
 def finish(table, volume, heights, few, copies, columns, out):
     """Write the features made of moments.
@@ -98,11 +124,11 @@ def finish(table, volume, heights, few, copies, columns, out):
     copies : (m,) int64 array
         How many queries each column stands for.
     columns : (up to FEATURES,) int64 array
-        Where in `out` (m, F) float32 each feature of ``names.MOMENT_FEATURES`` goes, and x, y, z of the unit normal (0, 0, 0
-        where there is none); -1: nowhere.
+        Column of `out` (m, F) float32 for each row of :data:`ROW`; -1: not wanted. The normal is (0, 0, 0) where there is
+        none.
     """
     # Of constant shapes: rows known not to overlap let the loops be vectorized.
-    made, m = np.empty((FEATURES, WIDTH)), np.empty((6, WIDTH))
+    made, m = np.empty((FEATURES, WIDTH)), np.empty((7, WIDTH))
     for start in range(0, len(heights), BATCH):
         count = min(BATCH, len(heights) - start)
         moments = table[:, start : start + count]
@@ -125,33 +151,29 @@ def finish(table, volume, heights, few, copies, columns, out):
             m[3, j] = moments[SXY, j] * inverse - mx * my
             m[4, j] = moments[SXZ, j] * inverse - mx * mz
             m[5, j] = moments[SYZ, j] * inverse - my * mz
-            made[9, j] = n if apart else 0.0
-            made[10, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
-            made[11, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
-            made[12, j] = heights[start + j] - moments[LOW, j] if n > 0.0 else 0.0
+            # Not read from the moments again, which LLVM must fear to overlap with what is written.
+            m[6, j] = n if apart else 0.0
+            made[ROW.HeightRange, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
+            made[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
+            made[ROW.HeightAboveLowest, j] = (
+                heights[start + j] - moments[LOW, j] if n > 0.0 else 0.0
+            )
         for j in range(count):
             r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
-            made[13, j] = moments[RADIUS, j]
-            made[8, j] = moments[N, j] / (
+            made[ROW.Radius, j] = moments[RADIUS, j]
+            made[ROW.Density, j] = moments[N, j] / (
                 4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume
             )
         for j in range(count):
-            n = made[
-                9, j
-            ]  # not from the moments, which LLVM must fear to overlap with what is written
+            n = m[6, j]
             l1, l2, l3, nx, ny, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
             some = 1.0 if n >= 3.0 else 0.0
-            made[14, j], made[15, j], made[16, j] = some * nx, some * ny, some * nz
-            f = covariance_features(n, l1, l2, l3)
-            made[0, j] = f[0]
-            made[1, j] = f[1]
-            made[2, j] = f[2]
-            made[3, j] = f[3]
-            made[4, j] = f[4]
-            made[5, j] = f[5]
-            made[6, j] = f[6]
-            made[7, j] = f[7]
-            made[9, j] = max(1.0 - abs(nz), 0.0) if n >= 3.0 else 0.0
+            made[ROW.NormalX, j], made[ROW.NormalY, j], made[ROW.NormalZ, j] = (
+                some * nx,
+                some * ny,
+                some * nz,
+            )
+            write_eigen_features(made, j, n, l1, l2, l3, nz)
         for j in range(count):
             if moments[N, j] < 3.0:
                 few[0] += copies[start + j]

@@ -31,6 +31,8 @@ ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in meters [H17]
 #: Kinds that choose a radius: by the lowest eigenentropy, or by the lowest entropy of dimensionality
 #: (Demantke et al. 2011, which [H17] cites).
 BY_RADIUS = ("ropt", "rdim")
+#: Kinds whose size is chosen point by point.
+ADAPTIVE = ("kopt", *BY_RADIUS, "copt")
 #: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with fewer are not
 #: candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t of 0.03 and the counts of its
 #: Table 1 come out (docs/papers.md), with three they do not.
@@ -98,7 +100,7 @@ class Neighborhood:
     @property
     def adaptive(self) -> bool:
         """Whether the size is chosen point by point (and so is a feature, ``Radius``)."""
-        return self.kind in ("kopt", *BY_RADIUS, "copt")
+        return self.kind in ADAPTIVE
 
     def __str__(self) -> str:
         return self.token

@@ -21,72 +21,7 @@ from .neighborhoods import (
     parse_neighborhoods,
     preset_dimensions,
 )
-
-#: Feature -> definition, in the order of the columns.
-COVARIANCE = {
-    "Linearity": "(e1 - e2) / e1",
-    "Planarity": "(e2 - e3) / e1",
-    "Scattering": "e3 / e1",
-    "Omnivariance": "cube root of e1 e2 e3",
-    "Anisotropy": "(e1 - e3) / e1",
-    "Eigenentropy": "-(e1 ln e1 + e2 ln e2 + e3 ln e3), 0 ln 0 = 0",
-    "EigenvalueSum": "l1 + l2 + l3, square meters",
-    "SurfaceVariation": "e3",
-}
-GEOMETRIC = {
-    "Density": "points per square meter of the cylinder's base, or per cubic meter of the sphere",
-    "Verticality": "1 - |nz|, n the unit eigenvector of l3",
-    "HeightRange": "highest minus lowest z, meters",
-    "HeightStd": "standard deviation of z (divisor n), meters",
-    "Radius": "the chosen size in meters; kopt, ropt, rdim and copt only",
-}
-#: What the papers' sets of features lack, and "all" therefore leaves out.
-RELATIVE = {
-    "HeightAboveLowest": "z of the point minus the lowest z of the neighborhood, meters [HWS16]"
-}
-#: Of the points around a point, each with the surface that its 10 nearest make (``surfaces.py``). Features of features:
-#: of nearest neighbors (``k20``) only, and no part of "all".
-SURFACES = {
-    "NormalAgreement": "mean |n . n'| of the point's normal n and those of the neighborhood's points",
-    "SurfaceVariationMin": "lowest surface variation of the neighborhood's points",
-    "SurfaceVariationMean": "mean surface variation of the neighborhood's points",
-    "SurfaceVariationStd": "standard deviation of the surface variation of the neighborhood's points (divisor n)",
-}
-SHAPES = {
-    "A3": "angle between two pulled points seen from a third",
-    "D1": "distance of a pulled point from the centroid",
-    "D2": "distance between two pulled points",
-    "D3": "square root of the area of the triangle of three pulled points",
-    "D4": "cube root of the volume of the tetrahedron of four pulled points",
-}
-SHAPE_BINS = 10
-
-#: Columns of the moment kernels, in their order.
-MOMENT_FEATURES = (
-    *COVARIANCE, "Density", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest", "Radius",
-)  # fmt: skip
-SHAPE_FEATURES = tuple(f"{metric}_{b}" for metric in SHAPES for b in range(SHAPE_BINS))
-
-#: Every feature, in order. Radius is of adaptive neighborhoods alone, SURFACES of nearest neighbors.
-ALL_FEATURES = (*COVARIANCE, *GEOMETRIC, *SHAPE_FEATURES, *RELATIVE, *SURFACES)
-
-#: Words for several features at once.
-GROUPS: dict[str, tuple[str, ...]] = {
-    "all": (*COVARIANCE, *GEOMETRIC, *SHAPE_FEATURES),
-    "covariance": tuple(COVARIANCE),
-    "geometric": tuple(GEOMETRIC),
-    "shapes": SHAPE_FEATURES,
-    "surfaces": tuple(SURFACES),
-    "he2017": (
-        "Linearity",
-        "Planarity",
-        "Scattering",
-        "SurfaceVariation",
-        "Verticality",
-        "HeightRange",
-    ),
-    **{metric: tuple(f"{metric}_{b}" for b in range(SHAPE_BINS)) for metric in SHAPES},
-}
+from .registry import BY_NAME, GROUPS, SURFACE_FEATURES
 
 #: Groups that bring a preset's own dimensions (HeightAboveGround, Z) along.
 WITH_DIMENSIONS = ("all", "geometric")
@@ -111,18 +46,18 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
             raise OptionError(
                 "'feature_set' must be text or a list of text", found=repr(spec)
             ) from None
-    known = {name.lower(): name for name in (*GROUPS, *ALL_FEATURES)}
+    known = {name.lower(): name for name in (*GROUPS, *BY_NAME)}
     found: dict[str, None] = {}
     for word in (w.strip() for w in words):
         if not word:
             continue
         name = known.get(word.lower())
         if name is None:  # a feature of one neighborhood keeps its suffix
-            heads = (name for name in ALL_FEATURES if word.lower().startswith(f"{name.lower()}_"))
+            heads = (name for name in BY_NAME if word.lower().startswith(f"{name.lower()}_"))
             head = max(heads, key=len, default=None)
             if head is None:
-                cure = suggest(word, (*GROUPS, *ALL_FEATURES))
-                single = (*COVARIANCE, *GEOMETRIC, *RELATIVE, *SURFACES)
+                cure = suggest(word, (*GROUPS, *BY_NAME))
+                single = [one.name for one in BY_NAME.values() if one.group != "shapes"]
                 raise OptionError(
                     f"unknown feature or group '{word}'",
                     cure=f"{cure}Groups: {', '.join(GROUPS)}; features: {', '.join(single)}",
@@ -168,8 +103,8 @@ class FeaturePlan:
     """An ordered set of features; make it with :meth:`parse`."""
 
     neighborhoods: tuple[Neighborhood, ...]
-    #: The words of the feature set: groups, features, or features of one neighborhood.
-    features: tuple[str, ...] = ("all",)
+    #: Full names of the features (``Linearity_c1``), in the order of the columns; never a group.
+    features: tuple[str, ...]
     #: The points' own dimensions used as features, after all others.
     dimensions: tuple[str, ...] = ()
     #: Points a radius of ``ropt`` and ``copt`` must hold, and the sphere of a curvature [H17].
@@ -194,7 +129,7 @@ class FeaturePlan:
         feature_set : str or iterable of str
             Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` .. ``D4``), features
             (``Linearity``) or features of one neighborhood (``Linearity_c1``). Only what is named is computed; columns
-            come in the order of ``ALL_FEATURES``, neighborhood by neighborhood.
+            come in the order of the registry, neighborhood by neighborhood.
         dimensions : str or iterable of str
             Dimensions of the points to use as features besides those that a preset brings. A preset brings
             its own (``HeightAboveGround``, ``Z``) with the groups ``all`` and ``geometric``.
@@ -219,48 +154,34 @@ class FeaturePlan:
             names.update(
                 dict.fromkeys(returns.NAMES if name == returns.GROUP else [name] if name else [])
             )
-        return cls(parsed, words, tuple(names))
+        return cls(parsed, _expand(parsed, words), tuple(names))
 
     @cached_property
     def layout(self) -> tuple[Columns, ...]:
         """The columns of each neighborhood, in the order of the neighborhoods."""
-        wanted = {name for word in self.features for name in GROUPS.get(word, (word,))}
-        result, names = [], list[str]()
-        for one in self.neighborhoods:
-            at = {}
-            for feature in ALL_FEATURES:
-                name = f"{feature}_{one.suffix}"
-                if has(one, feature) and (feature in wanted or name in wanted):
-                    at[feature] = len(names)
-                    names.append(name)
-            result.append(Columns(one, at))
-        if lost := [word for word in self.features if word not in {*GROUPS, *ALL_FEATURES, *names}]:
-            raise OptionError(
-                f"the feature '{lost[0]}' belongs to none of the neighborhoods",
-                found=", ".join(n.token for n in self.neighborhoods),
-            )
-        if not names:
-            cure = (
-                "Neighbors' surfaces exist for k20 and the like only"
-                if wanted & {*SURFACES}
-                else None
-            )
-            raise OptionError(
-                f"none of the neighborhoods has the feature '{', '.join(self.features)}'",
-                found=", ".join(n.token for n in self.neighborhoods),
-                cure="Radius exists for kopt, ropt, rdim and copt only"
-                if "Radius" in wanted
-                else cure,
-            )
-        if clash := {*names} & {*self.dimensions}:
-            raise OptionError(f"the dimension '{min(clash)}' is also a computed feature")
-        return tuple(result)
+        if not self.features:
+            raise OptionError("a feature plan names no feature")
+        found = _features_of(self.neighborhoods)
+        columns: dict[Neighborhood, dict[str, int]] = {one: {} for one in self.neighborhoods}
+        for column, name in enumerate(self.features):
+            if name not in found:
+                raise OptionError(
+                    f"the feature '{name}' belongs to none of the neighborhoods",
+                    found=", ".join(n.token for n in self.neighborhoods),
+                    cure=suggest(name, found) or None,
+                )
+            neighborhood, feature = found[name]
+            columns[neighborhood][feature] = column
+        if len(set(self.names)) < len(self.names):
+            twice = next(name for name in self.names if self.names.count(name) > 1)
+            what = "is also a computed feature" if twice in found else "is named twice"
+            raise OptionError(f"the dimension '{twice}' {what}")
+        return tuple(Columns(one, at) for one, at in columns.items())
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of all columns: ``Linearity_c1``, ..., then the dimensions."""
-        computed = (f"{feature}_{c.neighborhood.suffix}" for c in self.layout for feature in c.at)
-        return (*computed, *self.dimensions)
+        return (*self.features, *self.dimensions)
 
     @property
     def shapes(self) -> bool:
@@ -304,7 +225,7 @@ class FeaturePlan:
         return [
             int(c.neighborhood.parameters[0])
             for c in self.layout
-            if any(name in c.at for name in SURFACES)
+            if any(name in c.at for name in SURFACE_FEATURES)
         ]
 
     @property
@@ -313,7 +234,7 @@ class FeaturePlan:
         return any(c.at and c.neighborhood.kind == "copt" for c in self.layout)
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON-able description; :meth:`from_dict` reads it."""
+        """Return a JSON-able description; :meth:`from_dict` reads it."""
         by_radius = any(one.kind in (*BY_RADIUS, "copt") for one in self.neighborhoods)
         return {
             "neighborhoods": [n.token for n in self.neighborhoods],
@@ -324,7 +245,7 @@ class FeaturePlan:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
-        """The plan that :meth:`to_dict` described; OptionError where it is not such a description."""
+        """Return the plan that :meth:`to_dict` described; OptionError where it is not such a description."""
         lists = ("neighborhoods", "features", "dimensions")
         given: list[Any] = [data.get(name) if isinstance(data, Mapping) else None for name in lists]
         for value in given:
@@ -334,15 +255,45 @@ class FeaturePlan:
                 raise OptionError(
                     f"a feature plan needs lists of text: {', '.join(lists)}", found=repr(data)[:80]
                 )
-        tokens, words, dimensions = given
+        tokens, features, dimensions = given
         members = data.get("least_members", LEAST_MEMBERS)
         least = checks.whole("'least_members' of a feature plan", members, 3, 100)
         parsed = tuple(parse_neighborhoods(tokens))
-        return cls(parsed, parse_feature_set(words), tuple(dict.fromkeys(dimensions)), least)
+        return cls(parsed, tuple(features), tuple(dimensions), least)
 
 
-def has(neighborhood: Neighborhood, feature: str) -> bool:
-    """Whether a neighborhood has a feature: all have, but for the size chosen and what neighbors' surfaces make."""
-    if feature == "Radius":
-        return neighborhood.adaptive
-    return feature not in SURFACES or neighborhood.kind == "knn"
+def _features_of(neighborhoods: Sequence[Neighborhood]) -> dict[str, tuple[Neighborhood, str]]:
+    """Return the full name of every feature that neighborhoods have -> neighborhood, feature."""
+    return {
+        f"{feature.name}_{one.suffix}": (one, feature.name)
+        for one in neighborhoods
+        for feature in BY_NAME.values()
+        if not feature.kinds or one.kind in feature.kinds
+    }
+
+
+def _expand(neighborhoods: Sequence[Neighborhood], words: Sequence[str]) -> tuple[str, ...]:
+    """Return the full names of the features that words name, in the order of the columns.
+
+    Words are groups, features, or features of one neighborhood. OptionError where no neighborhood has one of these.
+    """
+    known = _features_of(neighborhoods)
+    wanted = {name for word in words for name in GROUPS.get(word, (word,))}
+    names = tuple(full for full, (_, feature) in known.items() if {full, feature} & wanted)
+    tokens = ", ".join(one.token for one in neighborhoods)
+    if lost := [word for word in words if word not in {*GROUPS, *BY_NAME, *names}]:
+        raise OptionError(
+            f"the feature '{lost[0]}' belongs to none of the neighborhoods", found=tokens
+        )
+    if not names:
+        cure = None
+        if wanted & {*SURFACE_FEATURES}:
+            cure = "Neighbors' surfaces exist for k20 and the like only"
+        if "Radius" in wanted:
+            cure = "Radius exists for kopt, ropt, rdim and copt only"
+        raise OptionError(
+            f"none of the neighborhoods has the feature '{', '.join(words)}'",
+            found=tokens,
+            cure=cure,
+        )
+    return names

@@ -34,7 +34,8 @@ import numpy as np
 from ..base.arrays import GOLDEN, finalise
 from ..base.jit import device, njit
 from .bins import ShapeBins
-from .plan import SHAPE_FEATURES, Columns, columns_of
+from .plan import Columns, columns_of
+from .registry import SHAPE_FEATURES
 
 #: x, y and z of points, (m,) float64 each.
 Axes = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -15,8 +15,9 @@ import math
 import numpy as np
 
 from ..base.jit import device
-from .moments import FEATURES, NORMAL
-from .plan import MOMENT_FEATURES, SURFACES
+from .moments import FEATURES
+from .moments import ROW as MOMENT_ROW
+from .registry import SURFACE_FEATURES, rows_of
 
 #: Columns of the table of surfaces, float32: unit normal, surface variation, distance to the farthest of the 10 (infinite
 #: where there are fewer).
@@ -25,22 +26,34 @@ SURFACE = 5
 
 #: Where :func:`moments.finish` writes what the 10 nearest make, all but the reach.
 COLUMNS = np.full(FEATURES, -1)
-COLUMNS[[MOMENT_FEATURES.index("SurfaceVariation"), *NORMAL]] = VARIATION, NX, NY, NZ
+COLUMNS[MOMENT_ROW.SurfaceVariation] = VARIATION
+COLUMNS[[MOMENT_ROW.NormalX, MOMENT_ROW.NormalY, MOMENT_ROW.NormalZ]] = NX, NY, NZ
 
-#: What is made of a neighborhood, in the order of ``names.SURFACES``.
-MADE = len(SURFACES)
+#: Rows of the features that :func:`agreement` computes.
+ROW = rows_of(*SURFACE_FEATURES)
 
 #: A little more than 1, by which distances grow in float32 so that none is too short.
 UP = 1.0 + 1e-6
 
 
 @device(forceinline=True)
-def agreement(surfaces, near, count, own, columns, out):
-    """Write the four features of the first `count` neighbors round a query of that surface to their `columns` of `out`.
+def _write(out, column, value):
+    """Write a value to its column, if it is wanted."""
+    if column >= 0:
+        out[column] = value
 
-    How far from the query points lie on which these depend, meters.
+
+@device(forceinline=True)
+def agreement(surfaces, near, count, own, columns, out):
+    """Write features of the first `count` neighbors of a query whose surface is `own`.
+
+    `columns` has the column of `out` for each of :data:`ROW`; -1: not wanted. Returns the distance in meters from the query
+    to the farthest point that the features depend on.
     """
-    if max(columns[0], columns[1], columns[2], columns[3]) < 0:
+    wanted = False
+    for row in range(len(columns)):
+        wanted |= columns[row] >= 0
+    if not wanted:
         return 0.0
     nx, ny, nz = np.float64(own[NX]), np.float64(own[NY]), np.float64(own[NZ])
     first = np.float64(surfaces[near.at[near.pos[0]], VARIATION])
@@ -57,8 +70,9 @@ def agreement(surfaces, near, count, own, columns, out):
         far = max(far, math.sqrt(near.sorted[i]) + surfaces[p, FAR])
     w = 1.0 / count
     mean = total * w
-    made = (min(agree * w, 1.0), low, first + mean, math.sqrt(max(squares * w - mean * mean, 0.0)))
-    for f in range(MADE):
-        if columns[f] >= 0:
-            out[columns[f]] = made[f]
+    deviation = math.sqrt(max(squares * w - mean * mean, 0.0))
+    _write(out, columns[ROW.NormalAgreement], min(agree * w, 1.0))
+    _write(out, columns[ROW.SurfaceVariationMin], low)
+    _write(out, columns[ROW.SurfaceVariationMean], first + mean)
+    _write(out, columns[ROW.SurfaceVariationStd], deviation)
     return max(far, np.float64(own[FAR]))

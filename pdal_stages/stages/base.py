@@ -74,6 +74,8 @@ class Stage(ABC):
     #: For a stage that a model file may carry, to be run by whoever applies it: the options that the file may give. Model
     #: files come from strangers, so none that holds a path.
     in_models: ClassVar[tuple[str, ...]] = ()
+    #: For the same: raise it when results change. Models store it, and warn where they were trained with another one.
+    algorithm_version: ClassVar[int] = 1
     #: Whether it forgets most dimensions (:meth:`Points.keep_only`) and then needs much memory: the next stage gets the
     #: points from PDAL anew.
     forgets: ClassVar[bool] = False

@@ -263,8 +263,10 @@ class ClassifierModel(Stage):
 
     def finish(self, model: Model, report: Report) -> None:
         """Write the model, and report what is to be known of it."""
-        model.info["preparation"] = self._preparation
-        if self.base is not None:
+        if self.base is None:
+            model.record_preprocessing(self._preparation)
+        else:
+            model.info["preparation"] = self._preparation
             model.info["base"] = {"name": Path(self.base).stem, "sha256": digest_of(self.base)}
             if "checked" in report.figures and "sureness" in model.info:
                 before = loaded_model(self.base).info

@@ -16,6 +16,7 @@ from ..base.messages import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.cells import LARGEST, check_side, represent
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
+from ..features.registry import ALGORITHM_VERSION
 from .base import Stage
 from .options import ignore_option, option
 from .points import Points
@@ -29,6 +30,7 @@ class MultiscaleFeatures(Stage):
     type = "filters.multiscalefeatures"
     summary = "Covariance, geometric and shape-distribution features of many neighborhoods"
     source = "[B16] sections 3.1-3.2, [W18] section 3.2, [H17] equations 1-3"
+    algorithm_version = ALGORITHM_VERSION
     where_chooses = True
     where_help = "Features are computed for the points inside; all points are neighbors"
     neighborhoods: list = option(

@@ -97,6 +97,12 @@ def _spelled(stages: Sequence[Mapping[str, Any]]) -> list[Any]:
         return list(stages)
 
 
+def algorithm_versions(preparation: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return type -> version of the algorithm in this release, for stages of ours; PDAL's have none."""
+    types = [str(stage["type"]) for stage in preparation]
+    return {kind: stage_type(kind).algorithm_version for kind in types if kind in stage_types()}
+
+
 def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A preparation that a model may carry, in one spelling.
 

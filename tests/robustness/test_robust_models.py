@@ -21,9 +21,8 @@ KEEP = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
 TRAPPED = Path("/tmp/should-not-exist-pdal-stages")
 
 
-def swap_names(head, members):
-    names = head["passes"][0]["feature_names"]
-    names[0], names[1] = names[1], names[0]
+def rename(head, members):
+    head["passes"][0]["feature_names"][0] = "Colour_s1"
 
 
 class Evil:
@@ -33,11 +32,11 @@ class Evil:
 
 #: Edit of manifest and members of a good file, what the message must hold; test_classifier_modelfile.py has more.
 BROKEN = {
-    "version 3": (lambda h, m: h.update(version=3), ["version", "Update pdal-stages"]),
-    "997 neighborhoods": (lambda h, m: h["passes"][0]["features"].update(neighborhoods=[f"ropt(0.25,{k / 100},0.05)" for k in range(30, 1027)]),
+    "version 4": (lambda h, m: h.update(version=4), ["version", "Update pdal-stages"]),
+    "997 neighborhoods": (lambda h, m: h["passes"][0].update(neighborhoods=[f"ropt(0.25,{k / 100},0.05)" for k in range(30, 1027)]),
                           ["at most 64 neighborhoods"]),
-    "features in another order": (swap_names, ["features"]),
-    "a neighborhood that is none": (lambda h, m: h["passes"][0]["features"].update(neighborhoods=["q5"]), []),
+    "a feature that no neighborhood has": (rename, ["Colour_s1", "belongs to none"]),
+    "a neighborhood that is none": (lambda h, m: h["passes"][0].update(neighborhoods=["q5"]), []),
     "densities of 400 digits": (lambda h, m: h["densities"].update(high=10**400), ["densities"]),
     "a pickle inside": (lambda h, m: m.update({h["arrays"]["1.threshold"]["file"]: pickle.dumps(Evil())}), []),
 }  # fmt: skip

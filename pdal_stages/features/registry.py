@@ -1,0 +1,100 @@
+"""The registry of features: names, groups, units and definitions, in the order of the columns.
+
+A new eigen-feature is one entry here and one line in ``moments.write_eigen_features``. Columns, groups, kernel rows and the
+table of docs/features.md follow. Model files name their features one by one, so none of them needs to be trained again.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import dataclass
+from typing import Any
+
+from .neighborhoods import ADAPTIVE
+
+#: Raise it when values of existing features change: models that were trained with another version then warn.
+ALGORITHM_VERSION = 1
+#: Bins of a shape distribution's histogram.
+SHAPE_BINS = 10
+#: Groups whose features are computed from the moments of a neighborhood, by ``moments.finish``.
+_OF_MOMENTS = ("covariance", "geometric", "relative")
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature of a neighborhood."""
+
+    name: str  #: without the neighborhood's suffix
+    group: str  #: covariance, geometric, shapes, relative or surfaces
+    unit: str  #: 1 for ratios
+    definition: str
+    #: Kinds of neighborhoods that have the feature; empty: all.
+    kinds: tuple[str, ...] = ()
+
+
+#: Shape distribution -> what is measured [B16 3.2.2].
+SHAPES = {
+    "A3": "angle between two pulled points seen from a third",
+    "D1": "distance of a pulled point from the centroid",
+    "D2": "distance between two pulled points",
+    "D3": "square root of the area of the triangle of three pulled points",
+    "D4": "cube root of the volume of the tetrahedron of four pulled points",
+}
+
+#: Every feature, in the order of the columns. e1 >= e2 >= e3 are the eigenvalues l1, l2, l3 divided by their sum, n is the
+#: unit eigenvector of l3.
+FEATURES = (
+    Feature("Linearity", "covariance", "1", "(e1 - e2) / e1"),
+    Feature("Planarity", "covariance", "1", "(e2 - e3) / e1"),
+    Feature("Scattering", "covariance", "1", "e3 / e1"),
+    Feature("Omnivariance", "covariance", "1", "cube root of e1 e2 e3"),
+    Feature("Anisotropy", "covariance", "1", "(e1 - e3) / e1"),
+    Feature("Eigenentropy", "covariance", "1", "-(e1 ln e1 + e2 ln e2 + e3 ln e3), 0 ln 0 = 0"),
+    Feature("EigenvalueSum", "covariance", "m²", "l1 + l2 + l3"),
+    Feature("SurfaceVariation", "covariance", "1", "e3"),
+    Feature("Density", "geometric", "1/m² or 1/m³", "points per area of a cylinder's base, n / (π r²), or per "
+            "volume of a sphere, n / (4/3 π r³), r the distance to the k-th neighbor where k is given"),
+    Feature("Verticality", "geometric", "1", "1 - abs(nz)"),
+    Feature("HeightRange", "geometric", "m", "highest minus lowest z"),
+    Feature("HeightStd", "geometric", "m", "standard deviation of z (divisor n)"),
+    Feature("Radius", "geometric", "m", "the chosen radius; kopt, ropt, rdim and copt only", ADAPTIVE),
+    *(
+        Feature(f"{metric}_{number}", "shapes", "1", f"share of pulls in bin {number}: {measured}")
+        for metric, measured in SHAPES.items()
+        for number in range(SHAPE_BINS)
+    ),
+    Feature("HeightAboveLowest", "relative", "m", "z of the point minus lowest z of the neighborhood [HWS16]"),
+    Feature("NormalAgreement", "surfaces", "1", "mean abs(n·n′) of the point's normal n and the normals n′ of the "
+            "neighborhood's points", ("knn",)),
+    Feature("SurfaceVariationMin", "surfaces", "1", "lowest surface variation of the neighborhood's points", ("knn",)),
+    Feature("SurfaceVariationMean", "surfaces", "1", "mean surface variation of the neighborhood's points", ("knn",)),
+    Feature("SurfaceVariationStd", "surfaces", "1", "standard deviation (divisor n) of the surface variation of the "
+            "neighborhood's points", ("knn",)),
+)  # fmt: skip
+
+BY_NAME = {feature.name: feature for feature in FEATURES}
+
+
+def _names(*groups: str) -> tuple[str, ...]:
+    return tuple(feature.name for feature in FEATURES if feature.group in groups)
+
+
+#: Features that ``moments.finish``, the shape kernels and ``surfaces.agreement`` compute, in the order of their rows.
+MOMENT_FEATURES = _names(*_OF_MOMENTS)
+SHAPE_FEATURES = _names("shapes")
+SURFACE_FEATURES = _names("surfaces")
+
+#: Words for several features at once. "all" is what the papers have: neither relative features nor surfaces.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "all": _names("covariance", "geometric", "shapes"),
+    **{group: _names(group) for group in ("covariance", "geometric", "shapes", "surfaces")},
+    "he2017": (
+        "Linearity", "Planarity", "Scattering", "SurfaceVariation", "Verticality", "HeightRange",
+    ),
+    **{metric: tuple(f"{metric}_{b}" for b in range(SHAPE_BINS)) for metric in SHAPES},
+}  # fmt: skip
+
+
+def rows_of(*names: str) -> Any:
+    """Return the rows of a kernel's table as a named tuple, ``rows.Linearity`` and so on; kernels see constants."""
+    return namedtuple("Rows", names)(*range(len(names)))
