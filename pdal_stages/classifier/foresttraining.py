@@ -17,7 +17,7 @@ from ..base.messages import Progress
 from ..base.resources import free_memory
 from ..features import FeaturePlan
 from ..features.engine import fit_clouds
-from ..features.plan import SHAPE_FEATURES
+from ..features.registry import SHAPE_FEATURES
 from ..features.returns import SOURCES
 from .algorithms import OPTIONAL_DIMENSIONS, PredictRequest, gather, required
 from .clouds import TrainingCloud, label_classes
