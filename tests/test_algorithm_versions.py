@@ -1,0 +1,77 @@
+"""Results of the stages that models depend on are bound to the versions of their algorithms."""
+
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from pdal_stages.stages.base import stage_type, stage_types
+
+DATA = Path(__file__).parent / "data"
+#: type -> version -> clip and dimension -> (PARTS,) means over points.
+STORED = DATA / "algorithm_versions.json"
+PARTS = 8
+#: Real clips, and how much of the first features are computed of, in meters around its middle.
+CLIPS, MIDDLE = ("canals", "riverbank", "woods"), 12.0
+#: A different processor rounds the last digits otherwise; a mean that moves by more is another result.
+TOLERANCE = 2e-3
+#: The options that results are stored for: all that a model's preprocessing may want.
+OPTIONS = {
+    "filters.hag_minima": {},
+    "filters.hag_morphological": {"ground": True, "terrain_slope": True, "openings": [5, 17]},
+    "filters.multiscalefeatures": {
+        "neighborhoods": "c2,s3,k20,kopt,ropt",
+        "feature_set": "covariance,geometric,HeightAboveLowest,surfaces",
+    },
+}
+
+
+def results(kind: str) -> dict[str, list[float]]:
+    """Return the means of each dimension that a stage makes of the clips, over parts of their points by x + y."""
+    stage, found = stage_type(kind)(OPTIONS[kind]), {}
+    for clip in CLIPS:
+        xyz = np.asarray(laspy.read(DATA / f"{clip}.laz").xyz)
+        if kind == "filters.multiscalefeatures":
+            middle = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
+            xyz = xyz[np.abs(xyz - middle)[:, :2].max(axis=1) < MIDDLE]
+        made = {name: np.zeros(len(xyz)) for name in stage.creates()}
+        columns = {**dict(zip("XYZ", xyz.T, strict=True)), **made}
+        out = stage.run(stage.points(columns))
+        parts = np.array_split(np.argsort(xyz[:, 0] + xyz[:, 1], kind="stable"), PARTS)
+        for name in made:
+            means = [round(float(np.mean(out[name][part])), 5) for part in parts]
+            found[f"{clip} {name}"] = means
+        if kind == "filters.multiscalefeatures":
+            break
+    return found
+
+
+@pytest.mark.parametrize("kind", sorted(OPTIONS))
+def test_results_change_with_the_version_only(kind):
+    version = str(stage_type(kind).algorithm_version)
+    known = json.loads(STORED.read_text())[kind]
+    found = results(kind)
+    cure = f"raise algorithm_version of {kind} and run: python tests/test_algorithm_versions.py"
+    assert version in known, cure
+    assert found.keys() == known[version].keys(), cure
+    changed = [
+        name
+        for name, values in known[version].items()
+        if not np.allclose(values, found[name], rtol=TOLERANCE, atol=TOLERANCE)
+    ]
+    assert not changed, f"changed: {changed[:5]}. {cure}"
+
+
+def test_every_stage_that_a_model_may_carry_has_stored_results():
+    carried = {kind for kind in stage_types() if stage_type(kind).in_models}
+    assert carried | {"filters.multiscalefeatures"} == set(OPTIONS)
+
+
+if __name__ == "__main__":  # stores the results of versions that have none
+    stored = json.loads(STORED.read_text()) if STORED.exists() else {}
+    for name in OPTIONS:
+        versions = stored.setdefault(name, {})
+        versions.setdefault(str(stage_type(name).algorithm_version), results(name))
+    STORED.write_text(json.dumps(stored, indent=1) + "\n")
