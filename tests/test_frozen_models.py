@@ -16,6 +16,7 @@ from pdal_stages import load_model
 from pdal_stages.base.errors import ModelError
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.modelfile import shipped
+from pdal_stages.cli import main
 
 DATA = Path(__file__).parent / "data"
 #: Models of the cloud below, written in versions 2 and 3 of the format, with the points of classes 2 and 5 they gave.
@@ -154,3 +155,21 @@ def test_a_shipped_model_that_is_damaged_is_not_suggested_in_its_own_place(tmp_p
     assert "Did you mean" not in str(caught.value)
     with pytest.raises(ModelError, match="Did you mean 'standard'"):
         load_model("standrd")
+
+
+def test_the_shipped_model_is_described_in_words(capsys):
+    main(["model", "standard"])
+    said = capsys.readouterr().out
+    model = load_model("standard")
+    for token in {one.token for each in model.passes for one in each.plan.neighborhoods}:
+        assert f"{token}, " in said
+    for words in (
+        "of points right, on ground it had not seen",
+        "filters.hag_morphological (ground True, openings",
+        f"version {model.info['algorithms']['filters.hag_morphological']} of its algorithm",
+        "sphere of 5 m radius: 12 features, Linearity, Planarity",
+        "the 10 nearest points: 12 features, those of s5",
+        "Montpellier, Delft, Seville",
+        *(f"{code} {name}" for code, name in model.classes),
+    ):
+        assert words in said, words

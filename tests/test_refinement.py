@@ -126,7 +126,7 @@ def test_a_file_holds_the_base(base, tmp_path, more):
     assert np.array_equal(one.probabilities, two.probabilities)
     again.save(tmp_path / "n.model")
     assert (tmp_path / "n.model").read_bytes() == (tmp_path / "m.model").read_bytes()
-    assert "refined_forest" in str(again)
+    assert "refined forest" in str(again)
 
 
 def test_any_order_and_any_part(base):
@@ -348,7 +348,7 @@ def test_through_pdal(tmp_path, write_las):
     assert made.codes.tolist() == [2, 5, 6, 11]
     assert made.info["base"]["name"] == "standard" and len(made.info["base"]["sha256"]) == 64
     assert (
-        f"on top of      standard, the passes before (SHA-256 {made.info['base']['sha256']})"
+        f"on top of       standard, the passes before (SHA-256 {made.info['base']['sha256']})"
         in str(made)
     )
     assert "pass 4" in str(made) and "pass 3" not in str(made)

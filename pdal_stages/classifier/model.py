@@ -122,10 +122,12 @@ class Model:
         stored, told = self.info.get("algorithms", {}), []
         for kind, version in self.algorithm_versions.items():
             if (then := stored.get(kind)) != version:
-                what = "an unknown version" if then is None else f"version {then}"
+                what, may = (
+                    ("an unknown version", "may ") if then is None else (f"version {then}", "")
+                )
                 told.append(
                     f"the model was trained with {what} of {kind}, and this release has version {version}, whose "
-                    "results differ: expect lower accuracy. Train the model again, or install the release that it was "
+                    f"results {may}differ: expect lower accuracy. Train the model again, or install the release that it was "
                     f"trained with (pdal_stages {self.info['created_by'].get('pdal_stages', 'unknown')})"
                 )
         return told
@@ -142,7 +144,12 @@ class Model:
 
     def describe(self) -> dict[str, Any]:
         """Everything about the model as plain data; ``str(model)`` is the same as text."""
-        more = {"required_dimensions": list(self.required_dimensions), "halo_m": self.halo_m}
+        more = {
+            "required_dimensions": list(self.required_dimensions),
+            "optional_dimensions": list(self.optional_dimensions),
+            "halo_m": self.halo_m,
+            "outdated": self.outdated,
+        }
         return summary.describe(
             {**self.manifest(), **more},
             [one.columns(codes) for one, codes in zip(self.passes, self.codes_of, strict=True)],

@@ -1,4 +1,4 @@
-"""What is told of a model: classes, features, samples, scores, importances."""
+"""A model in words: classes, accuracy, what it reads and where that comes from, training, importances."""
 
 from __future__ import annotations
 
@@ -7,12 +7,24 @@ from typing import Any
 
 from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
+from ..features.neighborhoods import parse_neighborhoods
 from .algorithms import REFINED, Column
+from .sureness import Sureness
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"
-#: How many clouds a model's text names.
-_CLOUDS = 8
+#: How many surveys a model's text names.
+_SURVEYS = 40
+#: Kind of neighborhood -> its words.
+_KINDS = {
+    "cylinder": "vertical cylinder of {0:g} m radius",
+    "sphere": "sphere of {0:g} m radius",
+    "knn": "the {0:g} nearest points",
+    "kopt": "the best of {0:g} to {1:g} nearest points",
+    "ropt": "the best radius of {0:g} to {1:g} m",
+    "rdim": "the best radius of {0:g} to {1:g} m, by dimensionality",
+    "copt": "radius or number of points by curvature",
+}
 
 GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 
@@ -42,6 +54,7 @@ def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -
     passes = []
     for entry, its in zip(manifest["passes"], columns, strict=True):
         kept = {k: v for k, v in entry.items() if k not in ("shape_bins", "importances")}
+        kept["features"] = by_neighborhood(its)
         if entry["importances"] is not None:
             kept["importances"] = {
                 by: {k: round(v, 6) for k, v in importances(entry["importances"], its, by).items()}
@@ -51,52 +64,137 @@ def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -
     return {**manifest, "passes": passes}
 
 
+def by_neighborhood(columns: Sequence[Column]) -> dict[str, list[str]]:
+    """Return token -> features of that neighborhood, without its suffix; a histogram's bins as one."""
+    found: dict[str, dict[str, int]] = {}
+    for column in columns:
+        if column.group not in ("dimension", "context"):
+            bins = found.setdefault(column.neighborhood, {})
+            bins[column.feature] = bins.get(column.feature, 0) + 1
+    return {
+        token: [name if count == 1 else f"{name} ({count} bins)" for name, count in bins.items()]
+        for token, bins in found.items()
+    }
+
+
 def text(info: Mapping[str, Any]) -> str:
-    """What :func:`describe` gives as a page of text."""
+    """Return what :func:`describe` gives as a page of text."""
     info = _in_one_line(info)
     several = len(info["passes"]) > 1
     every = list(enumerate(info["passes"], 1))
     # A base's own file describes its passes.
     passes = [(number, one) for number, one in every if one["algorithm"] == REFINED] or every
-    lines = [score(info), ""]
+    rows = [*_measured(info), *_inputs(info, passes), *_passes(passes, several), *_training(info)]
+    rows += [("warning", one) for one in info["outdated"]]
+    lines = [score(info), "", *(f"{name:<16}{said}".rstrip() for name, said in rows), ""]
+    lines += [*_classes(info), ""]
     for number, one in passes:
-        name = f"pass {number}, {one['algorithm']}" if several else one["algorithm"]
-        numbers = [f"{v:,} {k}" for k, v in one["parameters"].items() if isinstance(v, int)]
-        lines += [
-            f"{name}: {', '.join(numbers)}",
-            f"features       {len(one['feature_names'])}: {' '.join(one['neighborhoods'])}",
-            f"context        {' '.join(one['context']) or '-'}",
-        ]
+        for by in ("neighborhood", "group", "feature") if "importances" in one else ():
+            top = ", ".join(
+                f"{k} {100 * v:.1f} %" for k, v in list(one["importances"][by].items())[:10]
+            )
+            lines.append(f"pass {number}: " * several + f"importance by {by:<13}{top}")
+    return "\n".join(lines)
+
+
+#: Rows of the page: what they are called, what they hold.
+_Rows = list[tuple[str, str]]
+
+
+def _measured(info: Mapping[str, Any]) -> _Rows:
+    """Return how many points of ground that was held out were right, by the class they were given."""
+    if not info.get("sureness"):
+        return []
+    known = Sureness.from_dict(info["sureness"])
+    shares = {code: known.share_right([code]) for code in sorted(known.right)}
+    each = ", ".join(f"{code}: {_percent(share)}" for code, share in shares.items())
+    return [
+        ("points right", f"{_percent(known.share_right(known.right))}; of those given {each}"),
+        ("", f"measured on {known.about}"),
+    ]
+
+
+def _inputs(info: Mapping[str, Any], passes: Sequence[tuple[int, Mapping[str, Any]]]) -> _Rows:
+    """Return what the points must have, the stages that make it, and the features computed of it."""
+    versions = info.get("algorithms", {})
+    rows = [("reads", ", ".join(["X, Y, Z", *info["required_dimensions"]]))]
+    if info["optional_dimensions"]:
+        rows.append(("", f"{', '.join(info['optional_dimensions'])}, where the points have them"))
+    for stage in info.get("preparation") or []:
+        options = ", ".join(f"{k} {v}" for k, v in stage.items() if k != "type")
+        version = versions.get(stage["type"])
+        known = "" if version is None else f", version {version} of its algorithm"
+        rows.append(("preprocessing", f"{stage['type']}{f' ({options})' * bool(options)}{known}"))
+    if info.get("by_hand"):
+        rows.append(("preprocessing", f"{', '.join(info['by_hand'])}, which the file cannot carry"))
+    tokens: dict[str, list[str]] = {}  # list of features -> neighborhoods that have it
+    for _, one in passes:
+        for token, names in one["features"].items():
+            listed = ", ".join(names)
+            if token in tokens.setdefault(listed, []):
+                continue
+            said = f"those of {tokens[listed][0]}" if tokens[listed] else listed
+            tokens[listed].append(token)
+            rows.append(("features", f"{_describe(token)}: {len(names)} features, {said}"))
+    if tokens and "filters.multiscalefeatures" in versions:
+        rows.append(("", f"version {versions['filters.multiscalefeatures']} of their algorithm"))
+    return rows
+
+
+def _describe(token: str) -> str:
+    (one,) = parse_neighborhoods(token)
+    return f"{token}, {_KINDS[one.kind].format(*one.parameters)}"
+
+
+def _passes(passes: Sequence[tuple[int, Mapping[str, Any]]], several: bool) -> _Rows:
+    """Return the size of each classifier and how many columns of which kind it reads."""
+    rows = []
+    for number, one in passes:
+        sizes = [f"{v:,} {k}" for k, v in one["parameters"].items() if isinstance(v, int)]
+        said = f"{one['algorithm'].replace('_', ' ')}, {', '.join(sizes)}"
+        features = sum(map(len, one["features"].values()))
+        said += f"; reads {features} features, {len(one['dimensions'])} dimensions"
+        if one["context"]:
+            said += f" and, of the pass before, {' '.join(one['context'])}"
+        rows.append((f"pass {number}" if several else "classifier", said))
+    return rows
+
+
+def _training(info: Mapping[str, Any]) -> _Rows:
+    """Return what it was trained on and where it holds."""
     clouds = info["training"]["clouds"]
+    heads = [cloud["name"].partition(", ")[0] for cloud in clouds]  # copies follow the comma
+    surveys = list(
+        dict.fromkeys(
+            cloud["name"] if heads.count(head) == 1 else head
+            for cloud, head in zip(clouds, heads, strict=True)
+        )
+    )
+    more = f" and {len(surveys) - _SURVEYS} more (--showjson lists them)"
+    names = ", ".join(surveys[:_SURVEYS]) + more * (len(surveys) > _SURVEYS)
+    points = sum(cloud["points"] for cloud in clouds)
+    size = f"{len(surveys)} surveys or files, {len(clouds)} clouds with copies, {points:,} points"
+    density = f"{range_text(info.get('densities') or {})} points/m2"
+    binary = f"binary, target {info['target']}, background {info['background']}"
+    sure = "what {0[name]} is sure of ({0[sure]:g} and more); no person's"
     rows: list[tuple[str, Any, str]] = [
-        ("needs", True, ", ".join(info["required_dimensions"]) or "coordinates only"),
-        ("halo", True, f"{info['halo_m']:g} m"),
-        ("prior weight", info.get("priors"), "{0[weight]:g}"),
-        (
-            "strategy",
-            info["strategy"] == "binary",
-            f"binary, target {info['target']}, background {info['background']}",
-        ),
-        (
-            "densities",
-            info.get("densities"),
-            f"{range_text(info.get('densities') or {})} points/m2",
-        ),
-        ("voxel", info.get("voxel"), "{0:g} m, which one point stands for"),
+        ("trained on", clouds, size),
+        ("", clouds, names.replace("{", "{{").replace("}", "}}")),
+        ("labels", info.get("teacher"), sure),
         ("on top of", info.get("base"), "{0[name]}, the passes before (SHA-256 {0[sha256]})"),
-        *(("trained on", c, "{0[name]}, {0[points]:,} points") for c in clouds[:_CLOUDS]),
-        ("", len(clouds[_CLOUDS:]), "and {0:,} more (--showjson lists them)"),
-        (
-            "labels",
-            info.get("teacher"),
-            "what {0[name]} is sure of ({0[sure]:g} and more); no person's",
-        ),
+        ("densities", info.get("densities"), density),
+        ("voxel", info.get("voxel"), "{0:g} m, which one point stands for"),
+        ("halo", info["halo_m"], "{0:g} m around a tile"),
+        ("prior weight", info.get("priors"), "{0[weight]:g}"),
+        ("strategy", info["strategy"] == "binary", binary),
+        ("written by", info["created_by"].get("pdal_stages"), "pdal_stages {0}"),
     ]
-    lines += [f"{name:<15}{said.format(value)}" for name, value, said in rows if value]
-    lines += [
-        "",
-        f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 held out':>13}",
-    ]
+    return [(name, said.format(value)) for name, value, said in rows if value]
+
+
+def _classes(info: Mapping[str, Any]) -> list[str]:
+    """Return the table of classes."""
+    lines = [f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 held out':>13}"]
     f1 = held_out(info).get("f1") or {}
     for entry in info["classes"]:
         name = entry["name"]
@@ -105,14 +203,7 @@ def text(info: Mapping[str, Any]) -> str:
             f"{entry['code']:>3} {name:<30}{entry['available']:>12,}{entry['samples']:>10,}"
             f"{entry['duplicates']:>12,}{_percent(f1.get(str(entry['code']))):>13}"
         )
-    lines.append("")
-    for number, one in passes:
-        for by in ("neighborhood", "group", "feature") if "importances" in one else ():
-            top = ", ".join(
-                f"{k} {100 * v:.1f} %" for k, v in list(one["importances"][by].items())[:10]
-            )
-            lines.append(f"pass {number}: " * several + f"importance by {by:<13}{top}")
-    return "\n".join(lines)
+    return lines
 
 
 def range_text(densities: Mapping[str, float]) -> str:
@@ -145,6 +236,10 @@ def score(info: Mapping[str, Any]) -> str:
     if teacher := info.get("teacher"):
         return f"not scored     its labels are answers of {teacher['name']}; only labels of your own tell how right it is"
     row = held_out(info)
+    if not row and info.get("sureness"):
+        known = Sureness.from_dict(info["sureness"])
+        share = _percent(known.share_right(known.right))
+        return f"measured       {share} of points right, on ground it had not seen"
     if not row:
         why = "no score in the file (the shipped model: docs/models.md)"
         return f"not scored     {info['training'].get('unscored', why)}"

@@ -84,6 +84,12 @@ class Sureness:
             if code in self.right
         )
 
+    def share_right(self, codes: Iterable[int]) -> float | None:
+        """Return the share of points that were given these classes and are right; None where there is no such point."""
+        known = [code for code in codes if code in self.right]
+        points = self.points(known)
+        return sum(float(self.right[code].sum()) for code in known) / points if points else None
+
     def kept(self, limits: Mapping[int, Limit]) -> float:
         """The share of all points that keep their class."""
         kept = sum(limit.kept * self.points([code]) for code, limit in limits.items())

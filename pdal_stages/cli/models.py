@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 from pathlib import Path
 
@@ -177,9 +178,14 @@ def _compare_objects(options: argparse.Namespace) -> None:
 
 
 def _model(options: argparse.Namespace) -> None:
+    from ..base.errors import OptionError
     from ..classifier.model import load_model
+    from ..classifier.modelfile import find
+    from ..classifier.sureness import sureness_of
 
     model = load_model(options.file)
+    with contextlib.suppress(OptionError):  # it was never scored
+        model.info["sureness"] = sureness_of(model.info, find(options.file)).to_dict()
     if options.showjson:
         print(json.dumps(model.describe(), indent=2, default=str))
     else:
