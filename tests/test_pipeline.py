@@ -116,7 +116,6 @@ def test_stages_that_follow_one_another_are_one_filter(cloud, model):
         "type": "filters.hag_morphological",
         "ground": True,
         "terrain_slope": True,
-        "decks": True,
     }
     classifier = {"type": "filters.modelclassifier", "model": str(model)}
     ours = [{"type": "filters.detachednoise"}, heights, classifier, {"type": "filters.bridges"}]

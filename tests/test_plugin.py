@@ -117,7 +117,7 @@ def test_every_stage_is_listed_with_its_options(stock):
 EVERY = [
     {"type": "filters.detachednoise"},
     {"type": "filters.hag_minima", "cell": 10, "resolution": 0.25, "ignore": ["7", "withheld"]},
-    {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "decks": True},
+    {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
     {
         "type": "filters.multiscalefeatures",
         "neighborhoods": ["c1", "kopt(10,30)"],

@@ -243,29 +243,3 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
 def test_a_block_without_points_has_no_cells():
     none = cells_of_block(np.empty((0, 4)), (3, -4), FilterOptions(openings=(5,)))
     assert none.cells["opened"].shape == (0, 1)
-
-
-def test_decks_of_blocks_are_those_of_the_whole():
-    from bridge_scenes import SCENES, scan
-
-    xyz, _ = scan(SCENES["river"](), 2.0)
-    middle = np.array(
-        [xyz[:, 0].mean() - 1024.0, xyz[:, 1].mean() - 2048.0, 0.0]
-    )  # where four blocks meet
-    x, y, z = (xyz - middle).T
-    use = np.random.default_rng(0).random(len(x)) < 0.95
-    options = {"decks": True, "openings": (5,)}
-    whole = filtered_ground(x, y, z, mask=use, **options)
-    assert np.count_nonzero(whole["Deck"]) > 300
-    made = FilterOptions(openings=(5,), decks=True)
-    left = around_blocks(x, y, z, use, made)
-    inside = by_block(x, y, z, use, 1.0)
-    parts = [
-        cells_of_block(left, (i, j), made, [inside[i, j]]).in_parts(256)
-        for i in (0, 1)
-        for j in (1, 2)
-    ]
-    assert all(len(part["decks"]) for part in parts)
-    some = filtered_ground(x, y, z, mask=use, cells=GroundCells.of_blocks(parts, 1), **options)
-    for key, values in some.items():
-        assert np.array_equal(values, whole[key]), key

@@ -252,6 +252,7 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..classifier.trainoptions import TrainingOptions
     from ..objects.crowns import crown_cells
     from ..objects.roofs import roof_planes
+    from ..structures.decks import find_decks
     from ..structures.towers import find_towers
     from ..structures.wires import find_wires
     from ..synthetic import make_town
@@ -261,7 +262,8 @@ def _warmup(options: argparse.Namespace) -> None:
     # A deck over a valley, with land at both ends, so that the kernels for decks run as well.
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
     z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))
-    filtered_ground(x, y, z, openings=(5,), decks=True, threads=1)
+    on_ground = filtered_ground(x, y, z, openings=(5,), threads=1)["Ground"] > 0
+    find_decks(x, y, z, np.ones(len(x), bool), on_ground)
     # A wire that sags on both sides of a pole, so that the kernels for both run.
     x, z = np.arange(-60.0, 60.0, 0.5), np.arange(0.0, 12.0, 0.5)
     span = np.zeros((len(x) + len(z), 3))

@@ -49,7 +49,7 @@ def add_commands(parser: Parser) -> None:
     )
     for flag, default, help in (
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
-        ("--bridges", True, "Find bridge decks, class 17 (default: on)"),
+        ("--bridges", False, "Find bridge decks, class 17"),
         ("--wires", False, "Find wires, class 14; without it they become building"),
         ("--towers", False, "Find wires, and towers and poles, class 15"),
     ):

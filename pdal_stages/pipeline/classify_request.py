@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import ModelError, OptionError, suggest
-from ..base.las import BRIDGE
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation
@@ -19,8 +18,8 @@ from .read import Override
 from .run import Pipeline
 from .stagefiles import LAS_WRITERS
 
-#: The stage that finds bridge decks along with the heights.
-_DECKS = "filters.hag_morphological"
+#: The stage whose ground bridge decks lead on to.
+_GROUND = "filters.hag_morphological"
 
 #: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
@@ -37,7 +36,7 @@ class ClassifyRequest:
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True  #: mark low and high noise first
     bridges: bool = (
-        True  #: find bridge decks, where heights come from ``filters.hag_morphological``
+        False  #: find bridge decks, where heights come from ``filters.hag_morphological``
     )
     wires: bool = False  #: find wires, where heights are computed
     towers: bool = False  #: find wires, and towers and poles
@@ -93,11 +92,10 @@ class ClassifyRequest:
                 "filters.modelclassifier, and the writer",
             )
         prepared = self._prepared
-        if self._with_bridges:
-            # The heights and flags of the last one are those that remain.
-            at = max(n for n, stage in enumerate(prepared) if stage["type"] == _DECKS)
+        if self.bridges:
             prepared = [
-                {**stage, "decks": True} if n == at else stage for n, stage in enumerate(prepared)
+                {**stage, "ground": True} if stage["type"] == _GROUND else stage
+                for stage in prepared
             ]
         noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
         return [*noise, *prepared, self._classifier, *self._corrections]
@@ -107,19 +105,6 @@ class ClassifyRequest:
         """The stages before the classifier, as the model says or its dimensions need."""
         needed = self.loaded.required_dimensions
         return self.loaded.info.get("preparation") or preparation.preparation_of(needed)
-
-    @cached_property
-    def _with_bridges(self) -> bool:
-        """Whether to look for decks: not where the model knows bridges itself, or heights come from another stage."""
-        known = {code for code, _ in self.loaded.classes}
-        there = any(stage["type"] == _DECKS for stage in self._prepared)
-        return (
-            self.bridges
-            and there
-            and known >= {2, 6}
-            and BRIDGE not in known
-            and not self._by_class
-        )
 
     @property
     def _by_class(self) -> bool:
@@ -140,7 +125,7 @@ class ClassifyRequest:
             name: settled[name] for name in ("ignore", "keep") if name in settled
         }
         wanted = {
-            "filters.bridges": self._with_bridges,
+            "filters.bridges": self.bridges and not self._by_class,
             "filters.wires": self.wires and not self._by_class,
             "filters.polygons": bool(self.polygons),
         }

@@ -6,40 +6,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.las import BRIDGE
-from ..terrain.decks import PARTS, SURFACE
+from ..structures.decks import RULES, find_decks
 from .base import ClassStage
 from .options import code_option, ignore_option, keep_option
 from .points import Points, class_counts
 from .selection import Selection
 
-#: What parapets, flanks and cars are called where they are taken for something that stands on the ground.
-_MISTAKEN = (2, 6)
+#: Leaves beside a deck, as high as it is.
+_VEGETATION = (3, 4, 5)
 
 
 class Bridges(ClassStage):
     type = "filters.bridges"
     summary = "Classify bridge decks, which are then no longer ground or building"
-    where_help = "Points outside keep their class"
+    source = "after Sithole, Vosselman 2006, ISPRS Journal of Photogrammetry and Remote Sensing 61(1), 33-46"
+    where_help = "Points outside keep their class but still serve as neighbors"
     code: int = code_option(BRIDGE, "Class code of bridge decks")
-    ignore: Selection = ignore_option("Points that keep their class")
-    keep: Selection = keep_option("Further points that keep their class")
+    ignore: Selection = ignore_option(
+        "Points that are left out, even as neighbors, and keep their class"
+    )
+    keep: Selection = keep_option()
 
     def reads(self) -> list[str]:
-        return ["Classification", "Deck"]
+        return ["Classification", "Ground"]
+
+    def halo_m(self) -> float:
+        return RULES.reach_m
 
     def largest_class(self) -> int:
         return self.code
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        free = points.changeable(self.ignore, self.keep)
-        before, deck = points.class_codes, points.dimension("Deck")
-        parts = free & (deck == PARTS) & np.isin(before, _MISTAKEN)
-        found = parts | (free & (deck == SURFACE))
+        ignored, ground = points.ignored(self.ignore), points.dimension("Ground") != 0
+        before = points.class_codes
+        free = points.inside & ~ignored & ~points.chosen(self.keep)
+        deck = find_decks(*points.axes, ~ignored, ground) & free & ~np.isin(before, _VEGETATION)
         codes = before.copy()
-        codes[found] = self.code
+        codes[deck] = self.code
         figures = points.report.figures
-        figures["decks"], figures["parts"] = points.counted(found), points.counted(parts)
-        left = found & (before != self.code)
-        figures["left"] = class_counts(before[left])
+        figures["decks"] = points.counted(deck)
+        figures["left"] = class_counts(before[deck & (before != self.code)])
         figures["classes"] = class_counts(codes[free])
         return {"Classification": points.with_codes(codes)}

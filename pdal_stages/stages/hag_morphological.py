@@ -109,12 +109,6 @@ class HagMorphological(Stage):
         "5,9,17,33,65: HeightAboveOpening_5, ...",
         may_be_empty=True,
     )
-    decks: bool = option(
-        "boolean",
-        False,
-        "Also find bridge decks, which then are not ground, and write Deck: 1 on a deck, 2 for its parapets, sides and what "
-        "stands on it, else 0",
-    )
 
     def check(self) -> None:
         self._filter = FilterOptions(
@@ -127,7 +121,6 @@ class HagMorphological(Stage):
             **({"Ground": "uint8_t"} if self.ground else {}),
             **({"Slope": "float"} if self.terrain_slope else {}),
             **dict.fromkeys(opening_names(self.openings), "float"),
-            **({"Deck": "uint8_t"} if self.decks else {}),
         }
 
     def halo_m(self) -> float:

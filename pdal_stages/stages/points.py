@@ -26,7 +26,6 @@ MAKERS = {
     ),
     "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": "Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
-    "Deck": 'Add {"type": "filters.hag_morphological", "decks": true} before this stage',
     "Slope": 'Add {"type": "filters.hag_morphological", "terrain_slope": true} before this stage',
     **dict.fromkeys(
         ("Intensity", "ReturnNumber", "NumberOfReturns"),

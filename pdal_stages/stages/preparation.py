@@ -57,9 +57,8 @@ PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
     "filters.hag_delaunay": (_COUNT, _EXTRAPOLATION),
 }
 #: Options that say where in a pipeline a stage stands, how it is run, or in what units the points at hand are; not what
-#: it makes; and decks, which whoever applies a model looks for or not.
+#: it makes.
 _ASIDE = (
-    "decks",
     "tag",
     "inputs",
     "user_data",

@@ -1,1 +1,1 @@
-"""Detect wires and their towers and poles by shape, each in a module with its thresholds."""
+"""Detect bridge decks, wires, towers and poles by shape, each in a module with its thresholds."""

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cells import HIGHEST, HOLE, SIDE, CellWindow, cell_numbers, keys_of, lowest_of_cells, runs
-from .decks import CELL, decks_of_levels, level_points, levels_near_decks
 from .groundcells import (
     NEAR,
     CellMeans,
@@ -38,14 +37,12 @@ class GroundCells(NamedTuple):
     """Cells of a :class:`.planes.GroundRaster`, one by one: all with a height, an opening, or ground points."""
 
     cells: NDArray[np.void]  #: (n,) records, see `_record`
-    #: (number of levels near bridge decks, 5): see :func:`.decks.levels_near_decks`
-    decks: NDArray[np.float64]
 
     def in_parts(self, side: int) -> dict[str, NDArray]:
         """All by name, for files: those of squares of so many columns and rows by themselves."""
         column, row = (self.cells[name].astype(np.int64) // side for name in ("column", "row"))
         parts = runs(keys_of(column, row))
-        return {"decks": self.decks} | {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
+        return {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
 
     @staticmethod
     def names_within(side: int, west: int, south: int, east: int, north: int) -> set[str]:
@@ -53,16 +50,13 @@ class GroundCells(NamedTuple):
         columns, rows = (
             range(low // side, high // side + 1) for low, high in ((west, east), (south, north))
         )
-        return {"decks", *(f"{i}_{j}" for i in columns for j in rows)}
+        return {f"{i}_{j}" for i in columns for j in rows}
 
     @staticmethod
     def of_blocks(blocks: Iterable[Mapping[str, NDArray]], openings: int) -> GroundCells:
         """The cells that arrays of :meth:`in_parts` hold, of filters with so many openings."""
-        cells, decks = [np.empty(0, _record(openings))], [np.empty((0, 5))]
-        for block in blocks:
-            decks.append(block["decks"])
-            cells += [part for name, part in block.items() if name != "decks"]
-        return GroundCells(np.concatenate(cells), np.concatenate(decks))
+        parts = (part for block in blocks for part in block.values())
+        return GroundCells(np.concatenate([np.empty(0, _record(openings)), *parts]))
 
     def on(self, window: CellWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
         """The cells of a window on its raster, and what their ground points say."""
@@ -125,13 +119,9 @@ def around_blocks(
     options: FilterOptions,
 ) -> NDArray[np.float64]:
     """What of points must be known around blocks (n, 4), meters: the lowest of each cell and how high the highest one there
-    is; for decks, the points of levels as well."""
+    is."""
     low, top = lowest_of_cells(x, y, z, use, options.cell)
-    chosen, highest = np.zeros(len(x), bool), z.copy()
-    chosen[low], highest[low] = True, top
-    if options.decks:
-        chosen[level_points(x, y, z, use)] = True
-    return np.column_stack([axis[chosen] for axis in (x, y, z, highest)])
+    return np.column_stack([*(axis[low] for axis in (x, y, z)), top])
 
 
 def cells_of_block(
@@ -151,13 +141,9 @@ def cells_of_block(
     # Openings reach into cells without points.
     spill = max([*openings, 0]) + 2
     margin = max(spill, _beside(options))
-    levels = np.empty((0, 5))
-    if options.decks:
-        levels = levels_near_decks(cell_numbers(x, CELL), cell_numbers(y, CELL), z)
 
     def given(x, y, z, top) -> GroundPoints:
-        use = np.ones(len(x), bool)
-        return GroundPoints.of(x, y, z, top, use, decks_of_levels(x, y, z, use, levels), cell)
+        return GroundPoints.of(x, y, z, top, np.ones(len(x), bool), cell)
 
     low = given(x, y, z, top)
     if not own.grown(margin).holds(low.column, low.row).any():
@@ -176,7 +162,7 @@ def cells_of_block(
         some = given(x, y, z, z)
         height, gradient = np.empty((2, len(xyz)))
         heights_above(*some[:3], cell, left, bottom, planes, height, gradient)
-        is_ground = options.is_ground(some.use, some.deck, height, gradient)
+        is_ground = options.is_ground(some.use, height, gradient)
         add_ground(*some[:3], is_ground, some.column, some.row, cell, left, bottom, count, means)
     held = means_of(count, means)
     opened = np.empty((*raster.shape, len(openings)), np.float32)
@@ -193,6 +179,4 @@ def cells_of_block(
     ):  # fmt: skip
         cells[name] = values[there]
     cells["column"], cells["row"] = i + left, j + bottom
-    # A level is of the block that holds the middle of its cell.
-    middle = np.floor((levels[:, :2] + 0.5) * (CELL / cell)).astype(np.int64)
-    return GroundCells(cells, levels[own.holds(*middle.T)])
+    return GroundCells(cells)

@@ -19,8 +19,6 @@ from ..base.errors import OptionError
 from ..base.jit import njit
 from .belowground import pits, pits_reach
 from .cells import HOLE, CellWindow, cell_numbers, lowest_points
-from .decks import BESIDE, CELL
-from .decks import REACH as DECKS_REACH
 from .hillside import roofs_of_hillsides
 from .openings import (
     JUMP,
@@ -53,7 +51,6 @@ class FilterOptions:
     threshold: float = 0.5
     scalar: float = 1.25
     openings: Sequence[float] = ()
-    decks: bool = False
 
     def __post_init__(self) -> None:
         for name, value in (
@@ -93,12 +90,11 @@ class FilterOptions:
     def is_ground(
         self,
         use: NDArray[np.bool_],
-        deck: NDArray[np.uint8],
         height: NDArray[np.float64],
         gradient: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
         """Which of the points to `use` are ground, by their heights above the surface and its slope there; NaN is not."""
-        return use & (deck == 0) & (np.abs(height) <= self.threshold + self.scalar * gradient)
+        return use & (np.abs(height) <= self.threshold + self.scalar * gradient)
 
     @property
     def reach(self) -> int:
@@ -109,8 +105,7 @@ class FilterOptions:
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
         looked = 2 * max(self.largest_radius, 2 * wide_radius(self.radius, self.cell))
-        found = pits_reach(self.cell) + looked + plateau_reach(self.cell) + surfaces + 2
-        return max(found, self.reach_of_decks) if self.decks else found
+        return pits_reach(self.cell) + looked + plateau_reach(self.cell) + surfaces + 2
 
     @property
     def reach_of_points(self) -> int:
@@ -124,11 +119,6 @@ class FilterOptions:
     def reach_of_cells(self) -> int:
         """How far away from points, in cells, cells of the ground matter that was found before."""
         return planes_reach(self.levels(FAR)) + 4
-
-    @property
-    def reach_of_decks(self) -> int:
-        """How far away, in cells, points can change what is a bridge deck, which is found apart."""
-        return math.ceil((DECKS_REACH + (2 * BESIDE + 1) * CELL) / self.cell)
 
     @property
     def link(self) -> int:
@@ -149,15 +139,14 @@ class GroundPoints(NamedTuple):
     y: NDArray[np.float64]
     z: NDArray[np.float64]
     top: NDArray[np.float64]  #: as high as others of the same cell are, where these are not given
-    use: NDArray[np.bool_]  #: whether they may be ground, where they are not of a deck
-    deck: NDArray[np.uint8]
+    use: NDArray[np.bool_]  #: whether they may be ground
     column: NDArray[np.int64]
     row: NDArray[np.int64]
 
     @classmethod
-    def of(cls, x, y, z, top, use, deck, cell: float) -> GroundPoints:
+    def of(cls, x, y, z, top, use, cell: float) -> GroundPoints:
         """Of a grid of such cells."""
-        return cls(x, y, z, top, use, deck, cell_numbers(x, cell), cell_numbers(y, cell))
+        return cls(x, y, z, top, use, cell_numbers(x, cell), cell_numbers(y, cell))
 
     def some(self, which: NDArray | slice) -> GroundPoints:
         """Part of them."""
@@ -172,7 +161,7 @@ def ground_raster(
     On every side are `margin` empty cells, one at least: points blend the four cells round them. Where only some
     cells are `wanted`, the raster holds these and as many around as steps still look at, when that is known.
     """
-    x, y, z, top, use, deck, column, row = points
+    x, y, z, top, use, column, row = points
     window = CellWindow.round(column, row).grown(margin)
     shape = window.height, window.width
     cells, mine = window.height * window.width, np.flatnonzero(use)
@@ -203,7 +192,6 @@ def ground_raster(
     for axis, (at, cells_of) in enumerate(((x, column), (y, row))):
         place[held, axis] = at[low] / cell - cells_of[low] - 0.5
     place[held, 2] = z[low]
-    on_deck = (deck != 0)[lowest] & held
     del lowest, bad
     ground = np.isfinite(raster) & ~objects
     told = GroundRaster(kept, raster, place, ground, floor, opened)
@@ -221,9 +209,6 @@ def ground_raster(
     remove_plateaus(ground, floor, raster, steep, cell)
     roofs = ground & (below != HOLE)
     ground[roofs], floor[roofs] = False, below[roofs]
-    # The terrain runs below: no level of a deck stands for it either.
-    ground &= ~on_deck
-    raster[on_deck] = HOLE
     return told, pit_points
 
 

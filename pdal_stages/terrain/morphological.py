@@ -10,7 +10,7 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
 * what is higher than all around it on every side is no ground (:mod:`.openings`), nor are roofs that a slope runs into
-  (:mod:`.hillside`) and bridges (:mod:`.decks`);
+  (:mod:`.hillside`);
 * low outliers are told from ground under a canopy (:mod:`.belowground`).
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
@@ -27,7 +27,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.resources import map_blocks
 from .cells import HIGHEST, CellWindow, columns, patches, usable
-from .decks import decks_of_levels, find_decks
 from .groundblocks import GroundCells
 from .groundcells import (
     FAR,
@@ -59,7 +58,6 @@ def filtered_ground(
     scalar: float = 1.25,
     openings: Sequence[float] = (),
     slope_too: bool = False,
-    decks: bool = False,
     threads: int | None = None,
     figures: dict[str, Any] | None = None,
     cells: GroundCells | None = None,
@@ -84,8 +82,6 @@ def filtered_ground(
         Windows, in meters, of openings of the minimum grid above which heights are wanted too.
     slope_too : bool
         Whether the slope of the terrain is wanted.
-    decks : bool
-        Whether bridge decks are looked for, which then are not ground.
     threads : int, optional
         None or 0: every available core.
     figures : dict, optional
@@ -99,8 +95,7 @@ def filtered_ground(
     -------
     dict of str to ndarray, shape (n,)
         ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 where the filter calls a point ground), ``Slope``
-        (float64, degrees), ``HeightAboveOpening_<window>`` (float32) and ``Deck`` (uint8: see :func:`.decks.find_decks`) on
-        request. NaN where a coordinate is not finite.
+        (float64, degrees), ``HeightAboveOpening_<window>`` (float32) on request. NaN where a coordinate is not finite.
 
     Raises
     ------
@@ -109,7 +104,7 @@ def filtered_ground(
     StageError
         If shapes differ or coordinates are too large.
     """
-    options = FilterOptions(cell, slope, window, threshold, scalar, openings, decks)
+    options = FilterOptions(cell, slope, window, threshold, scalar, openings)
     x, y, z = columns(x, y, z)
     finite, use = usable(x, y, z), usable(x, y, z, mask=mask)
     all_finite = bool(finite.all())
@@ -123,15 +118,8 @@ def filtered_ground(
         **({"Slope": np.zeros(len(x))} if slope_too else {}),
         **{name: np.zeros(len(x), np.float32) for name in opening_names(openings)},
     }
-    deck = np.zeros(len(x), np.uint8)
-    if decks:
-        deck = (
-            find_decks(x, y, z, use)
-            if cells is None
-            else decks_of_levels(x, y, z, use, cells.decks)
-        )
     if len(x):
-        points = GroundPoints.of(x, y, z, z, use, deck, cell)
+        points = GroundPoints.of(x, y, z, z, use, cell)
         pieces = (
             _found(points, options, counts) if cells is None else _given(points, options, cells)
         )
@@ -144,11 +132,9 @@ def filtered_ground(
     if figures is not None:
         figures["ground_points"] = int(np.count_nonzero(out["Ground"]))
         figures.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
-    if decks:
-        out["Deck"] = deck
     if not all_finite:
         for name, values in out.items():
-            whole = np.full(len(finite), 0 if name in ("Ground", "Deck") else np.nan, values.dtype)
+            whole = np.full(len(finite), 0 if name == "Ground" else np.nan, values.dtype)
             whole[finite] = values
             out[name] = whole
     return out
@@ -184,7 +170,7 @@ def _measured(
     counts: dict[str, int],
 ) -> dict[str, NDArray]:
     """Heights of points above the ground of a raster, and what they say of that themselves, where no `means` say it."""
-    x, y, z, _, use, deck, column, row = points
+    x, y, z, _, use, column, row = points
     cell, (left, bottom, _, _) = options.cell, raster.window
     needed = around(raster.window, column, row)
     planes = surface(raster, options.levels(NEAR), needed)
@@ -198,7 +184,7 @@ def _measured(
         )
 
     list(map_blocks(above, spans, threads))
-    is_ground = options.is_ground(use, deck, height, gradient)
+    is_ground = options.is_ground(use, height, gradient)
     if means is None:
         count = np.zeros(raster.shape, np.int64)
         raster.place[:] = 0.0
