@@ -180,7 +180,10 @@ def test_counts_scores_and_importances(trained):
     for word in (
         "Ground",
         "Building",
-        "c1 s2 kopt(5,20)",
+        "c1, vertical cylinder of 1 m radius",
+        "s2, sphere of 2 m radius",
+        "kopt(5,20), the best of 5 to 20 nearest points",
+        "A3 (10 bins)",
         "HeightAboveGround",
         "a.laz",
         "held out",
