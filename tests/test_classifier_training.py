@@ -183,7 +183,7 @@ def test_counts_scores_and_importances(trained):
         "c1, vertical cylinder of 1 m radius",
         "s2, sphere of 2 m radius",
         "kopt(5,20), the best of 5 to 20 nearest points",
-        "A3 (10 bins)",
+        "D2 (10 bins)",
         "HeightAboveGround",
         "a.laz",
         "held out",
