@@ -295,6 +295,7 @@ def test_manifests_that_are_no_manifest(good):
         (b"[1, 2]", "something else"),
         (b'{"a": NaN}', "NaN"),
         (b'{"a": 1e999}', "too large"),
+        (b'{"a": 1%s}' % (b"0" * 400), "too large"),
         (b'{"a": 1, "a": 2}', "duplicate key"),
         (b"[" * 200_000 + b"]" * 200_000, "deep"),
         (
@@ -337,6 +338,7 @@ def npy(descr="'<f4'", shape="(4,)", fortran="False", data=b"\0" * 16, magic=b"\
         npy(shape="(-4,)"),
         npy(shape="(2, 2)"),
         npy(shape="()"),
+        npy(shape="(True,)", data=b"\0" * 4),
         npy(shape="(__import__('os').system('true'),)"),
     ],
 )

@@ -1,18 +1,21 @@
 """A few labels on top of a trained model: nothing is forgotten, and a file holds all of it."""
 
 import json
+import shutil
+import zipfile
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from test_classifier_modelfile import changed
 from test_classifier_passes import FEW
 from test_classifier_training import scene
 
 import pdal_stages as ps
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.base.errors import ModelError, OptionError
+from pdal_stages.base.errors import ModelError, OptionError, StageError
 from pdal_stages.classifier import foresttraining, modelfile
 from pdal_stages.classifier.algorithms import PredictRequest
 from pdal_stages.classifier.clouds import label_classes
@@ -127,6 +130,45 @@ def test_a_file_holds_the_base(base, tmp_path, more):
     again.save(tmp_path / "n.model")
     assert (tmp_path / "n.model").read_bytes() == (tmp_path / "m.model").read_bytes()
     assert "refined forest" in str(again)
+
+
+def leaves(value, at=()):
+    """Yield the path of everything in a manifest; of a list, its first entry."""
+    yield at
+    inside = enumerate(value[:1]) if isinstance(value, list) else ()
+    for key, one in value.items() if isinstance(value, dict) else inside:
+        if key != "arrays":
+            yield from leaves(one, (*at, key))
+
+
+def test_odd_numbers_anywhere_in_a_manifest(base, tmp_path):
+    """A file with any value replaced is refused with a message, or gives probabilities that sum to 1."""
+    on_top(base, passes=2, prior_weight=0.3).save(tmp_path / "m.model")
+    xyz, _, dimensions = scene(seed=7, n=60)
+    with zipfile.ZipFile(tmp_path / "m.model") as archive:
+        head = json.loads(archive.read("manifest.json"))
+    refused = 0
+    passes = [("passes", 3, *at) for at in leaves(head["passes"][3])]
+    for at in [*list(leaves(head))[1:], *passes]:
+        for odd in (10**400, 10**300, 5e-324, -1, True, 1.0, 2.5, [], {}, None):
+
+            def edit(inner, _, at=at, odd=odd):
+                for key in at[:-1]:
+                    inner = inner[key]
+                inner[at[-1]] = odd
+
+            shutil.copy(tmp_path / "m.model", tmp_path / "odd.model")
+            changed(tmp_path / "odd.model", edit)
+            try:
+                model = load_model(tmp_path / "odd.model")
+                str(model)
+                if at[0] in ("passes", "priors"):
+                    found = model.predict(xyz, dimensions, probabilities=True).probabilities
+                    assert np.allclose(found.sum(axis=1), 1.0, atol=1e-6), (at, odd)
+            except StageError as error:
+                refused += 1
+                assert "odd.model" in str(error), (at, odd)
+    assert refused > 500
 
 
 def test_any_order_and_any_part(base):

@@ -120,7 +120,7 @@ def _shown(value: Any) -> str:
 
 
 def strict_json(text: str | bytes) -> Any:
-    """The value of a JSON text: no NaN, no infinities (also written as 1e999), no duplicate keys.
+    """The value of a JSON text: no NaN, no number beyond a double (1e999), no duplicate keys.
 
     Raises
     ------
@@ -130,7 +130,11 @@ def strict_json(text: str | bytes) -> Any:
         If it is nested too deeply.
     """
     return json.loads(
-        text, parse_constant=refuse_constant, parse_float=_finite, object_pairs_hook=_unique
+        text,
+        parse_constant=refuse_constant,
+        parse_float=_finite,
+        parse_int=lambda word: _finite(word, int),
+        object_pairs_hook=_unique,
     )
 
 
@@ -139,11 +143,10 @@ def refuse_constant(word: str) -> None:
     raise ValueError(f"{word} is not a JSON number")
 
 
-def _finite(word: str) -> float:
-    value = float(word)
-    if not math.isfinite(value):
-        raise ValueError(f"{word} is too large for a number")
-    return value
+def _finite(word: str, kind: type = float) -> Any:
+    if not math.isfinite(float(word)):
+        raise ValueError(f"{word[:40]} is too large for a number")
+    return kind(word)
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-import stat
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -101,7 +101,7 @@ def named_copc(path: str | os.PathLike) -> bool:
 
 def refuse_pipe(path: str | os.PathLike) -> None:
     """Refuse a pipe as an input: it may block, and can be read only once."""
-    if stat.S_ISFIFO(os.stat(path).st_mode):
+    if Path(path).is_fifo():
         raise StageError("the input is a pipe", where=str(path), cure="Save it to a file first")
 
 

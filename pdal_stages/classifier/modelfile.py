@@ -237,6 +237,8 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
         if np.lib.format.read_magic(stream) != (1, 0):
             raise ValueError("another version than 1.0")
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        if any(type(n) is not int for n in shape):  # True is one to NumPy
+            raise ValueError(f"shape {shape}")
         if fortran or dtype.str not in rule.dtypes or len(shape) != rule.ndim:
             raise ValueError(
                 f"{dtype.str} {shape}, not {' or '.join(rule.dtypes)} with {rule.ndim} axes in C order"

@@ -35,7 +35,7 @@ _NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (0 fine, 1 an error, 2 wrong usage, 130 interrupted)."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = _protected(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
     arguments = [word for word in arguments if word != "--debug"]
     ended = watched(arguments) if argv is None else lambda: None
@@ -88,6 +88,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if shown is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = shown
     return code
+
+
+def _protected(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments without ``--``, after which a name with a leading dash becomes ``./-name``."""
+    before = list(itertools.takewhile(lambda word: word != "--", arguments))
+    after = arguments[len(before) + 1 :]
+    return before + [f"./{word}" if word.startswith("-") else word for word in after]
 
 
 def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:

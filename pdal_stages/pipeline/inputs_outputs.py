@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
-from ..base.las import named_copc, named_las
+from ..base.las import named_copc, named_las, refuse_pipe
 from ..base.octree import check_copc, check_ept
 from ..classifier.modelfile import find
 from ..stages.base import Stage
@@ -76,6 +76,7 @@ def locations(path: str, column: str = "location") -> list[str]:
     """The files a tile index names, made by ``pdal tindex create``; relative ones from its folder, then from here."""
     from ..objects.outlines import reading
 
+    refuse_pipe(path)
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")
     cure = f"It needs a column '{column}' with file names (option tindex_name)"
     with reading(path, "the tile index cannot be read", cure) as plain, warnings.catch_warnings():

@@ -90,6 +90,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
             if not paths:
                 raise PipelineError("no file matches the reader's pattern", where=kind, found=name)
         for path in map(os.path.abspath, paths):
+            las.refuse_pipe(path)
             found.setdefault(path, InputSource(path, {**options, "type": "readers.las"}, "las"))
     return list(found.values())
 

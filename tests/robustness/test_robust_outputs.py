@@ -57,6 +57,53 @@ def test_pipe(command, tmp_path, cloud):
     assert len(laspy.read(tmp_path / "got.las")) == 600
 
 
+DASHED = [
+    ["model", "--", "-m.model"],
+    ["validate", "--", "-p.json"],
+    ["expand", "--", "-p.json"],
+    ["pipeline", "--filters.hag_minima.cell=30", "--", "-p.json"],
+    ["classify", "--model", "m.model", "--", "-a.las", "-o.las"],
+    ["classify", "--model", "m.model", "--workers", "0", "b.las", "--", "-a.las", "--folder/"],
+    ["accuracy", "--reference", "b.las", "--", "-a.las"],
+    ["train", "--model", "n.model", *SMALL, "--", "-a.las"],
+    ["objects", "--", "-a.las", "-t.gpkg"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", DASHED, ids=" ".join)
+def test_names_with_a_leading_dash(command, files, words):
+    """After ``--`` a word is a name, of an input or an output, whatever it begins with."""
+    shutil.copy("a.las", "-a.las")
+    shutil.copy("m.model", "-m.model")
+    job(files, "./-a.las", HAG, name="-p.json")
+    command.runs(words)
+    made = {"-o.las": "-o.las", "-t.gpkg": "-t.gpkg", "--folder/": "--folder/b.las"}
+    assert words[-1] not in made or (files / made[words[-1]]).is_file()
+
+
+@pytest.mark.parametrize("door", ["files", "folder", "pattern", "index", "pipeline"])
+def test_a_pipe_among_several_inputs(command, files, door):
+    """It is refused; a pipe without a writer would be waited for without end."""
+    (files / "in").mkdir()
+    shutil.copy("a.las", "in/a.las")
+    os.mkfifo("in/pipe.las")
+    os.mkfifo("pipe.geojson")
+    named = {
+        "files": ["a.las", "pipe.las"],
+        "folder": ["in"],
+        "pattern": ["in/*.las"],
+        "index": ["pipe.geojson"],
+    }
+    classify = ["classify", *named.get(door, []), "o/", "--model", "m.model", "--workers", "0"]
+    many = [
+        "pipeline",
+        job(files, {"type": "readers.las", "filename": "in/*.las"}, HAG, "o_#.las"),
+        "--tile",
+        "50",
+    ]
+    command.refused(many if door == "pipeline" else classify, "the input is a pipe")
+
+
 # ---- what must not be replaced ---------------------------------------------------------------------------------
 
 
