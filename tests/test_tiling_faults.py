@@ -230,6 +230,24 @@ def test_resume_does_only_what_changed(tmp_path, expected, folder):
     assert again()["done"] == 8
 
 
+def test_an_edit_in_the_middle_of_an_input_is_noticed(tmp_path, write_las):
+    """Size, time and both ends stay the same; the height of one point does not."""
+    xyz = np.random.default_rng(0).uniform(0, 1, (8_000, 3)) * (40, 40, 5)
+    path = write_las(tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), point_format=6)
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o.las"), "forward": "all"}
+    stages = [str(path), {"type": "filters.hag_minima", "cell": 2}, writer]
+    run_tiled(stages, 20, workers=0)
+    status, las = path.stat(), laspy.read(path)
+    las.Z[4_000] += 10
+    data = bytearray(path.read_bytes())
+    data[las.header.offset_to_point_data : len(data)] = las.points.array.tobytes()
+    path.write_bytes(data)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert path.stat().st_size == status.st_size
+    assert run_tiled(stages, 20, workers=0, resume=True).summary["states"]["done"] >= 1
+    assert laspy.read(tmp_path / "o.las").Z[4_000] == las.Z[4_000]
+
+
 # ---- people ----------------------------------------------------------------------------------------------
 
 
@@ -448,6 +466,44 @@ def test_damaged_results_are_made_anew(tmp_path, folder, expected, monkeypatch):
     )  # found when it is read, not before
     assert not run_tiled(stages, 20, workers=0, resume=True).failures
     check_same(tmp_path, expected)
+
+
+@pytest.mark.parametrize("damage", ["cut", "zeroed", "one byte", "one byte of the halo"])
+def test_damaged_copies_of_inputs_are_made_anew(tmp_path, folder, expected, damage):
+    """What a power failure leaves of the sorted copies does not reach an output at --resume."""
+    stages = pipeline(folder, tmp_path / "o_#.laz")
+    # Tiles are begun from the south-west; the sixth one ends the run.
+    calls = str(tmp_path / "calls")
+    dies = f"""with open({calls!r}, 'a') as file: file.write('x')
+if os.path.getsize({calls!r}) == 6: os.kill(os.getpid(), signal.SIGKILL)"""
+    stages.insert(2, python_filter(dies))
+    run = command(tmp_path / "job.json", stages, "--workers", "0")
+    run.communicate(timeout=300)
+    assert run.returncode == -signal.SIGKILL
+    kept = tmp_path / ".pdal-stages" / "kept"
+    places = {}
+    for copy in kept.glob("*.points"):
+        note = json.loads(copy.with_suffix(".json").read_text())
+        places[note["box"][0] >= 40] = copy, note
+    assert len(places) == 2
+    copy, note = places[False]  # of the western file; its tiles 20_20 and east of it are waiting
+    size, record = copy.stat().st_size, copy.stat().st_size // note["count"]
+    if damage == "cut":
+        os.truncate(copy, size // 2)
+    elif damage == "zeroed":
+        copy.write_bytes(bytes(size))
+    else:  # the height of a point: beyond the tiles that failed, or in them
+        far = damage == "one byte of the halo"
+        first = next(c[2] for c in note["cells"] if c[:2] == ([3, 4] if far else [4, 4]))
+        with open(copy, "r+b") as file:
+            file.seek(first * record + 8 + 8)
+            byte = file.read(1)[0]
+            file.seek(first * record + 8 + 8)
+            file.write(bytes([byte ^ 0x40]))
+    assert not run_tiled(stages, 20, workers=0, resume=True, buffer=0.0).failures
+    (tmp_path / "o_west.laz").rename(tmp_path / "west")
+    (tmp_path / "o_east.laz").rename(tmp_path / "east")
+    assert {name: (tmp_path / name).read_bytes() for name in expected} == expected
 
 
 def test_links_in_place_of_the_runs_own_folders(tmp_path, folder):

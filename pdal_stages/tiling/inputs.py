@@ -160,13 +160,27 @@ class CloudIndex:
         np.int64
     ]  #: (n, 4): column, row, index of the first point in the copy, number of points
     copy: str  #: the file with the points
+    checksum: int  #: CRC-32 of the copy
+    digest: str  #: SHA-256 of the input
+    changed_ns: int  #: time of the input's last change of content or status, which no program sets
 
     @classmethod
     def of(cls, record: dict[str, Any], copy: str) -> CloudIndex:
         """From what :func:`sort_points` found."""
         cells = np.array(record["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in record["tiles"]]
-        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, copy)
+        sums = int(record["checksum"]), str(record["digest"]), int(record["changed_ns"])
+        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, copy, *sums)
+
+    def is_of(self, path: str) -> bool:
+        """Return whether the input still holds the bytes that were read.
+
+        It is read again only where its status changed, as it does when a file is copied, linked or edited.
+        """
+        try:
+            return os.stat(path).st_ctime_ns == self.changed_ns or digest_of(path) == self.digest
+        except OSError:
+            return False
 
 
 #: An input with the index of its points; EPT sources have none.
@@ -288,8 +302,12 @@ class Survey:
         return [[path, self.stamps.get(path)] for path in named_files(stages)]
 
     def seen(self, sources: list[InputSource]) -> list[Any]:
-        """Names, fingerprints and readers of inputs."""
-        return [[source.path, self.stamps[source.path], source.reader] for source in sources]
+        """Return names, fingerprints, digests and readers of inputs."""
+        indexes = [self.indexes.get(source.path) for source in sources]
+        return [
+            [source.path, self.stamps[source.path], index and index.digest, source.reader]
+            for source, index in zip(sources, indexes, strict=True)
+        ]
 
     def changed(self) -> list[str]:
         """Inputs and other files that changed since the run began."""
@@ -329,6 +347,15 @@ class Survey:
             "inputs": len(self.sources),
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
         }
+
+
+def digest_of(path: str | os.PathLike) -> str:
+    """Return the SHA-256 digest of a file, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while data := file.read(1 << 24):
+            digest.update(data)
+    return digest.hexdigest()
 
 
 def stamp(path: str | os.PathLike) -> list[Any]:

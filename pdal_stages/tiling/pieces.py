@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 import os
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +23,7 @@ from ..base.files import whole_files
 from ..pipeline.parts import header_of, las_chunks
 from ..terrain.cells import refuse_scattered
 from .grid import Box, TileGrid, check_number
-from .inputs import CloudIndex, IndexedSource, InputSource, fetch_ept
+from .inputs import CloudIndex, IndexedSource, InputSource, digest_of, fetch_ept
 
 if (
     TYPE_CHECKING
@@ -69,7 +70,8 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     found = [np.empty((0, 4), np.int64)]
-    total = 0
+    total = checksum = 0
+    changed_ns, digest = os.stat(path).st_ctime_ns, digest_of(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
         for points in las_chunks(path, most=_PART):
             records = points.array
@@ -83,16 +85,35 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
             rows = np.empty(len(records), dtype)
             rows["number"] = total + order
             rows["record"] = records[order]
-            out.write(rows.tobytes())
+            data = rows.tobytes()
+            out.write(data)
+            checksum = zlib.crc32(data, checksum)
             counts = np.diff([*starts, len(order)])
             found.append(np.column_stack([column[starts], line[starts], total + starts, counts]))
             total += len(records)
+        out.flush()
+        os.fsync(out.fileno())  # before the record that calls the copy complete
         held = np.concatenate(found)
         tiles = _squares(held, _CELLS)  # which cells divide exactly: powers of two do in floats
         check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
     refuse_scattered(_squares(held, math.ceil(_PLACE / cells.size))[:, 2].tolist())
     box = [*low.tolist(), *high.tolist()]
-    return {"count": total, "box": box, "tiles": tiles.tolist(), "cells": held.tolist()}
+    return {
+        **{"count": total, "box": box, "tiles": tiles.tolist(), "cells": held.tolist()},
+        **{"changed_ns": changed_ns, "digest": digest, "checksum": checksum},
+    }
+
+
+def is_intact(index: CloudIndex) -> bool:
+    """Return whether the sorted copy of a file holds the bytes that were written."""
+    checksum = 0
+    try:
+        with open(index.copy, "rb") as file:
+            while data := file.read(1 << 24):
+                checksum = zlib.crc32(data, checksum)
+    except OSError:
+        return False
+    return checksum == index.checksum
 
 
 def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -26,7 +25,7 @@ from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .ground import block_name, blocks_around, left_name, make_block
 from .inputs import CloudIndex, IndexedSource, Survey
 from .outputs import write_file
-from .pieces import TEMPORARY, sort_points
+from .pieces import TEMPORARY, is_intact, sort_points
 from .plan import RunContext, TilePlan, make_plan, outputs_for
 from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .settings import TilingOptions, worker_bytes
@@ -231,7 +230,8 @@ class _Run:
     def read_inputs(self, needed: Collection[str] | None = None) -> None:
         """Read LAS and LAZ files once, sort their points by location, and save their index.
 
-        Files that an earlier run read are only read again where their points are `needed` (paths) and no longer there.
+        Files that an earlier run read are read again where they changed, or where their points are `needed` (paths) and
+        the copy of these is gone or damaged.
         """
         survey, store = self.survey, self.store
         waiting: deque[Job] = deque()
@@ -243,7 +243,9 @@ class _Run:
             # Without a valid record it is read again.
             with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
                 index = CloudIndex.of(store.note(name), copy)
-                if os.path.exists(copy) or source.path not in (needed or ()):
+                wanted = source.path in (needed or ())
+                known = source.path in survey.indexes or index.is_of(source.path)
+                if known and (not wanted or is_intact(index)):
                     survey.indexes[source.path] = index
                     continue
             waiting.append(Job(name, survey.extents[source.path].count, source=source, mark=copy))
