@@ -11,16 +11,14 @@ Ground points should be at height 0. With hag_nn a point that SMRF calls ground 
 
     python benchmarks/terrain.py --data FOLDER [--json FILE] [--only isprs]
     python benchmarks/terrain.py --corners
-    python benchmarks/terrain.py --hillside
 
 With --corners: clips of 30, 50 and 100 m of generated woods on slopes, turned at random: ground missed, and where
-the surface is more than 1 m too high. With --hillside: how much of the roofs of houses dug into a slope is called ground.
+the surface is more than 1 m too high.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import platform
@@ -28,7 +26,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import laspy
 import numpy as np
@@ -237,41 +234,6 @@ def corners() -> None:
             print(f"| {slope:g} | {density:g} | {shown} |", flush=True)
 
 
-def dug_in(slope: float, eave: float, gabled: bool, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """A meadow of 150 m on a slope, 4 points/m², with nine houses 14 m wide and `depth` m deep whose uphill eave is `eave` m
-    above the ground: coordinates, and which are roofs."""
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(0, 150, (2, 90_000))
-
-    def ground(x: Any, y: Any) -> Any:
-        return slope * y + 2 * np.sin(x / 25) + 1.5 * np.sin(y / 31)
-
-    z, roof = ground(x, y), np.zeros(len(x), bool)
-    for west, south in itertools.product((35.0, 75.0, 115.0), repeat=2):
-        inside = (np.abs(x - west) <= 7) & (np.abs(y - south) <= depth / 2)
-        rise = 0.5 * (depth / 2 - np.abs(y - south)) if gabled else 0.0
-        z = np.where(inside, ground(west, south + depth / 2) + eave + rise, z)
-        roof |= inside
-    return np.column_stack([x, y, z + rng.normal(0, 0.03, len(x))]), roof
-
-
-def hillside() -> None:
-    """Print how much of roofs is called ground, by how far the eave uphill is above it."""
-    eaves = (0.0, 0.5, 1.0, 1.5)
-    print(
-        f"| roof | slope | {' | '.join(f'{eave:g} m' for eave in eaves)} |\n|---|---:|{'---:|' * len(eaves)}"
-    )
-    for gabled, depth, slope in itertools.product((False, True), (8.0, 15.0), (0.2, 0.4, 0.6)):
-        shares = []
-        for eave in eaves:
-            xyz, roof = dug_in(slope, eave, gabled, depth)
-            shares.append(f"{100 * (ps.filtered_ground(xyz)['Ground'][roof] > 0).mean():.0f}")
-        print(
-            f"| {'gabled' if gabled else 'flat'}, {depth:g} m deep | {slope:g} | {' | '.join(shares)} |",
-            flush=True,
-        )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -282,13 +244,9 @@ def main() -> None:
     parser.add_argument("--only", choices=("isprs", "tiles"), default="")
     parser.add_argument("--json", help="write the figures here")
     parser.add_argument("--corners", action="store_true", help="clips of woods on slopes instead")
-    parser.add_argument("--hillside", action="store_true", help="houses dug into a slope instead")
     options = parser.parse_args()
     if options.corners:
         corners()
-        return
-    if options.hillside:
-        hillside()
         return
     if not options.data:
         parser.error("name the folder of the clouds with --data or PDAL_STAGES_DATA")

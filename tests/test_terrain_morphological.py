@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from test_detached_noise import closed_wood
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import cells, filtered_ground, groundcells, openings
+from pdal_stages.terrain import cells, filtered_ground, groundcells
 from pdal_stages.terrain.cells import CellWindow
 from pdal_stages.terrain.groundcells import FilterOptions
-from pdal_stages.terrain.hillside import roofs_of_hillsides
-from pdal_stages.terrain.openings import LARGEST_DROP, objects_of, opening_radii, remove_plateaus
+from pdal_stages.terrain.openings import objects_of, opening_radii
 from pdal_stages.terrain.planes import GroundRaster, planes_of_blocks
 
 SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
@@ -60,14 +60,6 @@ def slow_opening(raster, radius):
     return ndimage.grey_dilation(centers, footprint=octagon(radius), mode="constant", cval=-np.inf)
 
 
-def slow_steepness(opened, measured, radius):
-    form = {"footprint": octagon(radius), "mode": "constant"}
-    highest = ndimage.grey_dilation(np.where(measured, opened, -np.inf), cval=-np.inf, **form)
-    lowest = ndimage.grey_erosion(np.where(measured, opened, np.inf), cval=np.inf, **form)
-    both = np.minimum(highest - opened, opened - lowest) / np.float32(radius)
-    return ndimage.grey_dilation(np.where(measured, both, 0), cval=0, **form)
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38), (60, 50)])
 @np.errstate(invalid="ignore")
 def test_openings_and_objects_equal_the_slow_reference(shape):
@@ -78,24 +70,17 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
     )
     raster[rng.random(shape) < 0.3] = np.inf
     window, measured = 21, np.isfinite(raster)
-    objects, floor, opened, steep = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
+    objects, floor, opened = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
     for radius in range(1, 25):
         assert np.array_equal(opened[radius], slow_opening(raster, radius)), radius
     want, want_floor, before = np.zeros(shape, bool), raster.copy(), raster
-    want_steep = slow_steepness(slow_opening(raster, 14), measured, 14)  # the first radius of 20 m
     for radius in opening_radii(window):
         after = slow_opening(raster, radius)
-        land = radius * want_steep
-        drop = before - after > np.maximum(
-            min(0.1 * radius * 1.5, LARGEST_DROP), 0.5 * (radius >= 14) * land
-        )
-        again = before - after > np.maximum(LARGEST_DROP, 3 * land)
-        new = measured & np.where(want, again, drop)
+        new = measured & ~want & (before - after > np.float32(0.1 * radius * 1.5))
         want_floor[new] = after[new]
         want |= new
         before = after
-    for one, other in ((objects, want), (steep, want_steep), (floor, want_floor)):
-        assert np.array_equal(one, other)
+    assert np.array_equal(objects, want) and np.array_equal(floor, want_floor)
 
 
 def slow_planes(cells, level, floor, at):
@@ -113,12 +98,7 @@ def slow_planes(cells, level, floor, at):
         known = np.array([row for row in known if row[3] > 0]).T
         if not known.size:
             return None
-        *middle, level = np.average(known[:3], axis=1, weights=known[3])
-        spread = np.cov(known[:3], aweights=known[3], ddof=0)
-        slope = np.linalg.solve(spread[:2, :2] + 0.02 * size**2 * np.eye(2), spread[:2, 2])
-        near = slope @ spread[:2, 2] >= 0.6 * spread[2, 2] and known[3].sum() >= 0.3 * 4 * size**2
-        slope = slope if near and np.hypot(*slope) >= 0.5 else np.zeros(2)
-        prior = np.array([level - slope @ middle, *slope])
+        prior = np.array([np.average(known[2], weights=known[3]), 0.0, 0.0])
     else:
         uv = center / (2 * size) - 0.5
         base = np.floor(uv).astype(int)
@@ -164,7 +144,7 @@ def test_planes_equal_the_slow_reference(slope):
     floor = (rng.normal(0, 5, (h, w)) + slope * np.arange(w)).astype(np.float32)
     raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
     raster[ground] = floor[ground]
-    planes = planes_of_blocks(GroundRaster(window, raster, place, ground, floor, {}), 3, 0.5)
+    planes = planes_of_blocks(GroundRaster(window, raster, place, ground, floor, {}), 3)
     places = [(j, i, (i + left, j + bottom)) for j in range(h) for i in range(w)]
     cells = {c: (place[j, i, :2], place[j, i, 2]) for j, i, c in places if ground[j, i]}
     known = {c: floor[j, i] for j, i, c in places if np.isfinite(raster[j, i])}
@@ -176,232 +156,52 @@ def test_planes_equal_the_slow_reference(slope):
         )
 
 
-def square(place, reach):
-    return [
-        (place[0] + b, place[1] + a)
-        for b in range(-reach, reach + 1)
-        for a in range(-reach, reach + 1)
-    ]
+# ---- land that was dug: real clouds, and what must stay ground ----------------------------------------------
+
+#: West-east and south-north half widths in meters, and depth; "canal" runs through the cloud.
+HOLES = {"basement": (12.5, 7.5, 3.5), "pit": (6.0, 6.0, 8.0), "canal": (np.inf, 4.0, 3.0)}
 
 
-def heights_of(raster):
-    return {
-        (j, i): float(raster[j, i]) for j, i in zip(*np.nonzero(np.isfinite(raster)), strict=True)
-    }
+def share_kept(path, hole, clip=np.inf):
+    """Return the share of the ground more than 2 m off a hole that is still ground when the hole is dug.
+
+    Up to 2 m off, cells hold points of both sides of the wall.
+    """
+    import laspy
+
+    las = laspy.read(path)
+    xyz, true = np.column_stack([las.x, las.y, las.z]), np.asarray(las.classification) == 2
+    away = np.abs(xyz[:, :2] - np.median(xyz[:, :2], axis=0))
+    near = (away < clip).all(axis=1)
+    xyz, true, away = xyz[near], true[near], away[near]
+    west, south, depth = HOLES[hole]
+    land = true & ((away[:, 0] > west + 2) | (away[:, 1] > south + 2))
+    land &= filtered_ground(xyz)["Ground"] == 1
+    xyz[(away[:, 0] < west) & (away[:, 1] < south), 2] -= depth
+    return (filtered_ground(xyz)["Ground"] == 1)[land].mean()
 
 
-def walked(cells, cell, reach):
-    """Sets of cells {place: height} among which one walks from one to the next."""
-    seen = set()
-    for start in cells:
-        if start in seen:
-            continue
-        members, todo = {start}, [start]
-        while todo:
-            here = todo.pop()
-            for other in square(here, int(reach)):
-                far = np.hypot(*np.subtract(other, here))
-                if other not in cells or other in members or far > reach:
-                    continue
-                if abs(cells[other] - cells[here]) <= max(0.75, 0.3 * cell * far):
-                    members.add(other)
-                    todo.append(other)
-        seen |= members
-        yield members
+@pytest.mark.parametrize("hole", HOLES)
+@pytest.mark.parametrize("name", ["city", "canals", "woods"])
+def test_land_around_a_hole_stays_ground(name, hole):
+    """A pit in a plot does not make its land a roof; real clouds with a hole dug in their middle."""
+    assert share_kept(Path(__file__).parent / "data" / f"{name}.laz", hole) > 0.99
 
 
-def turn_of(place, middle):
-    return int(np.floor(16 * (np.arctan2(*np.subtract(place, middle)) / (2 * np.pi) + 1))) % 16
-
-
-def slow_plateaus(ground, raster, steep, cell):
-    """Ground cells of plateaus, and the level around them, by walking."""
-    cells, taken = heights_of(raster), {}
-    for members in walked(cells, cell, 4):
-        at = np.array(sorted(members))
-        own = [c for c in members if ground[c]]
-        if len(own) <= 0.05 * len(members) or np.ptp(at, axis=0).max() >= int(200 / cell):
-            continue
-        middle, lower, level, directions, uphill, rim = at.mean(axis=0), [], 0, set(), 0, set()
-        for here in members:
-            for other in square(here, 8):
-                if other in cells and ground[other] and other not in members:
-                    drop, far = cells[here] - cells[other], np.hypot(*np.subtract(other, here))
-                    jump = max(1.5, 0.75 * cell * far)
-                    if ground[here]:
-                        uphill += 1.0 if drop < -jump else -0.5 if drop > jump else 0.0
-                    if drop > max(jump, 3 * steep[here] * far):
-                        lower.append(cells[other])
-                        directions.add(turn_of(other, middle))
-                        rim |= {here} if far < 3 else set()
-                    elif abs(drop) < 0.75:
-                        level += 1
-        if (
-            len(directions) >= 14
-            and len(lower) >= 0.8 * (len(lower) + level)
-            and uphill <= 0
-            and len(rim) <= 14 * len(members) ** 0.5
-        ):
-            taken |= dict.fromkeys(own, np.mean(lower))
-    return taken
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_plateaus_equal_the_slow_reference(seed):
-    rng = np.random.default_rng(seed)
-    h, w = 40, 44
-    cell = (1.0, 0.5, 6.0)[seed % 3]
-    j, i = np.mgrid[:h, :w]
-    level = 0.05 * i * cell
-    for _ in range(6):
-        y, x, size, high = (
-            rng.integers(0, h),
-            rng.integers(0, w),
-            rng.integers(3, 9),
-            rng.uniform(1, 30),
-        )
-        level = np.where((abs(j - y) < size) & (abs(i - x) < size), level.min() + high, level)
-    raster = (level + rng.normal(0, 0.1, (h, w))).astype(np.float32)
-    raster[rng.random((h, w)) < (0.2 + 0.1 * seed)] = np.inf
-    ground = np.isfinite(raster) & (rng.random((h, w)) < 0.7)
-    left, floor = ground.copy(), raster.copy()
-    steep = np.where(i < w / 2, 0.0, rng.uniform(0, 2, (h, w))).astype(np.float32)
-    remove_plateaus(left, floor, raster, steep, cell)
-    want = slow_plateaus(ground, raster, steep, cell)
-    assert {tuple(map(int, at)) for at in np.argwhere(ground & ~left)} == set(want)
-    assert [floor[at] for at in want] == pytest.approx(list(want.values()), abs=1e-4)
-    assert seed % 3 == 2 or want
-
-
-def slow_roofs(ground, raster, cell):
-    """What lies below ground cells of roofs that a slope runs into, by walking and looking around."""
-    cells, below = heights_of(raster), {}
-    reach, arm = max(1, int(2 / cell)), max(1.0, 4 / cell)
-
-    def bends(j, i, dj, di):
-        length, ends = np.hypot(dj, di), []
-        for t in (-1, 1):
-            steps = range(int(arm / length + 0.5), 0, -1)
-            ends.append(
-                [(s, cells[c]) for s in steps if (c := (j + t * s * dj, i + t * s * di)) in cells]
-            )
-        if not all(ends):
-            return False
-        (n, one), (m, other) = ends[0][0], ends[1][0]
-        most = 0.3 + 0.3 * abs(one - other) / ((n + m) * length * cell)
-        return (one * m + other * n) / (n + m) - cells[j, i] > most * 2 * n * m / ((n + m) * arm)
-
-    creases = {c for c in cells if any(bends(*c, *d) for d in ((0, 1), (1, 0), (1, 1), (1, -1)))}
-    for members in walked({c: cells[c] for c in cells if c not in creases}, cell, 1.5):
-        at = np.array(sorted(members))
-        footing = sum(map(ground.__getitem__, members)) > 0.05 * len(at)
-        if not footing or len(at) * cell**2 < 40 or np.ptp(at, axis=0).max() * cell >= 35:
-            continue
-        feet, high, others, creased, directions = [], 0, 0, 0, set()
-        for here in members:
-            beside = [
-                c for c in square(here, reach) if c in cells and ground[c] and c not in members
-            ]
-            far = {c: max(1, cell * np.hypot(*np.subtract(c, here))) for c in beside}
-            walls = {c: cells[here] - cells[c] for c in beside if cells[here] - cells[c] > far[c]}
-            directions |= {turn_of(c, at.mean(axis=0)) for c in walls}
-            feet += [cells[here] - max(walls.values())] if walls else []
-            high = max([high, *walls.values()])
-            near = any(
-                c in creases and abs(cells[c] - cells[here]) <= 0.75 for c in square(here, 1)
-            )
-            others += not walls and bool(beside or near)
-            creased += near
-        rim = len(feet) >= 0.5 * (len(feet) + others) and len(directions) >= 10 and high >= 1.8
-        plane = np.column_stack([cell * at, np.ones(len(at))])
-        tilt = np.hypot(*np.linalg.lstsq(plane, [cells[c] for c in map(tuple, at)])[0][:2])
-        if rim and tilt < 0.4 and creased <= 0.4 * len(members):
-            below |= dict.fromkeys(members, np.mean(feet))
-    beside = {c: [below[b] for b in square(c, reach) if b in below] for c in creases}
-    below |= {c: min(levels) for c, levels in beside.items() if levels}
-    return {c: level for c, level in below.items() if ground[c]}
-
-
-@pytest.mark.parametrize(("seed", "cell"), [(0, 1.0), (1, 1.0), (2, 0.8), (3, 2.0)])
-def test_roofs_of_hillsides_equal_the_slow_reference(seed, cell):
-    rng = np.random.default_rng(seed)
-    j, i = np.mgrid[:44, :120]
-    raster = 0.5 * cell * j + rng.normal(0, 0.02, j.shape)
-    for y, x in ((4, 6), (6, 30), (25, 8), (24, 29), (20, 90), (5, 100)):
-        deep, wide = rng.integers(8, 14, 2)
-        house = (j >= y) & (j < y + deep) & (i >= x) & (i < x + wide)
-        raster[house] = 0.5 * cell * (y + deep) + 0.4 * cell * np.minimum(j - y, y + deep - j)[
-            house
-        ] * (seed % 2)
-    raster[rng.random(raster.shape) < 0.1 * seed] = np.inf
-    raster = raster.astype(np.float32)
-    ground = np.isfinite(raster) & (rng.random(raster.shape) < 0.9)
-    found, want = roofs_of_hillsides(ground, raster, cell), slow_roofs(ground, raster, cell)
-    assert {tuple(map(int, at)) for at in np.argwhere(np.isfinite(found))} == set(want) and len(
-        want
-    ) > 100
-    assert [found[at] for at in want] == pytest.approx(list(want.values()), abs=1e-4)
-    part = roofs_of_hillsides(ground[:, 40:], raster[:, 40:], cell)
-    assert np.array_equal(part[:, 50:], found[:, 90:])
-
-
-@pytest.mark.parametrize(("tilt", "roof"), [(0.0, True), (0.3, True), (0.5, False)])
-def test_what_is_tilted_as_a_steep_slope_is_no_roof(tilt, roof):
-    j, i = np.mgrid[:44, :60]
-    lifted = (abs(j - 22) < 7) & (abs(i - 30) < 8)
-    raster = (0.6 * j + np.where(lifted, 4 - (0.6 - tilt) * (j - 22), 0)).astype(np.float32)
-    found = np.isfinite(roofs_of_hillsides(np.ones(raster.shape, bool), raster, 1.0))
-    assert found[lifted].mean() > 0.9 if roof else not found.any()
-
-
-def test_a_roof_is_no_ground_whatever_its_width_and_steps():
-    """190 m wide, with a storey on it; a terrace with a ramp, a plateau of 260 m and a ridge stay."""
-    rng = np.random.default_rng(2)
-    x, y = rng.uniform(0, 500, (2, 60_000))
-    far = np.maximum(np.abs(x - 250), np.abs(y - 250))
-
-    def ground_of(height):
-        found = filtered_ground(x, y, 0.02 * x + height + rng.normal(0, 0.03, len(x)))
-        return found["Ground"] == 1, found["HeightAboveGround"]
-
-    for storey in (0.0, 3.0):
-        ground, height = ground_of(np.where(far < 95, 3.0, 0.0) + np.where(far < 50, storey, 0.0))
-        assert not ground[far < 93].any()
-        assert ground[far > 97].mean() > 0.999
-        assert height[far < 90].min() > 1.0
-    ramp = np.clip((x - 320) / 25, 0, 1) * 5.0
-    hill = np.where(
-        (far < 95) & (x > 320) & (abs(y - 250) < 10), 5.0 - ramp, np.where(far < 95, 5.0, 0.0)
-    )
-    ground, _ = ground_of(hill)
-    assert ground[far < 30].mean() > 0.99
-    ground, _ = ground_of(np.where(far < 130, 6.0, 0.0))
-    assert ground[far < 40].mean() > 0.99
-    assert (np.abs(ground_of(-0.6 * np.abs(x - y))[1]) < 1).mean() > 0.97
-
-
+@pytest.mark.data
+@pytest.mark.parametrize("hole", HOLES)
 @pytest.mark.parametrize(
-    ("slope", "scarp", "seen"), [(1.0, 0.0, 0.05), (0.46, 12.0, 0.05), (0.46, 12.0, 0.1)]
+    "name", ["rural/ahn3_achterhoek", "delft/train", "forest/neon_osbs", "bridge/ign_0299_6802"]
 )
-def test_wooded_land_that_the_rim_cuts_off_uphill_is_ground(slope, scarp, seen):
-    """All windows round it reach far down, and from its crowns it goes down in all directions: it is no hall."""
-    xyz, ground = closed_wood(slope, seen, 6.0, 100, 1)
-    xyz[:, 2] += scarp / (1 + np.exp((10 - (xyz[:, :2] - 50) @ (0.9, 0.4)) / 1.8))
-    found = filtered_ground(xyz)
-    assert found["Ground"][ground].all()
-    assert np.abs(found["HeightAboveGround"][ground]).max() < 1.5  # no treetops stand for it
+def test_land_around_a_hole_in_large_clouds_stays_ground(data_dir, name, hole):
+    assert share_kept(data_dir / f"{name}.laz", hole, clip=80) > 0.99
 
 
-def test_rock_steps_on_a_steep_slope_are_ground(monkeypatch):
-    """Openings take it where nobody asks how steep the land is, and less is regained from level planes."""
+def test_benches_of_a_quarry_stay_ground():
     rng = np.random.default_rng(0)
-    x, y = rng.uniform(0, 200, (2, 40_000))
-    steps = 4 * np.floor((x + 6 * np.sin(y / 15)) / 40)
-    z = 1.2 * x + 2 * np.sin(x / 9) * np.cos(y / 13) + steps + rng.normal(0, 0.2, len(x))
-    for wide, steep, missed in ((20.0, 0.5, 0.0), (np.inf, 0.5, 0.1), (np.inf, np.inf, 0.2)):
-        monkeypatch.setattr(openings, "WIDE", wide)
-        monkeypatch.setattr(groundcells, "STEEP", steep)
-        assert missed <= (filtered_ground(x, y, z)["Ground"] == 0).mean() < missed + 0.1
+    x, y = rng.uniform(0, 200, (2, 120_000))
+    z = -8.0 * np.clip(np.floor((x - 60) / 25), 0, 4) + rng.normal(0, 0.03, len(x))
+    assert filtered_ground(x, y, z)["Ground"].mean() > 0.99
 
 
 # ---- what must hold --------------------------------------------------------------------------------------
@@ -455,22 +255,6 @@ def test_a_tile_with_its_halo_gives_the_same_bits():
     assert near.sum() < 0.9 * len(x)
     tile = filtered_ground(x[near], y[near], z[near], **options)
     same({k: a[core[near]] for k, a in tile.items()}, {k: a[core] for k, a in whole.items()})
-
-
-def test_a_tile_above_a_scarp_at_the_rim_gives_the_same_bits(monkeypatch):
-    rng = np.random.default_rng(0)
-    x, y = np.round(rng.uniform([[400], [0]], [[640], [1500]], (2, 180_000)), 2)
-    z = 0.3 * x + 16 / (1 + np.exp((570 - x) / 1.8)) + np.sin(x / 9) * np.cos(y / 13)
-    z = np.round(z + rng.normal(0, 0.1, len(x)), 2)
-    whole, halo = filtered_ground(x, y, z), FilterOptions().reach_of_points
-    core = (x >= 560) & (y >= 715) & (y < 775)
-    near = (y >= 715 - halo) & (y < 775 + halo)
-    assert near.sum() < 0.96 * len(x)
-    tile = filtered_ground(x[near], y[near], z[near])
-    same({k: a[core[near]] for k, a in tile.items()}, {k: a[core] for k, a in whole.items()})
-    monkeypatch.setattr(openings, "WIDE", 100.0)
-    less = filtered_ground(x[near], y[near], z[near])["Ground"][core[near]]
-    assert less.mean() + 0.1 < whole["Ground"][core].mean()
 
 
 @pytest.mark.parametrize("spacing", [40, 250])
@@ -568,7 +352,7 @@ def test_sizes_and_shapes_are_checked():
     with pytest.raises(OptionError, match="'cell' must be a number above 0"):
         filtered_ground([0.0], [0.0], [0.0], cell=0)
     with pytest.raises(OptionError, match="'window' must not be more than 300 cells"):
-        filtered_ground([0.0], [0.0], [0.0], cell=0.1)
+        filtered_ground([0.0], [0.0], [0.0], cell=0.05)
     with pytest.raises(OptionError, match="'slope' must be a number"):
         filtered_ground([0.0], [0.0], [0.0], slope=-1)
     with pytest.raises(StageError, match="one length"):
@@ -605,12 +389,11 @@ def test_the_stage_declares_what_it_makes_and_how_far_it_looks():
         "HeightAboveOpening_16_5": "float",
     }
     assert HagMorphological({}).creates() == {"HeightAboveGround": "float"}
-    assert 650 < HagMorphological({}).halo_m() < 700
-    assert HagMorphological({"window": 20}).halo_m() < 600
+    assert HagMorphological({}).halo_m() < 450 < HagMorphological({"window": 75}).halo_m()
     with pytest.raises(
         StageError, match=r"filters\.hag_morphological.*'window' must not be more than 300 cells"
     ):
-        HagMorphological({"cell": 0.2})
+        HagMorphological({"cell": 0.05})
     with pytest.raises(StageError, match="'openings' must be a number"):
         HagMorphological({"openings": "five"})
 

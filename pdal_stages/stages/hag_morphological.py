@@ -49,6 +49,7 @@ class HagMorphological(Stage):
     type = "filters.hag_morphological"
     summary = "Height above ground found by a progressive morphological filter"
     source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
+    algorithm_version = 2
     where_help = HEIGHTS_OUTSIDE
     in_models = (
         "cell",
@@ -68,15 +69,15 @@ class HagMorphological(Stage):
     slope: float = option(
         "number",
         0.15,
-        "Rise over run: a window removes what it lowers by more than this times its radius, or by 3.5 m; raise it for "
-        "rugged terrain without buildings",
+        "Rise over run: a window removes what it lowers by more than this times its radius; raise it for rugged terrain "
+        "without buildings",
         minimum=0,
         maximum=100,
     )
     window: float = option(
         "number",
-        75.0,
-        "Radius of the largest window: half the width of the largest building",
+        18.0,
+        "Radius of the largest window: half the width of the largest object that is removed",
         minimum=0,
         exclusive=True,
         maximum=10_000,

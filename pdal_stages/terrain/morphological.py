@@ -6,12 +6,12 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 
 * the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile with its halo gets the
   bits of the whole cloud, and so does any order of the points;
-* windows grow to the size of large halls, where a drop of a few meters is enough, except on steep land (:mod:`.openings`);
 * holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
-* what is higher than all around it on every side is no ground (:mod:`.openings`), nor are roofs that a slope runs into
-  (:mod:`.hillside`);
 * low outliers are told from ground under a canopy (:mod:`.belowground`).
+
+Parameters have SMRF's defaults. What lies beyond the cloud's end or in a hole is unknown, and no evidence for an object.
+Roofs wider than the window stay ground: a classifier tells them by heights above openings of other widths.
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
 airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30.
@@ -53,7 +53,7 @@ def filtered_ground(
     mask: ArrayLike | None = None,
     cell: float = 1.0,
     slope: float = 0.15,
-    window: float = 75.0,
+    window: float = 18.0,
     threshold: float = 0.5,
     scalar: float = 1.25,
     openings: Sequence[float] = (),
@@ -73,9 +73,9 @@ def filtered_ground(
     cell : float, default 1
         Side of the grid's cells, meters.
     slope : float, default 0.15
-        Rise over run: a window of radius r removes what it lowers by more than `slope` times r, or by 3.5 m.
-    window : float, default 75
-        Radius of the largest window, meters: half the width of the largest building.
+        Rise over run: a window of radius r removes what it lowers by more than `slope` times r.
+    window : float, default 18
+        Radius of the largest window, meters: half the width of the largest object that is removed.
     threshold, scalar : float, default 0.5 and 1.25
         A point is ground within `threshold` + `scalar` times the terrain's slope of the surface, meters.
     openings : sequence of float

@@ -1,14 +1,8 @@
-"""What stands on the ground of a minimum grid: what openings by octagons of growing radius show [P13], and plateaus.
+"""Morphological openings of a minimum grid by octagons, and the objects that growing openings show [P13].
 
-A hole is ``+inf``: erosion passes over it, and no window is centered on one, so an opening is the highest
-level that a window centered on measured cells reaches. Octagons (squares and diamonds taken in turn) treat
-ridges alike whatever their direction, as discs do, but fall apart into lines, so an opening costs the
-logarithm of its radius.
-
-Openings miss roofs wider than their window and roofs that fall in several small steps, and a few cells of a roof that were
-taken for ground spread. So cells are linked where one can walk from one to the next. A set of linked cells that is no
-wider than a large hall, and from which the ground around, on every side, lies a jump down, is a plateau without a ramp: a
-roof, not terrain.
+A hole is ``+inf``: erosion passes over it, and no window is centered on one, so an opening is the highest level
+that a window centered on measured cells reaches. Octagons (squares and diamonds taken in turn) treat ridges alike
+whatever their direction, as discs do, but fall apart into lines, so an opening costs the logarithm of its radius.
 """
 
 from __future__ import annotations
@@ -19,14 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.jit import device, njit
-from .cells import HOLE, linked_cells
-
-#: Drops beyond this, in meters, are objects however large the window: halls are not higher for being wider.
-LARGEST_DROP = 3.5
-#: Windows from this radius on, in meters, show halls; how steep the land is, is seen in the first of them. A hall is also
-#: lowered by more than such a share of what the land falls within the radius, and a wall is so many times as steep.
-WIDE, FALLS, STEEPER = 20.0, 0.5, 3.0
+from ..base.jit import njit
+from .cells import HOLE
 
 
 def opening_radius(window: float, cell: float) -> int:
@@ -84,53 +72,29 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
     return np.ascontiguousarray(rows)
 
 
-def wide_radius(window: int, cell: float) -> int:
-    """The first radius, in cells, from `WIDE` on; 0 where the largest `window` is smaller."""
-    return next((radius for radius in opening_radii(window) if radius * cell >= WIDE), 0)
-
-
-def _steepness(
-    heights: NDArray[np.float32], opened: NDArray[Any], measured: NDArray[np.bool_], radius: int
-) -> NDArray[np.float32]:
-    """How steep the land is round each cell (h, w), in meters per cell.
-
-    That is how far it goes both up and down within `radius` cells of one of those as near: a hall goes only up or down.
-    `opened` (h, w) are the ranks of its `heights`.
-    """
-    steps, last = _steps(min(radius, sum(opened.shape))), len(heights) - 1
-    level = heights[opened[measured]]
-    up = heights[highest_around(opened * measured, *steps)[measured]] - level
-    down = level - heights[last - highest_around((last - opened) * measured, *steps)[measured]]
-    steep = np.zeros(opened.shape, np.float32)
-    steep[measured] = np.minimum(up, down) / np.float32(radius)
-    return highest_around(steep, *steps)
-
-
-@njit
-def _lower(fall, land, drop, falls, again, after, below, found):
-    """Find cells (n,) that an opening lowers by more than `drop` and than `falls` times what steep land falls, or once more
-    by more than `again` and than walls on it; what is then `below` them.
-
-    `fall` is by how much they fall to what is there `after`, and `land` how far steep land falls.
-    """
-    for k in range(len(fall)):
-        if fall[k] > (max(again, STEEPER * land[k]) if found[k] else max(drop, falls * land[k])):
-            below[k], found[k] = after[k], True
-
-
 def objects_of(
     raster: NDArray[np.float32], cell: float, slope: float, window: int, keep: Collection[int] = ()
-) -> tuple[
-    NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]], NDArray[np.float32]
-]:
-    """Cells that an opening lowers by more than `slope` times its radius, or than `LARGEST_DROP`.
+) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]]]:
+    """Find the cells that an opening lowers by more than `slope` times its radius [P13, 2.2].
 
-    Wide windows also lower steep land that the rim of the cloud cuts off uphill, so there they must lower by more (see
-    `WIDE`). What an opening leaves of an object may be a lower roof or treetop: wider ones take that, too, down a wall.
-    `raster` is the minimum grid (h, w), float32, with holes; it and `cell`, a cell's side, are in meters. `window` is the
-    largest radius and `keep` lists radii whose openings are wanted, in cells. Returned are the objects (h, w), what openings
-    left there (elsewhere the cell's own height), the openings of `keep`, and how steep the land is (h, w), in meters per
-    cell.
+    Parameters
+    ----------
+    raster : (h, w) float32
+        The minimum grid, with holes; meters.
+    cell : float
+        Side of a cell in meters.
+    window : int
+        Radius of the largest window in cells; windows grow from 1 cell to it.
+    keep : collection of int
+        Radii in cells whose openings are returned.
+
+    Returns
+    -------
+    objects : (h, w) bool
+    floor : (h, w) float32
+        What the first opening that lowered an object left there; elsewhere the cell's own height.
+    openings : dict
+        Radius -> (h, w) float32, of `keep`.
     """
     measured = raster != HOLE
     # Heights by their rank: that takes half the bytes, and order is all that openings look at.
@@ -141,33 +105,24 @@ def objects_of(
     upended = np.zeros_like(most)
     upended[measured] = last - 1 - rank
     openings, taken = {}, (0, 0)
-    cells, before = np.flatnonzero(measured), raster[measured]
-    below, found = before.copy(), np.zeros(len(cells), bool)
+    objects, floor, before = np.zeros(raster.shape, bool), raster.copy(), raster
     # An opening lowers nothing by more than all heights differ.
-    drops = {r: np.float32(min(slope * r * cell, LARGEST_DROP)) for r in opening_radii(window)}
+    drops = {radius: np.float32(slope * radius * cell) for radius in opening_radii(window)}
     drops = {radius: drop for radius, drop in drops.items() if drop < heights[-2] - heights[1]}
-    wide, again, steep = wide_radius(window, cell), np.inf, np.zeros(raster.shape, np.float32)
-    if wide:
-        steps, again = _steps(min(wide, sum(raster.shape))), LARGEST_DROP
-        opened = highest_around(np.minimum(last - highest_around(upended, *steps), most), *steps)
-        steep = _steepness(heights, opened, measured, wide)
-    land = steep[measured]
     for radius in sorted({*drops, *keep}):
         squares, diamonds = _steps(min(radius, sum(raster.shape)))
         upended = highest_around(upended, squares - taken[0], diamonds - taken[1])
         taken = squares, diamonds
-        opened = highest_around(np.minimum(last - upended, most), squares, diamonds)
+        opened = heights[highest_around(np.minimum(last - upended, most), squares, diamonds)]
         if radius in keep:
-            openings[radius] = heights[opened]
+            openings[radius] = opened
         if radius in drops:
-            after = heights[opened.ravel()[cells]]
-            falls = FALLS if 0 < wide <= radius else 0.0
-            fallen = np.float32(radius) * land
-            _lower(before - after, fallen, drops[radius], falls, again, after, below, found)
-            before = after
-    objects, floor = np.zeros(raster.shape, bool), raster.copy()
-    objects[measured], floor[measured] = found, below
-    return objects, floor, openings, steep
+            lowered = measured & ~objects
+            lowered[lowered] = before[lowered] - opened[lowered] > drops[radius]
+            objects |= lowered
+            floor[lowered] = opened[lowered]
+            before = opened
+    return objects, floor, openings
 
 
 def opening_names(windows: Sequence[float]) -> list[str]:
@@ -195,111 +150,3 @@ def above_opening(x, y, z, cell, left, bottom, opening, fallback, out):
                     level += weight * value
                     total += weight
         out[p] = z[p] - level / total if total > 0.0 else fallback[p]
-
-
-#: The widest roof, in meters along either axis.
-WIDEST = 200.0
-#: Two cells are linked across a step of so many meters, or of so much per meter of their distance.
-STEP, GRADE = 0.75, 0.3
-#: How far apart cells are linked, and how far beyond an edge ground is looked for, in cells.
-LINK, BEYOND = 4, 8
-#: A jump down has more than so many meters, and more than so much per meter of distance.
-JUMP, WALL = 1.5, 0.75
-#: The share of a set's cells that must have been taken for ground: a few are more likely ground among treetops.
-FOOTING = 0.05
-#: Lower ground must lie in so many of 16 directions from the middle, and be such a share of the ground that is lower or
-#: less than a step away, where there may be a way up; a higher story does not count. Around ground on a steep slope as
-#: much lies a jump higher as lower: from a plateau's ground, the former is no more than half of the latter.
-DIRECTIONS, SHARE = 14, 0.8
-#: At most so many cells for the root of the number of all lie at the rim: crowns have ground below them everywhere.
-RIM = 14.0
-
-
-def plateau_reach(cell: float) -> int:
-    """How far away cells change what is a plateau, in cells."""
-    return int(WIDEST / cell) + 1 + LINK + BEYOND
-
-
-def sums_of_sets(number: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Sums of the rows and of the columns of the cells of each set, and how many they are (n, 3), from their `size` (n,)."""
-    rows, columns = np.nonzero(number >= 0)
-    sets = number[rows, columns]
-    sums = [np.bincount(sets, at, len(size)) for at in (rows, columns)]
-    return np.column_stack([*sums, size]).astype(np.int64)
-
-
-@device
-def direction(sums, j, i):
-    """Which of 16 directions a cell lies in from the middle of a set, of which sums are given."""
-    # Times the set's size: whole numbers, the same wherever the array begins.
-    v, u = j * sums[2] - sums[0], i * sums[2] - sums[1]
-    return int((np.arctan2(float(v), float(u)) / (2 * np.pi) + 1.0) * 16) % 16
-
-
-@njit
-def _look_around(
-    number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim
-):
-    """Of each set asked for: in which directions ground lies a jump lower, how often, how high, and how often level.
-
-    And of the set's own ground, twice how often other ground lies a jump higher, less how often it lies a jump lower; and
-    how many cells lie at the rim.
-    """
-    h, w = number.shape
-    for j in range(h):
-        for i in range(w):
-            k = number[j, i]
-            if k < 0 or not asked[k]:
-                continue
-            at_rim = False
-            for y in range(max(j - BEYOND, 0), min(j + BEYOND + 1, h)):
-                for x in range(max(i - BEYOND, 0), min(i + BEYOND + 1, w)):
-                    if not ground[y, x] or number[y, x] == k:
-                        continue
-                    drop = raster[j, i] - raster[y, x]
-                    far = np.sqrt(float((y - j) ** 2 + (x - i) ** 2))
-                    jump = max(JUMP, WALL * cell * far)
-                    if ground[j, i]:
-                        uphill[k] += 2 * (drop < -jump) - (drop > jump)
-                    if drop > max(jump, STEEPER * steep[j, i] * far):
-                        around[k, 0] += 1
-                        level[k] += raster[y, x]
-                        at_rim |= far < 3.0
-                        sectors[k, direction(sums[k], y, x)] = True
-                    elif abs(drop) < STEP:
-                        around[k, 1] += 1
-            rim[k] += at_rim
-
-
-def remove_plateaus(
-    ground: np.ndarray, floor: np.ndarray, raster: np.ndarray, steep: np.ndarray, cell: float
-) -> None:
-    """Take plateaus from the `ground` (h, w) of a minimum grid; what lies around them becomes their `floor`.
-
-    `raster` (h, w) holds the heights, in meters like `cell`, a cell's side; ground is measured everywhere. `steep` (h, w)
-    is how steep the land is, in meters per cell.
-    """
-    number, size, side = linked_cells(
-        raster, LINK, lambda away: np.maximum(STEP, GRADE * cell * away)
-    )
-    count, sums = len(size), sums_of_sets(number, size)
-    grounds = np.bincount(number[ground], minlength=count)
-    asked = (grounds > FOOTING * size) & (side < int(WIDEST / cell))
-    sectors, around, level = (
-        np.zeros((count, 16), bool),
-        np.zeros((count, 2), np.int64),
-        np.zeros(count),
-    )
-    uphill, rim = np.zeros((2, count), np.int64)
-    _look_around(
-        number, asked, ground, raster, steep, cell, sums, sectors, around, level, uphill, rim
-    )
-    lower = around[:, 0]
-    plateau = (
-        (sectors.sum(axis=1) >= DIRECTIONS) & (lower >= SHARE * around.sum(axis=1)) & (uphill <= 0)
-    )
-    plateau &= rim <= RIM * np.sqrt(size)
-    level[plateau] /= lower[plateau]
-    taken = ground & np.append(plateau, False)[number]
-    ground[taken] = False
-    floor[taken] = level[number[taken]]

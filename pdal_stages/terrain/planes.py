@@ -25,8 +25,6 @@ from .openings import highest_around
 _STIFFNESS = 0.02
 #: Weight of the coarser height, in ground cells.
 _HOLD = 0.1
-#: The floor is near to a plane that tells such a share of its variance, where such a share of the cells is measured.
-_PLANE, _MEASURED = 0.6, 0.3
 
 
 class GroundRaster(NamedTuple):
@@ -137,14 +135,12 @@ def _sum_around(moments, j, i, size, sums):
             if moments[b, a, 0] > 0:
                 weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
                 _add(sums, moments[b, a], (a - i) * size, (b - j) * size, weight)
-                for k in range(9, len(sums)):
-                    sums[k] += weight * moments[b, a, k]
 
 
 @njit
 def _moments_of_cells(held, place, height, level, left, bottom, out, out_left, out_bottom):
-    """Moments of the held cells of each block of a level, about its center; and sums of squares, where there is room."""
-    size, moments = 1 << level, out.shape[2]
+    """Add up moments of the held cells of each block of a level, about its center."""
+    size = 1 << level
     for j in range(held.shape[0]):
         for i in range(held.shape[1]):
             if held[j, i]:
@@ -152,8 +148,8 @@ def _moments_of_cells(held, place, height, level, left, bottom, out, out_left, o
                 y = place[j, i, 1] + ((j + bottom) & (size - 1)) - (0.5 * size - 0.5)
                 z = np.float64(height[j, i])
                 block = out[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
-                values = (1.0, x, y, x * x, x * y, y * y, z, x * z, y * z, z * z)
-                for k in range(moments):
+                values = (1.0, x, y, x * x, x * y, y * y, z, x * z, y * z)
+                for k in range(len(values)):
                     block[k] += values[k]
 
 
@@ -169,35 +165,15 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
 
 
 @njit
-def _coarsest(moments, size, steep, planes):
-    """Level planes at the mean of the floor of 3 x 3 blocks; the plane nearest to it where it is steep and near to one."""
+def _coarsest(moments, size, planes):
+    """Lay level planes at the mean of the floor of 3 x 3 blocks."""
     h, w = moments.shape[:2]
-    sums = np.empty(10)
+    sums = np.empty(9)
     for j in range(h):
         for i in range(w):
             _sum_around(moments, j, i, size, sums)
-            n = sums[0]
-            planes[j, i, 0], planes[j, i, 1], planes[j, i, 2] = np.nan, 0.0, 0.0
-            if n == 0.0:
-                continue
-            x, y, z = sums[1] / n, sums[2] / n, sums[6] / n
-            planes[j, i, 0] = z
-            if n < _MEASURED * 4.0 * size * size:
-                continue
-            stiff = _STIFFNESS * size * size
-            xx, yy, xy = (
-                sums[3] / n - x * x + stiff,
-                sums[5] / n - y * y + stiff,
-                sums[4] / n - x * y,
-            )
-            xz, yz = sums[7] / n - x * z, sums[8] / n - y * z
-            determinant = xx * yy - xy * xy
-            gx, gy = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-            if np.sqrt(gx * gx + gy * gy) >= steep and gx * xz + gy * yz >= _PLANE * (
-                sums[9] / n - z * z
-            ):
-                planes[j, i, 0] = z - gx * x - gy * y
-                planes[j, i, 1], planes[j, i, 2] = gx, gy
+            planes[j, i, 0] = sums[6] / sums[0] if sums[0] > 0.0 else np.nan
+            planes[j, i, 1], planes[j, i, 2] = 0.0, 0.0
 
 
 @njit
@@ -240,11 +216,8 @@ def _fit(moments, size, planes):
             planes[j, i, 2] = along + gy
 
 
-def planes_of_blocks(raster: GroundRaster, levels: int, steep: float = np.inf) -> Planes:
-    """Planes of blocks of 2 x 2 cells, through the ground of a raster; there are `levels` coarser levels, at least 1.
-
-    Those of the coarsest level are not level where what lies below objects rises by `steep` meters per cell or more.
-    """
+def planes_of_blocks(raster: GroundRaster, levels: int) -> Planes:
+    """Fit planes of blocks of 2 x 2 cells through the ground of a raster; there are `levels` coarser levels, at least 1."""
     h, w = raster.shape
     moments: list[np.ndarray] = []
     spans = [raster.window[:2]]
@@ -261,10 +234,10 @@ def planes_of_blocks(raster: GroundRaster, levels: int, steep: float = np.inf) -
         moments.append(made)
         spans.append((low_a, low_b))
     planes = np.empty((h, w, 3))
-    made = np.zeros((h, w, 10))
+    made = np.zeros((h, w, 9))
     middle, measured = np.broadcast_to(0.0, (*raster.shape, 2)), raster.lowest != HOLE
     _moments_of_cells(measured, middle, raster.floor, levels, *spans[0], made, *spans[levels])
-    _coarsest(made, 2.0**levels, steep, planes)
+    _coarsest(made, 2.0**levels, planes)
     for level in range(levels, 0, -1):
         made = moments.pop()
         if level < levels:
