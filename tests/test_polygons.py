@@ -12,7 +12,6 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.cli import main
 from pdal_stages.objects import overlay as overlays
 from pdal_stages.objects.overlay import Overlay, points_inside
 from pdal_stages.stages.polygons import Polygons
@@ -204,7 +203,7 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las, run_job):
 
 
 @pytest.mark.pdal
-def test_water_of_delft_on_the_command_line(tmp_path, capsys, data_dir):
+def test_water_of_delft_on_the_command_line(tmp_path, data_dir):
     shapes = shapely.from_wkb(pyogrio.raw.read(str(data_dir / "delft/water_train.geojson"))[2])
     water = write(tmp_path / "water.gpkg", shapes, 4258)
     las = laspy.read(data_dir / "delft/train.laz")
@@ -219,8 +218,6 @@ def test_water_of_delft_on_the_command_line(tmp_path, capsys, data_dir):
     assert (codes == 9).any() and "  9 Water" in said
     at = inside({"X": las.x, "Y": las.y}, *shapes)
     assert not (codes[~at] == 9).any() and not (codes[at] == 2).any()
-    assert main([*words, "--where", "Classification == 1"]) == 1
-    assert "--where by Classification cannot be combined with --polygons" in capsys.readouterr().err
 
 
 def test_what_cannot_be_read_after_the_check_is_an_error_of_ours(tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation
 from ..stages.base import stage_from, stage_types
+from ..stages.points import SELECTED
 from .inputs_outputs import overridden, reader_of, writer_of
 from .las_output import extra_dims_option
 from .read import Override
@@ -31,7 +32,8 @@ class ClassifyRequest:
 
     model: str = STANDARD  #: a model file, or the name of a shipped one
     overrides: tuple[Override, ...] = ()  #: options of stages, which may name another model
-    where: str | None = None  #: classify only the points for which this holds
+    #: Classify only the points for which this holds, with the classes that they have in the input.
+    where: str | None = None
     #: Created dimensions to write besides the input's own; ``all`` and ``none`` are allowed.
     dimensions: tuple[str, ...] = WRITTEN
     noise: bool = True  #: mark low and high noise first
@@ -55,6 +57,7 @@ class ClassifyRequest:
             "type": "filters.modelclassifier",
             "model": self.model,
             **self._inside,
+            **({"mark": SELECTED} if self.where else {}),
         }
         stage["compact"] = True
         if self.keep_sure is not None:
@@ -107,31 +110,22 @@ class ClassifyRequest:
         return self.loaded.info.get("preparation") or preparation.preparation_of(needed)
 
     @property
-    def _by_class(self) -> bool:
-        """Whether `where` refers to classes, which the classifier changes."""
-        return "Classification" in (self.where or "")
-
-    @property
     def _corrections(self) -> list[dict[str, Any]]:
-        """The corrections after the classifier, for models with the classes they need, and polygons last."""
-        if self._by_class and self.polygons:
-            raise OptionError(
-                "--where by Classification cannot be combined with --polygons: the classes are new by then",
-                found=self.where,
-                cure="Add filters.polygons in a second run",
-            )
+        """Return the corrections after the classifier, for models with the classes they need, and polygons last.
+
+        They take the points that the classifier marked: `where` would see its new classes by then.
+        """
         settled = overridden(self._classifier, self.overrides)
         taken: dict[str, Any] = {
             name: settled[name] for name in ("ignore", "keep") if name in settled
         }
         wanted = {
-            "filters.bridges": self.bridges and not self._by_class,
-            "filters.wires": self.wires and not self._by_class,
+            "filters.bridges": self.bridges,
+            "filters.wires": self.wires,
             "filters.polygons": bool(self.polygons),
         }
-        stages = [
-            {"type": kind, **taken, **self._inside} for kind, chosen in wanted.items() if chosen
-        ]
+        inside = {"where": f"{SELECTED} == 1"} if self.where else {}
+        stages = [{"type": kind, **taken, **inside} for kind, chosen in wanted.items() if chosen]
         for stage in stages:
             if stage["type"] == "filters.wires" and self.towers:
                 stage["towers"] = True
@@ -148,7 +142,8 @@ class ClassifyRequest:
                 made["HeightAboveGround"] = "double"
             elif stage["type"] in stage_types():
                 made |= stage_from(overridden(stage, self.overrides)).creates()
-        made.pop("Classification", None)
+        for name in ("Classification", SELECTED):
+            made.pop(name, None)
         for name in self.dimensions:
             if name not in ("all", "none", *made) and self.dimensions != WRITTEN:
                 raise OptionError(

@@ -403,8 +403,21 @@ def flags_inside_classification(dimensions, metadata: Any) -> bool:
         for name in ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")
     ):
         return False
-    formats = [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
-    return bool(formats) and all(f <= 5 for f in formats)
+    formats = _point_formats(metadata)
+    return bool(formats) and max(formats) <= 5
+
+
+def overlap_as_flag(dimensions, metadata: Any) -> bool:
+    """Whether class 12 (overlap) of LAS 1.0-1.3 is read as class 0 with the flag Overlap, as PDAL from 2.6 on does.
+
+    Files of LAS 1.4 have both the class and the flag: there class 0 with the flag is a point not yet classified.
+    """
+    return "Overlap" in dimensions and min(_point_formats(metadata), default=6) <= 5
+
+
+def _point_formats(metadata: Any) -> list[int]:
+    """Return the point data record formats of the files that were read, from PDAL's metadata."""
+    return [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
 
 
 def _values(node: Any, name: str) -> list[Any]:

@@ -147,10 +147,12 @@ def _run_one(
 
 def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -> Points:
     """The points of a view, as a stage sees them, from what PDAL sets in a script's globals."""
+    metadata = module.get("metadata")
     return stage.points(
         ins,
         wkt=wkt_of(module.get("spatialreference")),
-        legacy_flags=pdal_env.flags_inside_classification(ins, module.get("metadata")),
+        legacy_flags=pdal_env.flags_inside_classification(ins, metadata),
+        overlap_as_flag=pdal_env.overlap_as_flag(ins, metadata),
     )
 
 

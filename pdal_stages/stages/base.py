@@ -189,13 +189,28 @@ class Stage(ABC):
         return {}
 
     def points(
-        self, arrays: Mapping[str, NDArray], *, wkt: str = "", legacy_flags: bool = False
+        self,
+        arrays: Mapping[str, NDArray],
+        *,
+        wkt: str = "",
+        legacy_flags: bool = False,
+        overlap_as_flag: bool = False,
     ) -> Points:
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
         own = arrays.get(self.own_points)
         used = self.used(arrays) if self.where_chooses and own is not None else None
-        return Points(arrays, wkt, self._condition, units, legacy_flags, own, used, self.code_limit)
+        return Points(
+            arrays,
+            wkt,
+            self._condition,
+            units,
+            legacy_flags,
+            overlap_as_flag,
+            own,
+            used,
+            self.code_limit,
+        )
 
     def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_]:
         """In tiles: the points whose results are used."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cached_property
 from typing import Any
 
@@ -87,6 +88,12 @@ class ModelClassifier(Stage):
         "Two heights in meters, e.g. 0.5,2: vegetation (5) below them becomes low (3) and medium (4)",
         may_be_empty=True,
     )
+    mark: str = option(
+        "string",
+        "",
+        "A dimension to write: 1 for points inside `where`, else 0. Later stages can take it in their own `where`, which "
+        "would see the new classes",
+    )
     compact: bool = option(
         "boolean",
         False,
@@ -103,6 +110,8 @@ class ModelClassifier(Stage):
 
     def check(self) -> None:
         self.limits  # noqa: B018  refused here where nothing is known of the model
+        if self.mark and not re.fullmatch(r"[A-Za-z]\w*", self.mark):
+            raise OptionError("option 'mark' must be a name of letters and digits", found=self.mark)
         codes = [code for code, _ in self.model.classes]
         if self.variance and not self.model.gives_variance:
             raise OptionError(
@@ -174,7 +183,12 @@ class ModelClassifier(Stage):
         more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
         if self.probabilities:
             more += [f"Probability_{code}" for code, _ in self.model.classes]
-        return {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
+        marks = {self.mark: "uint8_t"} if self.mark else {}
+        return {
+            "Classification": "uint8_t",
+            **dict.fromkeys(["Reliability", *more], "float"),
+            **marks,
+        }
 
     def halo_m(self) -> float:
         return self.model.halo_m
@@ -244,9 +258,11 @@ class ModelClassifier(Stage):
                 height = points.arrays[HEIGHT]
                 values[HEIGHT] = np.where(inside, _rounded(height, _PARTS_OF_HEIGHT), height)
         if points.mask is not None:  # what was there before stays outside `where`
-            for name in self.creates():
+            for name in values:
                 if name != "Classification":
                     values[name] = np.where(points.mask, values[name], points.arrays[name])
+        if self.mark:
+            values[self.mark] = inside
         values["Classification"] = points.with_codes(values["Classification"])
         if self.reject_below is not None or self.limits is not None:
             points.report.figures["rejected"] = points.counted(rejected)

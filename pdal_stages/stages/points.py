@@ -36,6 +36,8 @@ MAKERS = {
 #: told where it is so in all.
 HOLDS_NOWHERE = "'where' holds for none of the points:"
 TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
+#: The dimension in which `classify` marks the points that its `where` selects.
+SELECTED = "PdalStagesSelected"
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 #: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical unit.
@@ -54,6 +56,8 @@ class Points:
     legacy_flags: bool = (
         False  #: whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`
     )
+    #: Whether class 12 (overlap) of LAS 1.0-1.3 may be read as class 0 with the flag Overlap, as PDAL from 2.6 on does.
+    overlap_as_flag: bool = False
     #: Below zero for the points whose results are used: :meth:`counted` counts those alone.
     own: NDArray | None = None
     used: NDArray[np.bool_] | None = None  #: in tiles: those for which anything is to be computed
@@ -74,7 +78,8 @@ class Points:
             if self.used is not None:
                 self.mask &= self.used
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
-            if self.count and not self.report.figures["where"]:
+            # Where `classify` marked no point, the stage that marks them has said so.
+            if self.count and not self.report.figures["where"] and SELECTED not in self.where.text:
                 self.report.warnings.append(f"{HOLDS_NOWHERE} {self.where.text}")
 
     @property
@@ -211,7 +216,7 @@ class Points:
         found = np.zeros(self.count, bool)
         if selection.codes and "Classification" in self.arrays:
             found |= np.isin(self.class_codes, np.array(selection.codes, np.uint8))
-            if OVERLAP in selection.codes:  # which newer PDAL reads as class 0 and a flag
+            if OVERLAP in selection.codes and self.overlap_as_flag:
                 found |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
         for span in selection.spans:
             name = span.dimension

@@ -1,0 +1,141 @@
+"""`classify --where`: one selection, made on the classes of the input, for every step."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+from bridge_scenes import SCENES, scan
+from test_wires import scene
+
+from pdal_stages.stages.points import SELECTED, Points
+
+pytestmark = pytest.mark.pdal
+WHERE = ("--where", "Classification == 1")
+TILES = ("--tile", 100, "--workers", 0, "--no-progress")
+
+
+def write(write_las, path, xyz, point_format, **more):
+    """A cloud of class 1 with a low outlier; its least coordinates are 500,000, 5,400,000 and 100."""
+    arrays = dict(zip("XYZ", (xyz - xyz.min(axis=0)).T, strict=True))
+    arrays["Z"][0] -= 30.0
+    arrays["Classification"] = np.ones(len(xyz), np.uint8)
+    shift = dict(zip("XYZ", (500_000, 5_400_000, 100), strict=True))
+    arrays = {name: values + shift.get(name, 0) for name, values in arrays.items()}
+    return write_las(path, arrays | more, point_format=point_format)
+
+
+def classes(path):
+    las = laspy.read(path)
+    assert SELECTED not in las.point_format.dimension_names
+    return np.asarray(las.classification)
+
+
+@pytest.mark.parametrize("tiles", [(), TILES])
+def test_wires_of_points_that_the_model_gives_another_class(tmp_path, run, write_las, tiles):
+    """LAS 1.2, where some points have flags and some have a class that --where leaves out."""
+    xyz, codes = scene(0, 3.0)
+    rng = np.random.default_rng(0)
+    flags = (rng.random(len(xyz)) < 0.2).astype(np.uint8)
+    source = write(write_las, tmp_path / "in.las", xyz, 1, Synthetic=flags, KeyPoint=flags[::-1])
+    words = ("classify", source, tmp_path / "out.las", "--wires", *tiles)
+    assert run(*words)[0] == 0
+    every = classes(tmp_path / "out.las")
+    code, said, err = run(*words, *WHERE)
+    assert code == 0, err
+    found = classes(tmp_path / "out.las")
+    assert np.array_equal(found, every) and found[0] == 7
+    assert (found[codes == 14] == 14).mean() > 0.9 and "wires (wires)" in said
+    las = laspy.read(tmp_path / "out.las")
+    assert np.array_equal(las.synthetic, flags) and np.array_equal(las.key_point, flags[::-1])
+    kept = laspy.read(source)
+    left_out = (codes == 14) & (rng.random(len(xyz)) < 0.5)
+    kept.classification[left_out] = 9
+    kept.write(source)
+    assert run(*words, *WHERE, *(("--resume",) if tiles else ()))[0] == 0
+    found = classes(tmp_path / "out.las")
+    assert (found[left_out] == 9).all() and not (found[~left_out] == 9).any()
+    assert np.array_equal(found[~left_out], every[~left_out])  # they are still neighbors
+
+
+def test_bridges_and_polygons_of_points_that_the_model_gives_another_class(
+    tmp_path, run, write_las
+):
+    pyogrio, shapely = pytest.importorskip("pyogrio"), pytest.importorskip("shapely")
+    xyz, _ = scan(SCENES["overpass"](), 4.0)
+    source = write(write_las, tmp_path / "in.las", xyz, 6)
+    lake = shapely.box(499_000, 5_399_000, 500_000 + np.ptp(xyz[:, 0]) / 2, 5_401_000)
+    pyogrio.raw.write(
+        tmp_path / "lake.gpkg",
+        shapely.to_wkb([lake]),
+        [],
+        [],
+        geometry_type="Polygon",
+        crs="EPSG:28992",
+    )
+    words = ("classify", source, tmp_path / "out.las", "--bridges")
+    words += ("--polygons", f"{tmp_path / 'lake.gpkg'}=9:2")
+    assert run(*words)[0] == 0
+    every = classes(tmp_path / "out.las")
+    assert run(*words, *WHERE)[0] == 0
+    assert np.array_equal(classes(tmp_path / "out.las"), every)
+    assert (every == 17).sum() > 500 and (every == 9).any()
+
+
+def test_in_a_pipeline_each_where_sees_the_classes_of_its_place(tmp_path, run_job, write_las):
+    """As in PDAL; `mark` keeps what the first one saw."""
+    xyz, _ = scene(0, 3.0)
+    source = write(write_las, tmp_path / "in.las", xyz, 6)
+    heights = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
+    model = {"type": "filters.modelclassifier", "model": "standard", "where": WHERE[1]}
+    wires = {}
+    for where in (WHERE[1], "Mine == 1"):
+        stages = [source, heights, model | {"mark": "Mine"}]
+        stages += [{"type": "filters.wires", "where": where}, tmp_path / "out.las"]
+        assert run_job(stages)[0] == 0
+        wires[where] = (np.asarray(laspy.read(tmp_path / "out.las").classification) == 14).sum()
+    assert not wires[WHERE[1]] and wires["Mine == 1"] > 100
+
+
+@pytest.mark.parametrize("mark", ["1st", "a b", "a-b"])
+def test_marks_that_are_no_names(run_job, tmp_path, mark):
+    stages = ["in.las", {"type": "filters.modelclassifier", "model": "standard", "mark": mark}]
+    code, _, err = run_job([*stages, tmp_path / "out.las"])
+    assert code == 1 and "option 'mark' must be a name" in err
+
+
+# ---- overlap -----------------------------------------------------------------------------------------------
+
+
+def test_class_0_with_the_overlap_flag_is_classified_in_las_14(tmp_path, run, write_las):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 40, (2, 4000))
+    xyz = np.column_stack([x, y, rng.normal(0, 0.03, 4000)])
+    overlap = (np.arange(4000) % 3 == 0).astype(np.uint8)
+    source = write(write_las, tmp_path / "in.las", xyz, 6, Overlap=overlap)
+    las = laspy.read(source)
+    las.classification[:] = 0
+    las.write(source)
+    code, _, err = run("classify", source, tmp_path / "out.las")
+    assert code == 0, err
+    out = laspy.read(tmp_path / "out.las")
+    assert not (np.asarray(out.classification) == 0).any()
+    assert np.array_equal(out.overlap, overlap)
+
+
+@pytest.mark.parametrize(
+    ("of_old_format", "kept"), [(True, [True, True, False]), (False, [True, False, False])]
+)
+def test_what_newer_pdal_reads_of_class_12(of_old_format, kept):
+    """Class 12 of LAS 1.0-1.3 becomes class 0 with a flag; in LAS 1.4 these are two different things."""
+    from pdal_stages.pipeline.pdal import overlap_as_flag
+    from pdal_stages.stages.wires import Wires
+
+    arrays = {
+        **dict.fromkeys("XYZ", np.zeros(3)),
+        "Classification": np.array([12, 0, 0], np.uint8),
+        "Overlap": np.array([0, 1, 0], np.uint8),
+    }
+    metadata = {"readers.las": {"dataformat_id": 1 if of_old_format else 6}}
+    points = Points(arrays, overlap_as_flag=overlap_as_flag(arrays, metadata))
+    assert points.chosen(Wires({}).keep).tolist() == kept
