@@ -98,6 +98,32 @@ def test_two_writers_of_one_name_at_once_while_others_sweep(tmp_path):
     assert names(tmp_path) == [longest] and (tmp_path / longest).read_bytes() in contents
 
 
+@pytest.mark.skipif(os.name == "nt" or os.geteuid(), reason="only root can give files to others")
+@pytest.mark.parametrize("kind", ["link", "chain", "dangling", "pipe"])
+def test_links_and_pipes_of_other_users_are_refused(tmp_path, kind):
+    """As Linux does in sticky folders: they count only if they are one's own or the folder's owner's."""
+    shared, mine, at = tmp_path / "shared", tmp_path / "mine", tmp_path / "shared" / "o"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    if kind != "dangling":
+        mine.write_text("mine")
+    os.mkfifo(at) if kind == "pipe" else at.symlink_to(mine)
+    os.chown(at, 65534, -1, follow_symlinks=False)
+    named = at
+    if kind == "chain":
+        named = tmp_path / "own"
+        named.symlink_to("shared/o")
+    with pytest.raises(StageError, match="link or pipe of another user"):
+        write_whole(named, b"new")
+    assert mine.exists() == (kind != "dangling") and (
+        not mine.exists() or mine.read_text() == "mine"
+    )
+    if kind != "pipe":
+        os.chown(shared, 65534, -1)
+        write_whole(named, b"new")
+        assert mine.read_bytes() == b"new"
+
+
 @unix
 def test_links_are_followed_and_modes_kept(tmp_path):
     (tmp_path / "there").mkdir()

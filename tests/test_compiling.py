@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 
 import pytest
 
+#: A job of two kernels, of which one calls the other.
+TWO_KERNELS = (
+    "from pdal_stages.base.messages import Progress; Progress.delay = 0.0; "
+    "import numpy as np; from pdal_stages.synthetic.townplan import Plan, ground, heights; plan = Plan(1, "
+    "np.ones((2, 4)), 0, np.eye(2)); assert ground(3.0, 40.0, plan)[0] == heights(np.array([[3.0, 40.0]]), plan)"
+)
+
 
 def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
-    code = (
-        "from pdal_stages.base.messages import Progress; Progress.delay = 0.0; "
-        "import numpy as np; from pdal_stages.synthetic.townplan import Plan, ground, heights; plan = Plan(1, "
-        "np.ones((2, 4)), 0, np.eye(2)); assert ground(3.0, 40.0, plan)[0] == heights(np.array([[3.0, 40.0]]), plan)"
-    )
+    code = TWO_KERNELS
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "1"}
 
     def said(code: str = code) -> str:
@@ -31,8 +35,36 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
         index.write_bytes(b"damaged")
     assert "Traceback" not in said("import os; os.environ['PDAL_STAGES_PROGRESS'] = '0'; " + code)
     assert not said()
-    index.parent.chmod(0o777)
-    assert "other users can write to" in said()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="users and modes of Unix")
+def test_code_is_kept_only_where_no_other_user_can_put_any(tmp_path):
+    """The folder of compiled code and all its parents count; elsewhere kernels are compiled in memory."""
+    home = tmp_path / "home"
+    kernels = home / "kernels"
+
+    def run(mode: int = 0o755, owner: int | None = None, folder=home) -> tuple[int, str]:
+        """Return the number of files in the cache and what a job says, with another mode or owner of a folder."""
+        shutil.rmtree(home, ignore_errors=True)
+        kernels.mkdir(parents=True)
+        folder.chmod(mode)
+        if owner is not None:
+            os.chown(folder, owner, -1)
+        env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "link"), "PDAL_STAGES_PROGRESS": "0"}
+        done = subprocess.run(
+            [sys.executable, "-c", TWO_KERNELS], env=env, text=True, capture_output=True
+        )
+        assert done.returncode == 0, done.stderr
+        return len(list(kernels.rglob("*.nbc"))), done.stderr
+
+    (tmp_path / "link").symlink_to(kernels)
+    for mode in (0o700, 0o775, 0o1777):  # one's own, a group's, sticky like /tmp
+        assert run(mode) == (2, "")
+    for count, said in (run(0o777), run(0o777, folder=kernels)):
+        assert not count and said.count("compiled code is not kept") == 1
+    if os.geteuid() == 0:
+        count, said = run(owner=65534)
+        assert not count and f"other users can write to {home}" in said
 
 
 @pytest.mark.pdal

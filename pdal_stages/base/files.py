@@ -69,6 +69,8 @@ def kind_of(path: str | os.PathLike) -> str:
 
 #: The longest file name, in bytes, on common file systems.
 _LONGEST_NAME = 255
+#: The most links that Linux follows one after the other.
+_MOST_LINKS = 40
 
 
 def check_writable(path: str | os.PathLike, what: str = "output", kind: str = "") -> None:
@@ -92,6 +94,7 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         raise StageError(
             f"the {what} file has no name", found=ascii(path), cure="Is a shell variable unset?"
         )
+    _refuse_foreign(path, what)
     if is_stream(path):
         mode = os.stat(path).st_mode
         if not os.access(path, os.W_OK) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
@@ -126,6 +129,71 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     if older and older != kind:
         cure = "Give another name, or remove that file first"
         raise StageError(f"the {what} file would replace {older}", found=str(path), cure=cure)
+
+
+def _trusted() -> set[int]:
+    """Return the users whose files may be code or lead elsewhere: this one, root, and the owner of the whole system."""
+    return {0, os.geteuid(), os.stat("/").st_uid}
+
+
+def _refuse_foreign(path: str | os.PathLike, what: str) -> None:
+    """Refuse a link or pipe that another user has put into a folder that is not his."""
+    at = os.path.abspath(path)
+    for _ in range(_MOST_LINKS if hasattr(os, "geteuid") else 0):
+        if not os.path.lexists(at):
+            return
+        found, folder = os.lstat(at), os.path.dirname(at)
+        if not (stat.S_ISLNK(found.st_mode) or stat.S_ISFIFO(found.st_mode)):
+            return
+        if found.st_uid not in _trusted() | {os.stat(folder).st_uid}:
+            raise StageError(
+                f"the {what} file is a link or pipe of another user",
+                found=at,
+                cure="Give another name",
+            )
+        if stat.S_ISFIFO(found.st_mode):
+            return
+        at = os.path.join(folder, os.readlink(at))
+
+
+def exposed_folder(folder: str) -> str:
+    """Return the first of a real folder and its parents that other users may change; empty if there is none.
+
+    Members of a folder's group are trusted. Of a parent all may write to if it is sticky.
+    """
+    for at in (folder, *map(str, Path(folder).parents)) if hasattr(os, "geteuid") else ():
+        found = os.stat(at)
+        sticky = at != folder and found.st_mode & stat.S_ISVTX
+        if found.st_uid not in _trusted() or (found.st_mode & stat.S_IWOTH and not sticky):
+            return at
+    return ""
+
+
+def make_own_folder(folder: Path) -> None:
+    """Make a folder that its owner alone can enter, or check that an existing one is such a folder.
+
+    It must be like one that is made here now: file systems without users give all files one owner and mode.
+
+    Raises
+    ------
+    StageError
+        For a link, a file, or a folder that is another user's or that others may write to.
+    """
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(0o700)
+        return
+    probe = tempfile.mkdtemp(prefix=PREFIX, dir=folder.parent)
+    like, found = os.stat(probe), os.lstat(folder)
+    os.rmdir(probe)
+    writable = found.st_mode & ~like.st_mode & 0o022
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != like.st_uid or writable:
+        raise StageError(
+            "the run's own folder beside the outputs is a link, a file, another user's or open to others",
+            found=str(folder),
+            cure="Remove it, or write to another folder",
+        )
+    if found.st_mode != like.st_mode:
+        os.chmod(folder, stat.S_IMODE(like.st_mode))
 
 
 def is_stream(path: str | os.PathLike) -> bool:

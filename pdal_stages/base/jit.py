@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import stat
 import sys
 import threading
 from collections.abc import Callable
@@ -20,7 +19,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .errors import DependencyError
-from .messages import Progress
+from .files import exposed_folder
+from .messages import Progress, print_messages
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
@@ -32,6 +32,7 @@ _ERRORS = {"error_model": "numpy"}
 _functions: dict[Any, Callable] = {}
 
 _lock = threading.RLock()
+_told_uncached: set[str] = set()
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -55,20 +56,28 @@ class Kernel:
         with _lock:
             if self._dispatcher is None:
                 numba = _numba()
-                try:
-                    made = numba.njit(**self._options)(self._function)
-                except RuntimeError:  # no folder for the cache can be written
-                    made = numba.njit(**{**self._options, "cache": False})(self._function)
-                file: Any = getattr(getattr(made, "_cache", None), "_cache_file", None)
-                if hasattr(file, "_source_stamp"):
-                    file._source_stamp = "-".join(sorted(_sources(self)))
-                    file.load, file.save = (_careful(file, act) for act in (file.load, file.save))
-                    made._cache.load_overload = partial(
-                        _load, made._cache, made._cache.load_overload
-                    )
-                    _refuse_shared(file._cache_path)
-                self._dispatcher = made
+                self._dispatcher = self._cached(numba) or numba.njit(
+                    **{**self._options, "cache": False}
+                )(self._function)
             return self._dispatcher
+
+    def _cached(self, numba: Any) -> Any:
+        """Return the function with a cache of its code, or None where no folder is safe for that or can be written."""
+        try:
+            made = numba.njit(**self._options)(self._function)
+        except RuntimeError:  # no folder for the cache can be written
+            return None
+        file: Any = getattr(getattr(made, "_cache", None), "_cache_file", None)
+        if hasattr(file, "_source_stamp"):
+            folder = os.path.realpath(file._cache_path)
+            if not Path(folder).is_relative_to(_PACKAGE) and (exposed := exposed_folder(folder)):
+                _tell_uncached(exposed)
+                return None
+            file._cache_path, file._index_path = folder, os.path.join(folder, file._index_name)
+            file._source_stamp = "-".join(sorted(_sources(self)))
+            file.load, file.save = (_careful(file, act) for act in (file.load, file.save))
+            made._cache.load_overload = partial(_load, made._cache, made._cache.load_overload)
+        return made
 
     @property
     def _numba_type_(self) -> Any:
@@ -181,16 +190,13 @@ def _careful(file: Any, act: Callable) -> Callable:
     return done
 
 
-@lru_cache(maxsize=256)
-def _refuse_shared(folder: str) -> None:
-    """Refuse a folder into which other users may put code: numba runs what it finds there."""
-    if not hasattr(os, "geteuid") or Path(folder).is_relative_to(_PACKAGE):
-        return
-    if (found := os.stat(folder)).st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
-        raise DependencyError(
-            "other users can write to the folder of compiled kernels",
-            found=folder,
-            cure="Set NUMBA_CACHE_DIR to a folder of your own, or take write permission from the others",
+def _tell_uncached(folder: str) -> None:
+    """Warn, once in a process, that kernels are compiled at each start because other users could replace their code."""
+    if not _told_uncached:
+        _told_uncached.add(folder)
+        print_messages(
+            f"compiled code is not kept, as other users can write to {folder}: every start compiles again. "
+            "Set NUMBA_CACHE_DIR to a folder of your own"
         )
 
 

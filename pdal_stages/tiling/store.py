@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..base.checks import strict_json
 from ..base.errors import StageError
-from ..base.files import try_lock, whole_files
+from ..base.files import make_own_folder, try_lock, whole_files
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"
@@ -42,23 +42,10 @@ class Store:
     def __enter__(self) -> Store:
         self._new = not self.folder.exists()
         try:
-            for folder in (self.folder, self.kept, self.scratch.parent):
-                with contextlib.suppress(FileExistsError):
-                    folder.mkdir()
-                # Links are not followed.
-                if folder.is_symlink() or not folder.is_dir():
-                    raise StageError(
-                        "the run's own folder beside the outputs is a link or a file",
-                        found=str(folder),
-                        cure="Remove it, or write to another folder",
-                    )
-            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-            lock = os.open(self.folder / "lock", flags, 0o622)
-            # Anyone who can read a lock can hold it, so only those may who can write.
-            if hasattr(os, "fchmod"):
-                writers = os.fstat(lock).st_mode & 0o022
-                with contextlib.suppress(OSError):  # of another user, whose folder this is
-                    os.fchmod(lock, 0o600 | writers | writers << 1)
+            make_own_folder(self.folder)
+            for folder in (self.kept, self.scratch.parent):
+                folder.mkdir(exist_ok=True)
+            lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
             self._lock = os.fdopen(lock, "r+", encoding="utf-8")
             if not try_lock(self._lock):
                 with self._lock:

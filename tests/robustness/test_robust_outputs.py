@@ -13,6 +13,7 @@ import pytest
 from robustness_kit import HAG, job
 
 from pdal_stages import load_model, run_tiled
+from pdal_stages.base.errors import StageError
 
 pytestmark = [
     pytest.mark.pdal,
@@ -196,20 +197,26 @@ def test_files_of_the_same_kind_are_replaced(command, files):
     assert json.loads((files / "m.json").read_text())["metadata"]
 
 
-def test_a_lock_that_only_writers_can_hold(tmp_path, cloud):
-    path, lock = job(tmp_path, cloud, HAG, tmp_path / "o.las"), tmp_path / ".pdal-stages" / "lock"
-    before = os.umask(0o022)
+def test_a_run_works_in_a_folder_of_its_own(tmp_path, cloud):
+    """Only its owner can enter it; one of another user's, or that others may write to, is refused and left alone."""
+    path, own = job(tmp_path, cloud, HAG, tmp_path / "o.las"), tmp_path / ".pdal-stages"
+
+    def run(mode: int, owner: int = -1) -> None:
+        own.chmod(mode)
+        os.chown(own, owner, -1)
+        run_tiled(path, 20, workers=0, progress=False)
+
+    before = os.umask(0)
     try:
-        for mask, older, mode in (
-            (0o022, None, 0o600),
-            (0o002, None, 0o660),
-            (0o002, 0o644, 0o600),
-        ):
-            os.umask(mask)
-            lock.chmod(older) if older else lock.unlink(
-                missing_ok=True
-            )  # of an older release, or a new one
-            run_tiled(path, 20, workers=0, progress=False)
-            assert stat.S_IMODE(lock.stat().st_mode) == mode
+        run_tiled(path, 20, workers=0, progress=False)
+        assert stat.S_IMODE(own.stat().st_mode) == 0o700
+        run(0o755)  # of an older release
+        assert stat.S_IMODE(own.stat().st_mode) == 0o700
+        (own / "kept" / "mine").write_text("mine")
+        cases = [(0o777,), (0o775,)] + [(0o700, 65534)] * (os.geteuid() == 0)
+        for case in cases:
+            with pytest.raises(StageError, match="another user's or open to others"):
+                run(*case)
+            assert (own / "kept" / "mine").read_text() == "mine"
     finally:
         os.umask(before)
