@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -24,7 +25,7 @@ import pdal_stages as ps
 from pdal_stages.classifier.recipes import RECIPES
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.read import apply_overrides, parse_overrides
-from pdal_stages.plugin import answers, building
+from pdal_stages.plugin import answers, building, declarations
 from pdal_stages.stages.base import stage_types
 
 pytestmark = pytest.mark.pdal
@@ -380,6 +381,23 @@ def test_a_plugin_of_another_version():
     (leaf,) = module["out_metadata"]["children"]
     assert leaf["name"] == "pdal_stages_error" and "9.9" in leaf["value"]
     assert "plugin --install" in leaf["value"]
+
+
+def test_the_digest_is_of_what_pdal_sees(monkeypatch):
+    """A help text may be corrected without building the plugin again; names, types and defaults may not."""
+    kind = stage_types()["filters.hag_minima"]
+    options, digest = kind.all_options(), declarations.digest(kind)
+
+    def changed(**how):
+        new = (*options[:1], replace(options[1], **how), *options[2:])
+        monkeypatch.setattr(kind, "all_options", classmethod(lambda cls: new))
+        return declarations.digest(kind)
+
+    assert changed(help="Other words") == digest
+    monkeypatch.setattr(kind, "summary", "Other words")
+    assert changed() == digest
+    different = {changed(name="other"), changed(kind="string"), changed(default=7.5)}
+    assert len(different | {digest}) == 4
 
 
 def test_without_filters_python(plugin, pdal_program, ready_town, tmp_path):

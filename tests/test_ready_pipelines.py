@@ -189,3 +189,65 @@ def test_terrain_and_surface_of_a_survey_show_no_tiles(ready_town, ready_halves,
     inside = np.s_[10:60, 10:60]
     above = (rasters["surface", "files"] - rasters["terrain", "files"])[inside]
     assert above.max() > 4 and np.quantile(above, 0.1) < 1.5
+
+
+# ---- flags of LAS 1.0-1.3, which PDAL before 2.6 reads as parts of the class -----------------------------
+
+
+def flagged(write_las, path, point_format, everywhere=()):
+    """Level ground; half of it are key-points, a third is synthetic; noise 400 m above, also withheld or synthetic."""
+    rng = np.random.default_rng(0)
+    n = 8000
+    x, y = rng.uniform(0, 40, (2, n))
+    arrays = {"X": x + 5e5, "Y": y + 5.4e6, "Z": rng.normal(0, 0.03, n)}
+    arrays["Classification"] = np.full(n, 2, np.uint8)
+    arrays["KeyPoint"] = (x > 20).astype(np.uint8)
+    arrays["Synthetic"] = (np.arange(n) % 3 == 0).astype(np.uint8)
+    arrays["Withheld"] = np.zeros(n, np.uint8)
+    arrays |= {name: np.ones(n, np.uint8) for name in everywhere}
+    noise = slice(0, n, 500)
+    arrays["KeyPoint"][noise] = 0
+    arrays["Withheld"][noise] = np.arange(16) % 2
+    arrays["Z"][noise] = 400.0
+    arrays["Classification"][noise] = np.repeat([7, 18], 8)
+    arrays["HeightAboveGround"] = arrays["Z"].copy()
+    return write_las(path, arrays, point_format=point_format)
+
+
+def raster(path):
+    reading = Pipeline([{"type": "readers.gdal", "filename": str(path), "header": "Z"}])
+    reading.execute()
+    return reading.arrays[0]["Z"]
+
+
+@pytest.mark.parametrize("program", ["pdal", "pdal-stages"])
+@pytest.mark.parametrize("everywhere", [(), ("Synthetic",)])
+def test_rasters_of_points_with_flags(tmp_path, write_las, pdal_program, program, everywhere):
+    made = []
+    for point_format in (1, 6):
+        source = flagged(write_las, tmp_path / f"{point_format}.las", point_format, everywhere)
+        words = [f"--stage.input.filename={source}"]
+        for model in ("surface", "terrain"):
+            words.append(f"--stage.{model}.filename={tmp_path / f'{model}{point_format}.tif'}")
+        if program == "pdal":
+            command = [pdal_program, "pipeline", FOLDER / "terrain-and-surface.json", *words]
+            subprocess.run(command, check=True, capture_output=True)
+        else:
+            run("terrain-and-surface", *words)
+        made += [raster(tmp_path / f"{kind}{point_format}.tif") for kind in ("surface", "terrain")]
+    for old, new in zip(made[:2], made[2:], strict=True):
+        assert len(old) in range(39**2, 42**2) and np.array_equal(old, new)
+        assert np.abs(old[old != -9999]).max() < 1
+
+
+@pytest.mark.parametrize("name", ["classify-on-smrf-ground", "classify-regularized"])
+def test_flags_stay_as_the_docs_say(tmp_path, write_las, ready_models, name):
+    source = flagged(write_las, tmp_path / "in.las", 1)
+    model = ready_models / ("smrf.model" if "smrf" in name else "classes.model")
+    words = [f"--stage.input.filename={source}", f"--stage.classifier.model={model}"]
+    words += [f"--stage.output.{k}={v}" for k, v in (("minor_version", 4), ("dataformat_id", 6))]
+    run(name, *words, f"--stage.output.filename={tmp_path / 'o.las'}")
+    before, after = laspy.read(source), laspy.read(tmp_path / "o.las")
+    for flag in ("key_point", "synthetic", "withheld"):
+        assert np.array_equal(before[flag], after[flag]), flag
+    assert (np.asarray(after.classification) == 2).mean() > 0.95

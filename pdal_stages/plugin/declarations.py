@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 
 from ..base.version import __version__
 from ..pipeline.expansion import SPLITS
@@ -40,18 +41,25 @@ def header() -> str:
 
 
 def digest(kind: type[Stage]) -> str:
-    """Changes with any option, default or help of a stage that the plugin holds."""
-    return hashlib.sha256(f"{kind.type} {kind.summary}{_options(kind)}".encode()).hexdigest()[:16]
+    """Return a digest of what PDAL sees of a stage: names, types and defaults of its options, not their help."""
+    gathers = bool(kind.instead_of_tiles)
+    held = f"{kind.type} {gathers} {[fields[:-1] for fields in _fields(kind)]}"
+    return hashlib.sha256(held.encode()).hexdigest()[:16]
 
 
 def _options(kind: type[Stage]) -> str:
-    lines = [""]
+    lines = [f"    {{ {', '.join(fields)} }}," for fields in _fields(kind)]
+    return "\n".join(["", *lines, ""])
+
+
+def _fields(kind: type[Stage]) -> Iterator[list[str]]:
+    """Yield the fields of each option, as C++ text; the help is the last one."""
     for option in kind.all_options():
         if option.name == "where" and kind.type.startswith("filters."):
             continue  # PDAL's filters have it by themselves, writers of older PDAL not
         text = option.typed_default
         as_number = text and option.kind in ("number", "integer", "boolean")
-        fields = [
+        yield [
             json.dumps(option.name),
             f"Kind::{_KINDS.get(option.kind, 'Text')}",
             str(bool(text)).lower(),
@@ -59,8 +67,6 @@ def _options(kind: type[Stage]) -> str:
             json.dumps("" if as_number else text),
             json.dumps(_help(option)),
         ]
-        lines.append(f"    {{ {', '.join(fields)} }},")
-    return "\n".join([*lines, ""])
 
 
 def _help(option: Option) -> str:

@@ -22,13 +22,13 @@ def reader(source):
 
 
 def plain_classes(source):
-    """What takes the flags of LAS 1.0 to 1.3 off the classes, with which PDAL before 2.6 reads them; rasters have none."""
+    """Return the filter that takes the flags of point formats 0 to 5 off the classes, as PDAL before 2.6 reads them."""
     try:
         with open(source, "rb") as file:
-            head = file.read(26)
+            head = file.read(105)
     except OSError:
         return []  # told by whoever reads it
-    if head[:4] != b"LASF" or head[25] >= 4:
+    if head[:4] != b"LASF" or len(head) < 105 or head[104] & 63 > 5:  # the point format
         return []
     return [{"type": "filters.python", "module": "classes", "function": "plain", "source": _PLAIN}]
 
