@@ -201,7 +201,7 @@ QUICK_RECIPES = {
 }
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("recipe", QUICK_RECIPES)
 def test_the_papers_pipelines_train_and_apply(pipeline, ready_town, tmp_path, recipe):
     """Each recipe's ready pipeline through stock `pdal`, and the model it trains applied by it."""
     if recipe == "winiwarter2019" and importlib.util.find_spec("torch") is None:

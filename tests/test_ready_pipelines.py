@@ -34,7 +34,7 @@ def test_none_is_forgotten():
         "noise", "normalize", "features", "features-for-viewers", "train", "train-binary", "classify",
         "classify-with-rejection", "evaluate", "train-on-smrf-ground", "classify-on-smrf-ground", "tiles-to-tiles",
         "copc-to-tiles", "tile-index-to-tiles", "raw-to-footprints", "terrain-and-surface",
-        "classify-regularized", *(f"paper-{recipe}" for recipe in RECIPES),
+        "classify-regularized", *(f"paper-{recipe}" for recipe in RECIPES if recipe != "mobile"),
     }  # fmt: skip
     assert {f.stem for f in FILES} == tested
     listed = (FOLDER.parent / "docs" / "how-to.md").read_text()

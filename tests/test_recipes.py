@@ -51,7 +51,7 @@ def test_the_networks_recipe():
     assert merged == {**stage.alsnet, "epochs": 2}
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("name", [*RECIPES])
 def test_what_is_given_beside_a_recipe_replaces_its_value(name):
     given = {"type": "writers.classifiermodel", "filename": "a.model", "recipe": name, "target": 6}
     if "binary" not in name:

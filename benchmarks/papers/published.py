@@ -1,4 +1,4 @@
-"""What the four papers publish, as numbers, and what follows from them: makes docs/papers/published.md.
+"""What the four papers publish, as numbers, what follows from them, and ours beside: makes docs/papers/published.md.
 
     python benchmarks/papers/published.py > docs/papers/published.md
     python benchmarks/papers/published.py --ours vaihingen-accuracy.json
@@ -203,6 +203,72 @@ W18_BINARY = {
 }
 
 
+#: Where our results of the papers' experiments are, made by the commands of docs/papers.md.
+OURS = Path(__file__).resolve().parents[2] / "docs" / "papers"
+SCENES = ("delft", "montpellier")
+MEASURES = {
+    "Kappa": "kappa",
+    "Overall accuracy": "oa",
+    "Mean class recall": "mcr",
+    "Mean class precision": "mcp",
+}
+SETS = ("measures", "distributions", "both")
+RADII = ("c1", "c2", "c3", "c5")
+
+
+def our_runs(paper: str, scene: str) -> list[dict[str, Any]]:
+    """Return our finished runs of a paper's experiments on a scene."""
+    runs: list[dict[str, Any]] = json.loads((OURS / f"{paper}-{scene}.json").read_text())["runs"]
+    return runs
+
+
+def our_mean(scene: str, hood: str, features: str, *keys: str) -> float:
+    """Return the mean over seeds of one of our [B16] figures."""
+    found = []
+    for run in our_runs("b16", scene):
+        if (run["neighborhood"], run["set"]) == (hood, features):
+            value: Any = run
+            for key in keys:
+                value = value[key]
+            found.append(value)
+    return float(np.mean(found))
+
+
+def b16_ours(measure: str, scene: str) -> str:
+    """Return our half of a table of [B16]."""
+    rows = [
+        [hood, *(f"{our_mean(scene, hood, one, MEASURES[measure]):.2f}" for one in SETS)]
+        for hood in B16_ROWS
+    ]
+    return table(["Neighborhood", *SETS], rows)
+
+
+def f1_over_radii(scene: str) -> str:
+    """Return our F1 of each class over the radius of a cylinder, both feature sets [B16 5]."""
+    classes = list(our_runs("b16", scene)[0]["f1"])
+    rows = [
+        [hood, *(f"{our_mean(scene, hood, 'both', 'f1', one):.1f}" for one in classes)]
+        for hood in RADII
+    ]
+    return table(["Cylinder", *(f"class {one}" for one in classes)], rows)
+
+
+def w18_ours() -> list[str]:
+    """Return our figures and confusion matrices of [W18]'s multi-class runs, all features, first seed."""
+    rows, matrices = [], []
+    for scene in SCENES:
+        for run in our_runs("w18", scene):
+            if run["kind"] == "all" and run["target"] is None and run["seed"] == 0:
+                name = f"{scene.capitalize()}, {run['count']:,} per class"
+                rows.append([name, *(f"{run[key]:.2f}" for key in ("oa", "kappa", "mf1"))])
+                cells = [
+                    [str(code), *(f"{n:,}" for n in line)]
+                    for code, line in zip(run["classes"], run["matrix"], strict=True)
+                ]
+                matrices += [name, table(["Reference", *map(str, run["classes"])], cells)]
+    return [table(["Ours", "OA", "Kappa", "Mean F1"], rows), *matrices]
+
+
 def figures(matrix) -> dict[str, np.ndarray | float]:
     """Overall accuracy, kappa, recall, precision and F1 (per cent) of a confusion matrix, reference in rows."""
     m = np.asarray(matrix, float)
@@ -346,6 +412,11 @@ def page() -> str:
         parts.append(f"## [B16] Table {number}: {measure.lower()}")
         for first, scene in ((0, "GML A"), (3, "GML B")):
             parts += [scene, b16(measure, first)]
+        for ours in SCENES:
+            parts += [f"Ours, {ours.capitalize()}", b16_ours(measure, ours)]
+    parts.append("## [B16] Section 5: F1 by class over the radius, ours")
+    for ours in SCENES:
+        parts += [ours.capitalize(), f1_over_radii(ours)]
     parts.append("## [B16] Tables 6 and 7: classes")
     worst = max(
         float(
@@ -373,6 +444,8 @@ def page() -> str:
         confusion(W18),
         "[WM19], Fig. 9",
         confusion(WM19),
+        "## [W18], ours: multi-class on our scenes",
+        *w18_ours(),
         "## [W18] Table 2: binary, 100,000 samples per class",
         table(
             [
