@@ -22,7 +22,6 @@ import pytest
 from processes import ended
 
 import pdal_stages as ps
-from pdal_stages.classifier.recipes import RECIPES
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.read import apply_overrides, parse_overrides
 from pdal_stages.plugin import answers, building, declarations
