@@ -18,7 +18,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import PipelineError, StageError
+from .errors import StageError
 
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
@@ -140,6 +140,13 @@ def holds_flags(path: str | os.PathLike) -> bool:
     return header is not None and header.point_format <= 5
 
 
+def source_id(path: str | os.PathLike) -> int:
+    """Return the file source id of a LAS file, which LAS 1.0 has not."""
+    with open(path, "rb") as file:
+        head = file.read(26)
+    return int.from_bytes(head[4:6], "little") if head[25:] > b"\0" else 0
+
+
 class Record(NamedTuple):
     """A variable-length record: the offsets of its head and data, its user id, and whether it stands `after` the points."""
 
@@ -193,6 +200,19 @@ def records_of(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, b
                 yield record, file.read(record.length)
 
 
+def laszip_record(file: BinaryIO, header: LasHeader) -> bytes:
+    """Return the record of how a LAZ file is compressed; empty where it has none."""
+    for record in records(file, header):
+        if (record.user, record.number) == (b"laszip encoded", 22204):
+            file.seek(record.data)
+            return file.read(min(record.length, LARGEST_RECORD))
+    return b""
+
+
+#: How the record begins where points are compressed one by one, without chunks and a table of them (LASzip 1).
+POINTWISE = b"\1\0"
+
+
 def supersede_copc(path: str | os.PathLike) -> None:
     """Mark COPC records that do not describe this file; PDAL forwards them from a COPC input like any other.
 
@@ -213,30 +233,6 @@ def supersede_copc(path: str | os.PathLike) -> None:
         for record, _ in copc:
             file.seek(record.place + 2)
             file.write(b"LASF_Spec".ljust(16, b"\0") + struct.pack("<H", 7))
-
-
-def check_texts(path: str | os.PathLike) -> None:
-    """Refuse a file with a text in its header or in a record's head that is not UTF-8; PipelineError."""
-    header = read_header(path)
-    if header is None:
-        return
-    with open(path, "rb") as file:
-        head = file.read(90)
-        texts = [
-            ("system identifier", _text(head[26:58])),
-            ("generating software", _text(head[58:])),
-        ]
-        for record in islice(records(file, header), min(header.records, 1000)):
-            texts += [("description of a record", record.title), ("user of a record", record.user)]
-    for what, text in texts:
-        try:
-            text.decode()
-        except UnicodeDecodeError:
-            what = (
-                f"the {what} in the LAS file is not UTF-8, which PDAL's filters.python cannot take"
-            )
-            cure = f"Rewrite the file first: pdal translate {path} clean.laz"
-            raise PipelineError(what, where=str(path), found=str(text)[1:], cure=cure) from None
 
 
 def projection(path: str | os.PathLike) -> str:
@@ -264,42 +260,6 @@ def geotiff_code(path: str | os.PathLike) -> str:
     across, upward = keys.get(3072) or keys.get(2048, 0), keys.get(4096, 0)
     height = f"+{upward}" * (0 < upward < 32767)  # which stands for a user's own
     return f"EPSG:{across}{height}" if 0 < across < 32767 else ""
-
-
-#: PDAL's names of the types of extra dimensions, by number, 1 to 10 (LAS 1.4 R15, table 24).
-_TYPES = (
-    "uint8",
-    "int8",
-    "uint16",
-    "int16",
-    "uint32",
-    "int32",
-    "uint64",
-    "int64",
-    "float",
-    "double",
-)
-
-
-def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
-    """The extra dimensions of a LAS file: name -> the type PDAL holds it in. Empty where there are none.
-
-    Scaled ones are ``double``; those that are not valid numbers are left out.
-    """
-    found: dict[str, str] = {}
-    try:
-        described = [data for record, data in records_of(path, b"LASF_Spec") if record.number == 4]
-    except (OSError, ValueError):
-        return found
-    data = described[0] if described else b""  # PDAL passes over later ones
-    for start in range(0, len(data) - 191, 192):
-        kind, options = data[start + 2], data[start + 3]
-        name = _text(data[start + 4 : start + 36]).decode("utf-8", "replace")
-        if name and 1 <= kind <= len(_TYPES):
-            found[name] = (
-                "double" if options & 0x18 else _TYPES[kind - 1]
-            )  # with a scale or an offset
-    return found
 
 
 def number_type(kind: str) -> np.dtype:

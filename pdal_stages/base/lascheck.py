@@ -15,8 +15,17 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from .errors import StageError
+from .extrabytes import description, fields_of
 from .files import disk_is_full
-from .las import LARGEST_RECORD, POINT_BYTES, WAVES, LasHeader, read_header, records
+from .las import (
+    POINT_BYTES,
+    POINTWISE,
+    WAVES,
+    LasHeader,
+    laszip_record,
+    read_header,
+    records,
+)
 
 #: What to do about a damaged file.
 DAMAGED = "Get the file again from its source, or repair it with a tool made for that (e.g. lasinfo -repair)"
@@ -30,6 +39,9 @@ _HEADER_BYTES = (227, 227, 227, 235, 375, 375)
 _MOST_CHUNKS = 200_000
 #: Most points of a chunk, since lazrs allocates memory for all of them; 50,000 are usual.
 _LARGEST_CHUNK = 2**24
+
+#: Points that are decoded at a time.
+_DECODED = 50_000
 
 #: What is wrong, and what was found.
 Wrong = tuple[str, str]
@@ -55,8 +67,11 @@ def check_readable(path: str | os.PathLike) -> str | None:
             wrong = wrong or (_wrong_chunks if header.compressed else _wrong_count)(
                 file, header, size
             )
+        fields = [] if wrong else fields_of(header, description(path))[0]
     except OSError as error:
         raise StageError("the file cannot be read", where=where, found=error) from None
+    except StageError as error:
+        raise error.at(where) from None
     if wrong:
         raise StageError(
             f"the LAS file is damaged: {wrong[0]}", where=where, found=wrong[1], cure=DAMAGED
@@ -79,6 +94,11 @@ def check_readable(path: str | os.PathLike) -> str | None:
         return (
             f"{path}: the bounding box in its header is all zeros, as when a program was stopped while writing it; check "
             "that the points lie where they should"
+        )
+    if clashing := [f"{one.title} as {one.name}" for one in fields if one.clashes]:
+        return (
+            f"{path}: extra bytes named like dimensions of LAS are read and written under other names: "
+            + ", ".join(clashing)
         )
     return None
 
@@ -243,6 +263,9 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
 
     Layout: "LAZ specification 1.4", chunk table.
     """
+    coding = laszip_record(file, header)
+    if header.count and coding.startswith(POINTWISE):
+        return _wrong_stream(file, header, coding)
     file.seek(header.offset)
     place = file.read(8)
     if place == b"\xff" * 8:  # a stream that could not be rewound has it at its end
@@ -257,12 +280,6 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
         return _none_counted(end - begin) if end > begin else None
     if not inside:
         return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"
-    coding = b""
-    for record in records(file, header):
-        if (record.user, record.number) == (b"laszip encoded", 22204):
-            file.seek(record.data)
-            coding = file.read(min(record.length, LARGEST_RECORD))
-            break
     if len(coding) < 16:
         return "it has no record of how it is compressed", "no 'laszip encoded' among its records"
     (of_chunk,) = struct.unpack_from("<I", coding, 12)
@@ -300,6 +317,23 @@ def _wrong_chunks(file: BinaryIO, header: LasHeader, size: int) -> Wrong | None:
             "its header counts a different number of points than it holds",
             f"{header.count:,} counted, {held:,} held",
         )
+    return None
+
+
+def _wrong_stream(file: BinaryIO, header: LasHeader, coding: bytes) -> Wrong | None:
+    """Return what is wrong with points that are compressed one by one: without a table, only decoding them tells."""
+    import lazrs
+
+    file.seek(header.offset)
+    left, buffer = header.count, bytearray(_DECODED * header.point_bytes)
+    try:
+        stream = lazrs.LasZipDecompressor(file, coding)
+        while left:
+            number = min(left, _DECODED)
+            stream.decompress_many(memoryview(buffer)[: number * header.point_bytes])
+            left -= number
+    except (lazrs.LazrsError, OSError) as error:
+        return "it is cut short, or its points cannot be decoded", str(error)
     return None
 
 

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import ModelError, OptionError, suggest
+from ..base.extrabytes import extra_dimensions
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation
 from ..stages.base import stage_from, stage_types
 from ..stages.points import SELECTED
-from .inputs_outputs import overridden, reader_of, writer_of
+from .inputs_outputs import is_las, overridden, reader_of, writer_of
 from .las_output import extra_dims_option
 from .read import Override
 from .run import Pipeline
@@ -24,6 +25,13 @@ _GROUND = "filters.hag_morphological"
 
 #: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
+
+#: How the names begin of dimensions that hold what the input has, while stages make others of the same names.
+_KEPT = "PdalStagesKept"
+
+
+def _ferry(pairs: list[str]) -> list[dict[str, Any]]:
+    return [{"type": "filters.ferry", "dimensions": ",".join(pairs)}] if pairs else []
 
 
 @dataclass(frozen=True)
@@ -134,8 +142,8 @@ class ClassifyRequest:
         return stages
 
     @cached_property
-    def extra_dims(self) -> dict[str, str]:
-        """The dimensions that are written besides the input's own: name -> PDAL type."""
+    def _creates(self) -> dict[str, str]:
+        """The dimensions that the stages make, except classes: name -> PDAL type."""
         made: dict[str, str] = {}
         for stage in self.stages:
             if stage["type"] in preparation.OF_PDAL:
@@ -144,6 +152,12 @@ class ClassifyRequest:
                 made |= stage_from(overridden(stage, self.overrides)).creates()
         for name in ("Classification", SELECTED):
             made.pop(name, None)
+        return made
+
+    @cached_property
+    def extra_dims(self) -> dict[str, str]:
+        """The dimensions that are written besides the input's own: name -> PDAL type."""
+        made = self._creates
         for name in self.dimensions:
             if name not in ("all", "none", *made) and self.dimensions != WRITTEN:
                 raise OptionError(
@@ -173,4 +187,10 @@ class ClassifyRequest:
                 found=target,
                 cure="Leave it out, or write a pipeline",
             )
-        return Pipeline([reader_of(source, "input"), *self.stages, writer], self.overrides)
+        # What stages make on the way must not replace what the input has under the same name.
+        own = extra_dimensions(source) if is_las(source) else {}
+        kept = [name for name in own if name in self._creates and name not in self.extra_dims]
+        keep = _ferry([f"{name}=>{_KEPT}{name}" for name in kept])
+        put_back = _ferry([f"{_KEPT}{name}=>{name}" for name in kept])
+        stages = [reader_of(source, "input"), *keep, *self.stages, *put_back, writer]
+        return Pipeline(stages, self.overrides)

@@ -7,16 +7,16 @@ become one of class 130.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..base.corrected import restore_texts
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
+from ..base.extrabytes import MOST_ENTRIES, extra_dimensions, restore_titles
 from ..base.las import (
     LEGACY_LIMIT,
     LasHeader,
-    extra_dimensions,
     header_there,
     named_copc,
     named_las,
@@ -27,8 +27,6 @@ from . import pdal as pdal_env
 from .runtime import ExpandedStage, python_filter
 from .stagefiles import is_reader, is_writer, reader_files, writes_las
 
-#: A variable-length record of LAS holds 65,535 bytes; the description of an extra dimension takes 192.
-_MOST_EXTRA = 65_535 // 192
 _AS_LAS_14 = '"minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)'
 
 
@@ -64,9 +62,29 @@ def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
         if not named_las(source):
             return "all"
         own |= extra_dimensions(source)
-    if not all(re.fullmatch(r"[A-Za-z_]\w*", name) for name in own):
-        return "all"
     return ",".join(f"{name}={kind}" for name, kind in {**own, **made}.items())
+
+
+#: How the message begins that a run replaces dimensions of its inputs.
+REPLACED = "dimensions of the input get new values:"
+
+
+def replaced(sources: Iterable[str], made: Iterable[str]) -> list[str]:
+    """Return a message on extra dimensions of LAS files that stages make anew, such as those of an earlier run."""
+    own = dict.fromkeys(name for source in sources for name in extra_dimensions(source))
+    names = [name for name in own if name in set(made)]
+    if not names:
+        return []
+    return [f"{REPLACED} {', '.join(names)}. To keep the old ones, rename them first"]
+
+
+def finish(made: Path, sources: Iterable[str]) -> None:
+    """Correct in an output what PDAL forwards wrongly of the LAS files it was made from; others stay as they are."""
+    supersede_copc(made)
+    if named_las(made):
+        sources = list(sources)
+        restore_titles(made, sources)
+        restore_texts(made, sources)
 
 
 # ---- limits, checked before any work -------------------------------------------------------------
@@ -84,9 +102,9 @@ def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage])
                     raise OptionError(
                         limit[0], where=stage.place, found=f"code {largest}", cure=limit[1]
                     )
-            if extra > _MOST_EXTRA and str(writer.get("extra_dims", "")).strip() == "all":
+            if extra > MOST_ENTRIES and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
-                    f"LAS cannot hold so many extra dimensions: one record describes {_MOST_EXTRA} of them",
+                    f"LAS cannot hold so many extra dimensions: one record describes {MOST_ENTRIES} of them",
                     where=stage.place,
                     found=f"{extra} features",
                     cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "

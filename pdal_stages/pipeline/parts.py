@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.corrected import corrected
 from ..base.errors import StageError
-from ..base.las import named_las, read_header
+from ..base.las import POINTWISE, laszip_record, named_las, read_header
 from . import pdal as pdal_env
 from .inputs_outputs import reader_of
 
@@ -68,7 +69,7 @@ def las_chunks(
         more["decompression_selection"] = wanted
     at, what = start, "the input cannot be read"
     try:
-        with laspy.open(path, **more) as reader:
+        with opened(path, **more) as reader:
             end, what = (
                 int(reader.header.point_count) if end is None else end,
                 "the input is damaged",
@@ -91,12 +92,27 @@ def las_chunks(
         raise StageError("the input is cut short", where=path, found=f"{at:,} of {end:,} points")
 
 
+def opened(path: str, **more: Any) -> Any:
+    """Open a LAS or LAZ file with laspy, corrected where PDAL reads a corrected copy of it.
+
+    Points that were compressed one by one are not decompressed in parallel.
+    """
+    import laspy
+
+    header = read_header(path)
+    with open(path, "rb") as file:
+        coding = laszip_record(file, header) if header and header.compressed else b""
+    if coding.startswith(POINTWISE):
+        more["laz_backend"] = laspy.LazBackend.Lazrs
+    return laspy.open(corrected(path) or path, **more)
+
+
 def header_of(path: str) -> Any:
     """The header of a file with its records, except those of COPC, which do not fit points in another order."""
     import laspy
 
     try:
-        with laspy.open(path) as reader:
+        with opened(path) as reader:
             header = reader.header
         header.point_format.dtype()  # of extra bytes that no array can hold
         if header.version.minor == 0:  # which laspy does not write, and PDAL writes as LAS 1.2

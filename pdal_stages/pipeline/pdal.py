@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import logging
@@ -11,17 +12,20 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from types import CodeType, FrameType
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
+from ..base.corrected import LARGEST_HEAD, corrected
 from ..base.errors import DependencyError, PipelineError
-from ..base.las import check_texts, geotiff_code
+from ..base.extrabytes import overwritten
+from ..base.las import geotiff_code, read_header, source_id
 from ..base.lascheck import DAMAGED, check_readable
-from .stagefiles import reader_files, readers_files
+from .stagefiles import reader_files, readers_files, writers_outputs
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "
@@ -115,8 +119,64 @@ def execute(
     """
     for path in readers_files(stages, las=True):
         check_readable(path)  # newer PDAL crashes of a LAZ file that is cut short
-    with _one_run:
-        return _execute(stages, arrays, loglevel)
+    with _one_run, readable(stages) as copies:
+        return _execute(copies, arrays, loglevel)
+
+
+@contextlib.contextmanager
+def readable(stages: list[dict[str, Any]], points: bool = True) -> Iterator[list[dict[str, Any]]]:
+    """Give the stages with readers of copies in place of LAS files that PDAL cannot read as they are.
+
+    See :mod:`..base.corrected`. The copies lie beside what is written, and are removed on leaving. Without `points`
+    they hold what stands before the points.
+    """
+    beside = [os.path.dirname(output.path) for output in writers_outputs(stages)][:1]
+    with contextlib.ExitStack() as stack:
+        made: list[dict[str, Any]] = []
+        for stage in stages:
+            paths = reader_files(stage, las=True)
+            extra = not stage.keys() & {"extra_dims", "ignore_vlr"}
+            asked = str(stage.get("use_eb_vlr", "")).lower() == "true"
+            streams = [corrected(path, extra and (asked or _is_las_14(path))) for path in paths]
+            if any(streams):
+                folder = tempfile.TemporaryDirectory(
+                    prefix=".pdal-stages-input-", dir=next(filter(os.path.isdir, beside), None)
+                )
+                most = None if points else LARGEST_HEAD
+                name = _copied(stack.enter_context(folder), paths, streams, most)
+                stage = {**stage, "filename": name}
+            made.append(stage)
+        yield made
+
+
+def _is_las_14(path: str) -> bool:
+    header = read_header(path)
+    return header is not None and header.minor >= 4
+
+
+def _copied(
+    folder: str, paths: list[str], streams: Sequence[BinaryIO | None], most: int | None
+) -> str:
+    """Copy corrected files into a folder, with links to the others; return the name or pattern of all of them.
+
+    Of each file, `most` bytes are copied, and the rest is a hole.
+    """
+    names = [os.path.join(folder, f"{n:06}{_suffix(path)}") for n, path in enumerate(paths)]
+    for name, path, stream in zip(names, paths, streams, strict=True):
+        if stream is None:
+            os.symlink(os.path.abspath(path), name)
+            continue
+        with stream, open(name, "xb") as copy:
+            if most is None:
+                shutil.copyfileobj(stream, copy, 1 << 20)
+            else:
+                copy.write(stream.read(most))
+                copy.truncate(stream.seek(0, os.SEEK_END))
+    return names[0] if len(names) == 1 else os.path.join(folder, "*")
+
+
+def _suffix(path: str) -> str:
+    return ".laz" if path.lower().endswith("z") else ".las"
 
 
 #: PDAL puts its log in the place of sys.stdout while it runs and puts back what it found there, which in two threads is the
@@ -146,8 +206,6 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
                 found=str(error).strip(),
                 cure=DAMAGED,
             ) from None
-        for path in readers_files(stages, las=True) if _NOT_UTF8.search(str(error)) else ():
-            check_texts(path)
         raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
     except MemoryError:
         cure = "Work in tiles (--tile), or read less, e.g. with filters.crop"
@@ -166,10 +224,9 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
 
 
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
-_NOT_UTF8 = re.compile(
-    r"returned a result with an exception set|UnicodeDecodeError|codec can't decode"
-)
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
+BROKEN_REFERENCE = "the spatial reference in the file cannot be read"
+REFERENCE_CURE = 'Name the right one, --readers.las.override_srs=EPSG:CODE (in a pipeline "override_srs" of the reader)'
 #: How PDAL begins a line of its log; some stages say their name once more.
 _BY_PROGRAM = re.compile(
     r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE
@@ -229,8 +286,9 @@ def typed(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> l
 
 def validate(stages: list[dict[str, Any]]) -> None:
     """Let the program `pdal` check stages and their options, without reading points."""
-    text = json.dumps({"pipeline": adapted(stages)})
-    done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
+    with readable(stages, points=False) as copies:
+        text = json.dumps({"pipeline": adapted(copies)})
+        done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
     try:
         verdict = json.loads(done.stdout)
     except ValueError:
@@ -255,6 +313,8 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
             found=text.splitlines()[-1],
             cure="Install pdal_stages into the Python that the plugin of filters.python was built for",
         )
+    if "convert spatial reference" in text:
+        return PipelineError(BROKEN_REFERENCE, found=_one_line(text, before), cure=REFERENCE_CURE)
     if (
         "Traceback (most recent call last)" in text
     ):  # of a script, as the pieces of a list in older PDAL
@@ -262,9 +322,13 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         place = [line for line in lines if line.startswith("File ")][-1:]
         last = [line for line in lines if line][-1]
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
-    # On one line: what PDAL says quotes names of files, which may hold line breaks.
+    return PipelineError("PDAL could not run the pipeline", found=_one_line(text, before))
+
+
+def _one_line(text: str, before: Sequence[str]) -> str:
+    """What PDAL says, which quotes names of files that may hold line breaks, and log lines before it."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return PipelineError("PDAL could not run the pipeline", found="; ".join([*lines, *before]))
+    return "; ".join([*lines, *before])
 
 
 def _log(pipeline) -> str:
@@ -342,10 +406,10 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if version() >= (2, 4, 0):
         return stages
     out: list[Any] = []
-    for stage in stages:
+    for number, stage in enumerate(stages):
         kind = stage["type"]
-        if kind == "writers.las" and "forward" not in stage:
-            stage = {"filesource_id": 0, **stage}
+        if kind == "writers.las":
+            stage = {"filesource_id": _file_source(stage, stages[:number]), **stage}
         elif kind == "writers.ogr":
             stage = {"measure_dim": "Z", **stage}
         elif kind == "readers.copc":
@@ -366,6 +430,14 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 stage = {"default_srs": codes.pop(), **stage}
         out.append(stage)
     return out
+
+
+def _file_source(writer: dict[str, Any], before: list[dict[str, Any]]) -> int:
+    """The file source id that a writer forwards, 0 where it forwards none: inputs differ, or are of LAS 1.0."""
+    forward = str(writer.get("forward", ""))
+    forwards = any(word in forward for word in ("all", "header", "filesource_id"))
+    ids = {source_id(path) for path in readers_files(before, las=True)} if forwards else set()
+    return ids.pop() if len(ids) == 1 else 0
 
 
 #: Options of readers.copc that choose points, and those that only make it faster.
@@ -418,6 +490,19 @@ def overlap_as_flag(dimensions, metadata: Any) -> bool:
 def _point_formats(metadata: Any) -> list[int]:
     """Return the point data record formats of the files that were read, from PDAL's metadata."""
     return [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
+
+
+def overwritten_dimensions(metadata: Any) -> list[str]:
+    """Names of dimensions that a reader has overwritten with extra bytes, from metadata as filters.python has it."""
+    nodes = metadata.get("children", []) if isinstance(metadata, dict) else []
+    own = {node["name"]: node["value"] for node in nodes if isinstance(node, dict)}
+    found = [name for node in nodes for name in overwritten_dimensions(node)]
+    for node in nodes if str(own.get("dataformat_id", "")).isdigit() else ():
+        record = {child["name"]: child["value"] for child in node.get("children", [])}
+        if (record.get("user_id"), str(record.get("record_id"))) == ("LASF_Spec", "4"):
+            data = base64.b64decode(record.get("data", ""))
+            found += overwritten(int(own["dataformat_id"]), data)
+    return found
 
 
 def _values(node: Any, name: str) -> list[Any]:

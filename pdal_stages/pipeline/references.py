@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..base.errors import StageError
+from ..base.errors import PipelineError, StageError
 from ..base.las import header_there, named_las, projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from . import pdal as pdal_env
@@ -45,10 +45,20 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
 
     The reader should be restricted to as few points as possible.
     """
-    said = pdal_env.execute([dict(reader)], arrays=False).metadata.get("metadata", {})
+    # Without extra bytes: of a file with odd ones, all of it would be copied for a single point.
+    plain = {"ignore_vlr": "LASF_Spec/4"} if reader["type"] == "readers.las" else {}
+    run = pdal_env.execute([plain | dict(reader)], arrays=False)
+    said = run.metadata.get("metadata", {})
     node: Any = next((node for kind, node in said.items() if kind.startswith("readers.")), {})
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
     wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
+    if not wkt and "GDAL failure" in run.log:
+        raise PipelineError(
+            pdal_env.BROKEN_REFERENCE,
+            where=str(reader["filename"]),
+            found=pdal_env.log_lines(run.log)[-1],
+            cure=pdal_env.REFERENCE_CURE,
+        )
     try:
         header = header_there(str(reader["filename"]))
         count, (x0, y0, x1, y1) = (

@@ -13,7 +13,7 @@ from typing import Any
 
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
-from ..base.las import refuse_pipe, supersede_copc
+from ..base.las import refuse_pipe
 from ..base.lascheck import check_complete, check_readable
 from ..base.messages import Report
 from ..stages.base import stage_types
@@ -191,13 +191,14 @@ class Pipeline:
         self.check_outputs()
         stages = self.expanded.stages
         outputs = [output.path for output in writers_outputs(stages)]
+        sources = readers_files(stages, las=True)
         writers = list(filter(is_writer, stages))
         alone = len(writers) == 1 and writers[0] is stages[-1] and "where" not in writers[0]
 
         def finish(made: Path, final: Path, number: int) -> None:
             count = result.count if alone and "#" not in outputs[0] else None
             check_complete(made, final, writers[number], count)
-            supersede_copc(made)
+            las_output.finish(made, sources)
 
         runtime.remember_stdout()
         for ours in self.expanded.ours:
@@ -250,6 +251,10 @@ class Pipeline:
         odd = (check_readable(path) for path in readers_files(self.expanded.stages, las=True))
         self.warnings = [*self.expanded.warnings, *filter(None, odd)]
         check_octrees(self.expanded.stages)
+        creates = {name for ours in self.expanded.ours for name in ours.stage.creates()}
+        put_back = " ".join(str(s["dimensions"]) for s in stages if s["type"] == "filters.ferry")
+        creates = {name for name in creates if f"=>{name}" not in put_back}
+        self.warnings += las_output.replaced(readers_files(stages, las=True), creates)
         units = [ours.stage.horizontal_unit for ours in self.expanded.ours]
         if units:
             self.warnings += check_readers(self.expanded.stages, next(filter(None, units), ""))

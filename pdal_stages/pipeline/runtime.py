@@ -186,6 +186,7 @@ def run_on_view(
     stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
 ) -> Report:
     """Run a stage on one view; its report."""
+    _refuse_overwritten(module.get("metadata"))
     points = points_of(stage, module, ins)
     for name in stage.reads():
         if name not in ins:
@@ -203,6 +204,18 @@ def run_on_view(
             )
         outs[name] = array
     return points.report
+
+
+def _refuse_overwritten(metadata: Any) -> None:
+    """Refuse points whose dimensions PDAL has overwritten with extra bytes, which it does unless we run it."""
+    titles = pdal_env.overwritten_dimensions(metadata)
+    if titles:
+        raise StageError(
+            "extra bytes are named like dimensions of LAS, so PDAL has overwritten these",
+            found=", ".join(titles),
+            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under other names; or name "
+            'them all yourself: readers.las with "ignore_vlr": "LASF_Spec/4" and "extra_dims": "Name=type,..."',
+        )
 
 
 def run_on_nothing(stage: Stage) -> Report:

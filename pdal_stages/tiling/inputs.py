@@ -20,6 +20,7 @@ from ..base.octree import check_ept, read_ept
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import ept_address, is_ept, is_las, locations
+from ..pipeline.las_output import replaced
 from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..pipeline.stagefiles import LAS_READERS, named_files
 from .grid import Box, TileGrid, check_number, touching, union
@@ -204,6 +205,8 @@ class Survey:
         #: Fingerprints of inputs, and of other files that stages read, at the start of the run.
         self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
         self._read_headers()
+        files_of_las = [source.path for source in self.sources if source.kind == "las"]
+        self.messages += replaced(files_of_las, plan.makes)
         files = all(source.kind == "las" for source in self.sources)
         if options.per == "file" and not files:
             raise OptionError("--per file needs LAS or LAZ inputs", cure="Use --per tile")
@@ -237,7 +240,6 @@ class Survey:
                         cure="Rename the file",
                     )
                 if source.kind == "las":
-                    las.check_texts(source.path)
                     odd += filter(None, [lascheck.check_readable(source.path)])
             except StageError as error:
                 self.unreadable[source.path] = str(error)

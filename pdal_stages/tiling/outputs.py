@@ -145,8 +145,11 @@ def run_tail(
     tail: list[dict[str, Any]],
     outputs: Sequence[str],
     scratch: str,
+    sources: Sequence[str],
 ) -> dict[str, Any]:
     """Run readers, their new values, and the tail with its writers; returns a record of what was written.
+
+    The readers read `sources`, or parts of them.
 
     The `outputs` get their names once all are complete, and only while the run with the temporary folder `scratch` exists.
     """
@@ -158,7 +161,7 @@ def run_tail(
         check_complete(
             made, final, writers[number], None if "where" in writers[number] else run.count
         )
-        las.supersede_copc(made)
+        las_output.finish(made, sources)
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
     callbacks = Callbacks()
@@ -256,7 +259,9 @@ def write_file(
             new.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types}
         )
     reader = {**source.reader, "filename": source.path}
-    return run_tail([reader], [new], tail, outputs, scratch) | {"classes": _classes(new)}
+    return run_tail([reader], [new], tail, outputs, scratch, [source.path]) | {
+        "classes": _classes(new)
+    }
 
 
 def _in_parts(
@@ -286,7 +291,8 @@ def _in_parts(
             chunks = las_chunks(source.path, start, end, BLOCK)
             write_records(piece, header_of(source.path), (points.array for points in chunks))
             new = read_results(results, source, points, start, end)
-            run_tail([{**source.reader, "filename": piece}], [new], tail, [part], scratch)
+            reader = {**source.reader, "filename": piece}
+            run_tail([reader], [new], tail, [part], scratch, [source.path])
             classes.update(_classes(new))
             with laspy.open(part) as made:
                 if out is None:
@@ -321,8 +327,8 @@ def write_tile(
         return {"outputs": []}
     if plan.takes is not None:
         return plan.takes(mine, outputs, scratch)
-    tail = with_dimensions(
-        plan.tail, plan.extra_dims, [result.piece.source.path for result in mine]
-    )
+    sources = [result.piece.source.path for result in mine]
+    tail = with_dimensions(plan.tail, plan.extra_dims, sources)
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in mine]
-    return run_tail(readers, [of_own_points(result) for result in mine], tail, outputs, scratch)
+    new = [of_own_points(result) for result in mine]
+    return run_tail(readers, new, tail, outputs, scratch, sources)

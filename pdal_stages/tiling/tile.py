@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.las import LEGACY_LIMIT
-from ..pipeline.las_output import check_writers
+from ..pipeline.las_output import REPLACED, check_writers
 from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
@@ -112,9 +112,8 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     """Messages of a tile, worded the same for every tile, as a run repeats them once; none about files in `scratch`."""
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
-        if (
-            text.startswith(scratch) or NO_REFERENCE in text
-        ):  # about a piece; the input has its own message
+        about_piece = text.startswith((scratch, REPLACED)) or NO_REFERENCE in text
+        if about_piece:  # the input has its own message
             continue
         known = next((words for words in (TOUCH_NONE, HOLDS_NOWHERE) if words in text), "")
         lines.append(text[text.index(known) :])  # without its stage

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import subprocess
 
 import laspy
 import numpy as np
@@ -296,21 +295,6 @@ def test_a_file_without_points(command, tmp_path, write_las, suffix):
     source = write_las(tmp_path / f"in{suffix}", none, point_format=6)
     command.runs(pipeline(tmp_path, source, None, HAG))
     assert len(laspy.read(tmp_path / "out.las")) == 0
-
-
-def test_header_texts_in_latin_1(command, tmp_path, good, model, pdal_program):
-    text = "Vermessungsb\u00fcro".encode("latin-1").ljust(32, b"\0")
-    damaged(good, lambda d: d.__setitem__(slice(26, 58), text))
-    done = command(*pipeline(tmp_path, good, model))
-    if done.code:  # not every PDAL stumbles
-        said = "the system identifier", "not UTF-8", "Vermessungsb", "pdal translate"
-        command.refused(done, *said)
-        command.refused(
-            ["classify", good, tmp_path / "o.las", "--model", model, "--tile", "20"], *said
-        )
-        subprocess.run([pdal_program, "translate", good, tmp_path / "clean.las"], check=True)
-        command.runs(pipeline(tmp_path, tmp_path / "clean.las", model))
-    check(tmp_path)
 
 
 def test_cut_short_whoever_reads_it(tmp_path, write_las):
