@@ -188,7 +188,8 @@ class ClassifyRequest:
                 cure="Leave it out, or write a pipeline",
             )
         # What stages make on the way must not replace what the input has under the same name.
-        own = extra_dimensions(source) if is_las(source) else {}
+        to_las = writer.get("type") in LAS_WRITERS  # others get all dimensions
+        own = extra_dimensions(source) if to_las and is_las(source) else {}
         kept = [name for name in own if name in self._creates and name not in self.extra_dims]
         keep = _ferry([f"{name}=>{_KEPT}{name}" for name in kept])
         put_back = _ferry([f"{_KEPT}{name}=>{name}" for name in kept])
