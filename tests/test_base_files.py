@@ -166,6 +166,19 @@ def test_what_is_refused_stays_what_it_is(tmp_path, monkeypatch):
             write_whole("/dev/full", b"x" * 100)
 
 
+def test_what_belongs_to_an_input_is_one(tmp_path):
+    """The parts of a shapefile and the files of an EPT source are read with it; new files beside them are none."""
+    for name in ("s.shp", "s.dbf", "t.dbf", "ept.json", "ept-sources/list.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    shape, ept = tmp_path / "s.shp", tmp_path / "ept.json"
+    for name, read in (("s.dbf", shape), ("ept-sources/list.json", ept)):
+        with pytest.raises(StageError, match="is one of the inputs"):
+            files.check_outputs([files.Output(str(tmp_path / name))], [read])
+    files.check_outputs([files.Output(str(tmp_path / "t.dbf"))], [shape])
+    files.check_outputs([files.Output(str(tmp_path / "new.json"))], [ept])
+
+
 @unix
 def test_a_pipe_is_written_into(tmp_path):
     pipe, content = tmp_path / "pipe", os.urandom(300_000)

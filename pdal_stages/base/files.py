@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import json
 import os
 import re
@@ -218,14 +219,23 @@ class Output:
 def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]) -> None:
     """Refuse outputs that cannot be written, that are read, that are one file, or that would replace another kind.
 
-    Symbolic and hard links are recognized.
+    Symbolic and hard links are recognized. The other parts of a shapefile, and all files in the folder of an EPT source,
+    are read with it.
 
     Raises
     ------
     StageError
         Naming the output.
     """
-    read = {identity: os.fspath(path) for path in inputs if (identity := _identity(path))}
+    named = list(map(Path, inputs))
+    parts = [
+        part
+        for p in named
+        if p.suffix.lower() == ".shp"
+        for part in p.parent.glob(f"{glob.escape(p.stem)}.*")
+    ]
+    read = {identity: os.fspath(path) for path in [*named, *parts] if (identity := _identity(path))}
+    octrees = [Path(os.path.realpath(path)).parent for path in named if path.name == "ept.json"]
     names = [Path(os.path.realpath(path)) for path in read.values()]
     seen: dict[tuple[int, int] | Path, Output] = {}
     for output in outputs:
@@ -234,6 +244,8 @@ def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]
             continue
         real, identity = Path(os.path.realpath(output.path)), _identity(output.path)
         hit = (identity and read.get(identity)) or _numbered(real, names)
+        if hit is None and identity and any(map(real.is_relative_to, octrees)):
+            hit = real
         if hit is not None:
             raise StageError(
                 f"the {output.what} file is one of the inputs",

@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = str(int(options.progress))
         if getattr(options, "log", None):
-            check_outputs([Output(options.log, "log", "a log")], [])
+            check_outputs([Output(options.log, "log", "a log")], _named(options))
             log = RunLog(options.log, arguments, sys.stderr)
             sys.stdout, sys.stderr = LoggedStream(sys.stdout, log), LoggedStream(sys.stderr, log)  # type: ignore[assignment]
         code = int(options.run(options) or 0)
@@ -88,6 +88,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if shown is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = shown
     return code
+
+
+def _named(options: argparse.Namespace) -> list[str]:
+    """Return the words of a command that may be files, but for the log."""
+    given = [value for name, value in vars(options).items() if name not in ("log", "arguments")]
+    words = [value if isinstance(value, list) else [value] for value in given]
+    return [word for word in itertools.chain(*words) if isinstance(word, str)]
 
 
 def _protected(arguments: Sequence[str]) -> list[str]:

@@ -109,7 +109,13 @@ def _train(options: argparse.Namespace) -> None:
     files = input_files(options.inputs)
     surveys = {} if options.surveys is None else surveys_of(files, options.surveys)
     task = TrainTask(
-        files, options.model, options.overrides, extra, tiles.options_of(options), surveys
+        files,
+        options.model,
+        options.overrides,
+        extra,
+        tiles.options_of(options),
+        surveys,
+        named=options.inputs,
     )
     with tiles.interruptible():
         said = task.run()

@@ -108,7 +108,7 @@ def _classify(options: argparse.Namespace) -> int:
     if options.objects and not options.dry_run:
         with task.folders():
             stage = writer(options.objects, own)
-            refuse_tiles(task, options.objects)
+            refuse_tiles(task)
         then = partial(objects_of_files, task.outputs, stage, max(1, task.options.local_workers))
     if not task.in_one_piece:
         return _classify_tiles(task, options, names, then)
@@ -287,6 +287,8 @@ def extra_files(options: argparse.Namespace) -> list[Output]:
             raise OptionError("--report writes .html or .json", found=name)
     reports = [Output(name, "report", kinds[Path(name).suffix.lower()]) for name in options.report]
     more = [("log", options.log, ""), ("metadata", options.metadata, JSON)]
+    if not options.dry_run:  # its folder may not be there yet
+        more.append(("objects", getattr(options, "objects", None), ""))
     return [*(Output(name, what, kind) for what, name, kind in more if name), *reports]
 
 

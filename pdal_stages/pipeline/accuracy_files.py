@@ -54,7 +54,8 @@ def compare_files(
     (given,) = apply_overrides([wanted], own)
     renamed = {"dimension": "Classification", "reference": "Reference"}
     stage = cast(AccuracyStage, stage_from({**given, **renamed}))
-    check_outputs(stage.outputs(), [*listed["files"], *stage_files(stage)])
+    read = [*listed["files"], *sources, *references, *stage_files(stage)]
+    check_outputs(stage.outputs(), read)
     others = tuple(one for one in overrides if one not in own)
     parts = []
     kept = {"X", "Y", "Z", "Reliability", "Margin"}

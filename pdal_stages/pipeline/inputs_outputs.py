@@ -207,7 +207,7 @@ def check_octrees(stages: list[dict[str, Any]]) -> None:
 
 
 def stage_files(stage: Stage) -> list[str]:
-    """Files that a stage of ours reads."""
+    """Files that a stage of ours reads; a model that is both read and written is among them."""
     written = {output.path for output in stage.outputs()}
     if stage.type.startswith("writers."):  # whose outputs may be named after it
         written.add(stage.options["filename"])
@@ -216,5 +216,6 @@ def stage_files(stage: Stage) -> list[str]:
         for o in stage.all_options()
         if o.kind in ("filename", "model")
     ]
-    found = [find(name) if kind == "model" else name for kind, name in given if name]
-    return [name for name in [*found, *stage.inputs()] if name not in written]
+    models = [find(name) for kind, name in given if name and kind == "model"]
+    files = [name for kind, name in given if kind != "model" and name and name not in written]
+    return [*models, *files, *stage.inputs()]

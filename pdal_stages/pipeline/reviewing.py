@@ -20,7 +20,7 @@ from ..base.las import NOISE, read_header
 from ..base.messages import counted, duration, one_line, print_messages
 from ..base.version import __version__
 from ..classifier.model import loaded_model
-from ..classifier.modelfile import STANDARD
+from ..classifier.modelfile import STANDARD, find
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, qml, write_layers
 from ..reports.page import render
@@ -212,7 +212,10 @@ def write_review(
     check_target(output, LAYERS)
     pages = {"html": (html, HTML), "json": (json_file, JSON)}
     outputs = [Output(path, what, kind) for what, (path, kind) in pages.items() if path]
-    check_outputs([Output(output, "review"), *outputs], [*input_files(inputs), *inputs])
+    check_outputs(
+        [Output(output, "review"), *outputs],
+        [*input_files(inputs), *inputs, find(how.get("model", STANDARD))],
+    )
     found = review_files(inputs, **how)
     layers = review_layers(found)
     with whole_files(*filter(None, (json_file, html))) as files:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -20,7 +21,7 @@ from ..stages.base import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand, merge_filters
-from .inputs_outputs import check_octrees, stage_files
+from .inputs_outputs import check_octrees, locations, stage_files
 from .read import Override, PipelineSource, apply_overrides, read_pipeline
 from .references import check_readers
 from .stagefiles import (
@@ -141,23 +142,35 @@ class Pipeline:
         except StageError as error:
             raise self._located(error) from None
 
-    def check_outputs(self, *more: Output) -> None:
+    def check_outputs(self, *more: Output, read: Iterable[str] = ()) -> None:
         """Refuse outputs that cannot be written, that are inputs, or that replace files of another kind.
 
         Parameters
         ----------
         *more : Output
             What the caller will write beside the pipeline's own.
+        read : iterable of str
+            Files that the caller reads beside the pipeline's own.
         """
         own = [output for ours in self.expanded.ours for output in ours.stage.outputs()]
-        check_outputs([*writers_outputs(self.expanded.stages), *own, *more], self.inputs())
+        check_outputs(
+            [*writers_outputs(self.expanded.stages), *own, *more], [*self.inputs(), *read]
+        )
 
     def inputs(self) -> list[str]:
-        """Local files that are read: by readers, by other stages, and the pipeline itself."""
+        """Local files that are read: by readers, also through tile indexes, by other stages, and the pipeline itself."""
         stages = self.expanded.stages
+        indexed: list[str] = []
+        for one in stages:
+            if one["type"] == "readers.tindex":
+                with contextlib.suppress(StageError):  # PDAL reports it
+                    indexed += locations(
+                        str(one.get("filename")), one.get("tindex_name", "location")
+                    )
         named = [name for ours in self.expanded.ours for name in stage_files(ours.stage)]
         return [
             *readers_files(stages),
+            *indexed,
             *named_files(stages),
             *named,
             *filter(None, [self.source.name]),

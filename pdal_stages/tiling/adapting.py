@@ -17,7 +17,7 @@ from ..base import checks, las
 from ..base.errors import StageError
 from ..base.files import MODEL, Output, check_outputs, work_folder
 from ..classifier.model import load_model
-from ..classifier.modelfile import digest_of
+from ..classifier.modelfile import digest_of, find
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las
 from ..pipeline.parts import las_chunks
@@ -63,7 +63,7 @@ def adapt(
     """
     sure, options = checks.number("'--sure'", sure, 0.0, 1.0), options or TilingOptions()
     known, files = load_model(teacher), input_files(inputs)
-    check_outputs([Output(model, "model", MODEL)], files)
+    check_outputs([Output(model, "model", MODEL)], [*files, *inputs, find(teacher)])
     chosen, told = spread(files)
     with work_folder(model) as folder:
         request = ClassifyRequest(teacher, dimensions=("Reliability",))

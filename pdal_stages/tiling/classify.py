@@ -100,7 +100,7 @@ class ClassifyTask:
         (source,), (target,) = self.files, self.outputs
         with self.folders():
             pipeline = self.request.pipeline(source, target)
-            pipeline.check_outputs(*self.extra_files)
+            pipeline.check_outputs(*self.extra_files, read=self.inputs)
             count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
         reports = [each[-1] for _, each in pipeline.reports if each]
         codes = [report.codes for report in reports if report.codes is not None]
@@ -140,7 +140,7 @@ class ClassifyTask:
         alike = one_format(self.files) if self._per_tile else {}
         writer = {**writer_of(named), "filename": target, **alike}
         stages = [*self.request.stages, writer]
-        plan, source = plan_of_files(
+        plan, pipeline = plan_of_files(
             self.files, stages, self.request.overrides, self.options.buffer
         )
         extra_dims = self.request.extra_dims
@@ -155,5 +155,7 @@ class ClassifyTask:
         )
         with nullcontext() if dry_run else self.folders():
             outputs = [Output(name) for name in self.outputs if Path(name).parent.is_dir()]
-            check_outputs([*outputs, *self.extra_files], self.files)
+            read = [*self.inputs, *self.files, *pipeline.inputs()]
+            check_outputs([*outputs, *self.extra_files], read)
+            source = pipeline.source
             return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)

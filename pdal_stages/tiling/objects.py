@@ -20,7 +20,7 @@ from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
 from ..objects.find import find_objects
 from ..objects.found import Objects, ObjectSettings
-from ..pipeline.inputs_outputs import input_files
+from ..pipeline.inputs_outputs import input_files, stage_files
 from ..pipeline.parts import arrays_in_parts, reads_in_parts
 from ..pipeline.read import Override
 from ..pipeline.references import check_one_reference, reference_of_file
@@ -39,14 +39,13 @@ _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 LARGEST = 4.0
 
 
-def refuse_tiles(task: ClassifyTask, output: str) -> None:
+def refuse_tiles(task: ClassifyTask) -> None:
     """Refuse, before any work, what ``classify --objects`` cannot do."""
     if task.options.per == "tile" or not all(map(reads_in_parts, task.files)):
         raise OptionError(
             "classify --objects needs an output for each LAS or LAZ input",
             cure="Classify first, then: pdal-stages objects OUTPUT town.gpkg",
         )
-    check_outputs([Output(output, "objects")], task.files)
 
 
 def objects_of_files(
@@ -55,7 +54,7 @@ def objects_of_files(
     """Find objects in classified files, write and summarize them; returns the files, and counts by kind."""
     inputs = input_files(names)
     more = [Output(metadata, "metadata", JSON)] if metadata else []
-    check_outputs([*stage.outputs(), *more], [*inputs, *names])
+    check_outputs([*stage.outputs(), *more], [*inputs, *names, *stage_files(stage)])
     found, units, wkt = _find_in_files(inputs, stage, workers)
     found, refused = found.without(stage.refuse)
     files = write_objects(stage.filename, found, stage.outlines == STRAIGHT, units, wkt)["files"]

@@ -12,7 +12,7 @@ from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.modelfile import shipped
 from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of
-from ..pipeline.read import Override, PipelineSource
+from ..pipeline.read import Override
 from ..pipeline.references import MOVING
 from ..pipeline.run import Pipeline
 from ..pipeline.stagefiles import writes_las
@@ -178,7 +178,7 @@ def plan_of_files(
     stages: Sequence[dict[str, Any]],
     overrides: Iterable[Override],
     buffer: float | None = None,
-) -> tuple[TilePlan, PipelineSource]:
+) -> tuple[TilePlan, Pipeline]:
     """The plan of stages after readers of files; and the pipeline with one input of each kind."""
     readers = readers_of(files)
     heads = [{**reader, "filename": reader["filename"][0]} for reader in readers]
@@ -186,7 +186,7 @@ def plan_of_files(
     plan = make_plan(pipeline, buffer)
     for settled, reader in zip(plan.readers, readers, strict=True):
         settled["filename"] = reader["filename"]
-    return plan, pipeline.source
+    return plan, pipeline
 
 
 def _first_round(

@@ -23,7 +23,7 @@ from ..classifier.training import reach, train
 from ..classifier.trainoptions import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import is_ept, is_las, overridden, reader_of
+from ..pipeline.inputs_outputs import is_ept, is_las, overridden, reader_of, stage_files
 from ..pipeline.read import Override
 from ..pipeline.references import check_readers
 from ..pipeline.run import Pipeline
@@ -106,6 +106,7 @@ class TrainTask:
     #: the files of each survey, whose points are not neighbors of each other's
     surveys: Mapping[str, Sequence[str]] = field(default_factory=dict)
     survey: str = ""  #: the survey of all files
+    named: Sequence[str] = ()  #: what the files were named by: patterns, tile indexes
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
@@ -172,7 +173,7 @@ class TrainTask:
         heights = [overridden(one, self.overrides) for one in made_by]
         told = [follows] if (follows := stage.follows(heights)) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
-        check_outputs(stage.outputs(), list(self.files))
+        check_outputs(stage.outputs(), [*self.files, *self.named, *stage_files(stage)])
         report = Report()
         made = (self._whole if self.in_one_piece() else self._tiled)(heights, report)
         stage.finish(made, report)

@@ -108,6 +108,15 @@ def test_a_pipe_among_several_inputs(command, files, door):
 # ---- what must not be replaced ---------------------------------------------------------------------------------
 
 
+def index(path, *names):
+    """Write a tile index of files."""
+    square = [[[0, 0], [1, 0], [1, 1], [0, 0]]]
+    shape = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": square}}
+    tiles = [{**shape, "properties": {"location": name}} for name in names]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": tiles}))
+    return path
+
+
 @pytest.fixture()
 def files(tmp_path, cloud, model, monkeypatch):
     """A cloud, another, a model and a page in the test's own folder, and a check that they are what they were."""
@@ -115,13 +124,17 @@ def files(tmp_path, cloud, model, monkeypatch):
     for source, names in (
         (cloud, ("a.las", "b.las", "t_1.las")),
         (model, ("m.model", "other.laz")),
+        (index(tmp_path / "ti.geojson", "a.las"), ()),
+        (index(tmp_path / "two.geojson", "a.las", "b.las"), ()),
     ):
         for name in names:
             shutil.copy(source, tmp_path / name)
     (tmp_path / "page.html").write_text("<!DOCTYPE html>\n<p>mine</p>\n")
     (tmp_path / "poly.geojson").write_text('{"type": "FeatureCollection", "features": []}')
-    (tmp_path / "link.las").symlink_to("a.las")
-    os.link(tmp_path / "a.las", tmp_path / "hard.las")
+    (tmp_path / "points.txt").write_text("X,Y,Z\n1,2,3\n")
+    for name in ("a.las", "m.model"):
+        (tmp_path / f"link.{name[2:]}").symlink_to(name)
+        os.link(tmp_path / name, tmp_path / f"hard.{name[2:]}")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     os.mkfifo("pipe.las")
     yield tmp_path
@@ -142,6 +155,9 @@ PIPELINES = {
                      {"type": "writers.text", "filename": "poly.geojson"}],
     "split.json": ["t_1.las", {"type": "filters.splitter", "length": 10}, {**WRITE, "filename": "t_#.las"}],
     "pipe.json": ["pipe.las", HAG],
+    "base.json": ["a.las", HAG, {"type": "writers.classifiermodel", "filename": "m.model", "base": "m.model"}],
+    "index.json": [{"type": "readers.tindex", "filename": "ti.geojson"}, {**WRITE, "filename": "a.las"}],
+    "tiled.json": [{"type": "readers.tindex", "filename": "two.geojson"}, HAG, {**WRITE, "filename": "o_#.las"}],
     "twice.json": ["a.las", {**WRITE, "filename": "o.las"}, {**WRITE, "filename": "./o.las"}],
 }  # fmt: skip
 CLASSIFY = ["classify", "a.las", "--model", "m.model"]
@@ -159,6 +175,25 @@ REPLACING = [
     ([*ACCURACY, "--json", "x", "--html", "x"], "is the json file too"),
     (["objects", "a.las", "t.gpkg", "--metadata", "a.las"], OTHER),
     (["objects", "a.las", "t.gpkg", "--metadata", "t.gpkg"], "the metadata file is the objects file too"),
+    *((["train", "a.las", "--base", "m.model", "--model", name], INPUT) for name in ("m.model", "link.model", "hard.model")),
+    (["train", "a.las", "--base", "link.model", "--model", "m.model"], INPUT),
+    (["pipeline", "base.json"], INPUT),
+    (["adapt", "a.las", "--teacher", "m.model", "--model", "hard.model"], INPUT),
+    *((["classify", name, "o/", "--model", "m.model", "--metadata", name], INPUT) for name in ("ti.geojson", "two.geojson")),
+    (["classify", "two.geojson", "o/", "--model", "m.model", "--report", "b.json", "--metadata", "two.geojson"], INPUT),
+    *((["classify", *names, "o/", "--model", "m.model", "--polygons", "poly.geojson=9", "--metadata", "poly.geojson"], INPUT)
+      for names in (["a.las"], ["a.las", "b.las"])),
+    ([*CLASSIFY, "o.las", "--polygons", "poly.geojson=9", "--objects", "poly.geojson"], INPUT),
+    ([*CLASSIFY, "o.las", "--objects", "x.geojson", "--metadata", "x.geojson"], "the objects file is the metadata file too"),
+    (["accuracy", "ti.geojson", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
+    (["accuracy", "a.las", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
+    (["accuracy", "points.txt", "--reference", "b.las", "--log", "points.txt"], INPUT),
+    (["objects", "ti.geojson", "t.gpkg", "--metadata", "ti.geojson"], INPUT),
+    (["review", "ti.geojson", "t.gpkg", "--json", "ti.geojson"], INPUT),
+    (["review", "ti.geojson", "ti.geojson"], INPUT),
+    (["pipeline", "index.json"], INPUT),
+    (["pipeline", "index.json", "--metadata", "ti.geojson"], INPUT),
+    (["pipeline", "tiled.json", "--tile", "50", "--metadata", "two.geojson"], INPUT),
     (["expand", "p.json", "-o", "p.json"], INPUT),
     (["pipeline", "p.json", "--metadata", "p.json"], INPUT),
     (["pipeline", "bins.json", "--metadata", "b.json"], INPUT),
