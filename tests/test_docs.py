@@ -38,6 +38,23 @@ def test_names_of_the_api_page_are_there():
     assert names and all(hasattr(importlib.import_module(module), name) for module, name in names)
 
 
+def test_tests_that_the_docs_name_are_there():
+    """A page promises what a test shows: every row of such a table names one."""
+    named = 0
+    for page in ("robustness", "security"):
+        text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+        rows = [line for line in text.splitlines() if line.startswith("| ")]
+        for row in rows:
+            tests = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", row)
+            named += len(tests)
+            assert tests or row.endswith("| tests |"), row
+            for file, function in tests:
+                assert f"def {function or 'test_'}" in (ROOT / file).read_text(encoding="utf-8"), (
+                    row
+                )
+    assert named > 20
+
+
 def test_json_in_the_docs_is_valid(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = 0
