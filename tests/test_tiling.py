@@ -112,6 +112,43 @@ def test_index_refuses_what_is_cut_short(tmp_path, random_cloud, write_las):
         las_extent(str(path))
 
 
+def test_pdals_filters_see_one_file_at_a_time(tmp_path, random_cloud, write_las):
+    """As in a pipeline without tiles, until a stage of ours merges the files."""
+    xyz = random_cloud(4_000, seed=2, extent=(40, 40, 3))
+    for name, mine in (("a", xyz[:, 0] < 20), ("b", xyz[:, 0] >= 20)):
+        write_las(tmp_path / f"{name}.las", dict(zip("XYZ", xyz[mine].T, strict=True)))
+    filters = [
+        {"type": "filters.radialdensity", "radius": 2.0},
+        {"type": "filters.hag_minima", "cell": 3},
+    ]
+    inputs = [str(tmp_path / f"{name}.las") for name in "ab"]
+    whole = ps.run_pipeline([*inputs, *filters]).arrays
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las"), "extra_dims": "all"}
+    assert not run_tiled([*inputs, *filters, writer], 15, workers=0, buffer=3.0).failures
+    got = [laspy.read(tmp_path / f"o_{name}.las") for name in "ab"]
+    for name in ("RadialDensity", "HeightAboveGround"):
+        values = np.concatenate([np.asarray(las[name]) for las in got])
+        assert np.array_equal(values, np.concatenate([array[name] for array in whole])), name
+
+
+@pytest.mark.parametrize("corner", [(499_980.0, 5_399_980.0), (0.0, 0.0), (770_000.0, 6_277_000.0)])
+def test_a_small_survey_is_one_tile(tmp_path, random_cloud, write_las, corner):
+    """Wherever the lines of round grids lie; only those through zero cut every size."""
+    for name, at in (("a", 0.0), ("b", 20.0)):
+        x, y, z = random_cloud(500, seed=3, extent=(20, 40, 3)).T
+        arrays = {"X": x + corner[0] + at, "Y": y + corner[1], "Z": z}
+        write_las(tmp_path / f"{name}.las", arrays, offset=(*corner, 0.0))
+    stages = [str(tmp_path / "?.las"), {"type": "filters.hag_minima", "cell": 3}]
+    run = run_tiled([*stages, str(tmp_path / "o_#.las")], TilingOptions(workers=0), dry_run=True)
+    assert len(run.tiles) == 1
+
+
+@pytest.mark.parametrize("side", [1e300, 1e308, 2e9])
+def test_a_side_larger_than_the_earth_is_refused(side):
+    with pytest.raises(OptionError, match="--tile must be a number above 0 and at most 1e"):
+        TilingOptions(tile=side)
+
+
 # ---- the same as untiled ---------------------------------------------------------------------------------
 
 

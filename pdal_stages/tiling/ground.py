@@ -99,7 +99,7 @@ def from_before(
     )  # others have no points
     tiles = context.grid.covering(context.grid.box(tile, read_m / context.unit))
     left = _there(context.rasters, [left_name(context.grid.name(each)) for each in tiles])
-    changed = [_changed(first.kept or (), left, piece) for piece in cuts]
+    changed = _changed(first.kept or (), left, cuts)
     return FromBefore(stage.made_of_blocks(found), changed)
 
 
@@ -108,13 +108,18 @@ def _there(folder: str, names: Iterable[str]) -> list[str]:
     return [path for path in paths if os.path.exists(path)]
 
 
-def _changed(names: Sequence[str], left: list[str], piece: Piece) -> Changed:
-    """New values that earlier stages gave to points of a piece: rows and values by dimension."""
-    parts = []
+def _changed(names: Sequence[str], left: list[str], cuts: list[Piece]) -> list[Changed]:
+    """Return for each piece the new values that earlier stages gave to its points: rows and values by dimension."""
+    parts: list[list[tuple]] = [[] for _ in cuts]
     for path in left if names else ():
-        kept = load_arrays(path, under=f"{piece.source.key}/")
-        if "index" in kept:
-            rows, there = places_among(piece.index, kept["index"])
-            parts.append((rows[there], *(kept[f"dim/{name}"][there] for name in names)))
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return {name: (columns[0], column) for name, column in zip(names, columns[1:], strict=False)}
+        kept = load_arrays(path, {piece.source.key for piece in cuts})
+        for piece, mine in zip(cuts, parts, strict=True):
+            points = kept.get(piece.source.key)
+            if points is not None:
+                rows, there = places_among(piece.index, points["index"])
+                mine.append((rows[there], *(points[f"dim/{name}"][there] for name in names)))
+    found: list[Changed] = []
+    for mine in parts:
+        columns = [np.concatenate(column) for column in zip(*mine, strict=True)]
+        found.append({n: (columns[0], c) for n, c in zip(names, columns[1:], strict=False)})
+    return found

@@ -69,26 +69,43 @@ def flags_in_classes(path: str) -> bool:
 
 
 def changed_in(
-    name: str, read: NDArray, rows: NDArray[np.int64] | None, values: NDArray, holds_flags: bool
+    name: str,
+    read: NDArray,
+    rows: NDArray[np.int64] | None,
+    values: NDArray,
+    holds_flags: NDArray[np.bool_] | bool,
 ) -> NDArray:
-    """A dimension with new values in some or all rows; flags that are bits of the class are kept."""
+    """Return a dimension (n,) with new values in some or all rows; flags that are bits of the class are kept.
+
+    `holds_flags` (n,) tells of which points the class holds flags.
+    """
     out = np.array(read)
     out[slice(None) if rows is None else rows] = values
-    if holds_flags and name == "Classification":
-        out |= read & ~np.uint8(LEGACY_LIMIT)
+    if name == "Classification" and np.any(holds_flags):
+        out |= np.where(holds_flags, read & ~np.uint8(LEGACY_LIMIT), np.uint8(0))
     return out
 
 
 def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
-    """The results of a tile as arrays to be saved, by the key of each input."""
+    """Return the results of a tile as arrays to be saved.
+
+    Each input has one record array (n,) under its key: the ``index`` of each point in the input, ascending, and the new
+    values ``dim/NAME``. ``own`` holds the keys with the number of points in the tile, dropped ones included.
+    """
     content: dict[str, NDArray] = {}
+    own: list[tuple[str, int]] = []
     for result in results:
-        piece, key = result.piece, result.piece.source.key
-        if len(piece.own):
-            content[f"{key}/index"] = piece.index[result.rows]
-            content[f"{key}/own"] = np.array(len(piece.own))
-            content |= {f"{key}/dim/{name}": values for name, values in result.values.items()}
-    return content
+        piece = result.piece
+        if not len(piece.own):
+            continue
+        columns = {f"dim/{name}": values for name, values in result.values.items()}
+        columns = {"index": piece.index[result.rows], **columns}
+        records = np.empty(len(result.rows), [(name, c.dtype) for name, c in columns.items()])
+        for name, column in columns.items():
+            records[name] = column
+        content[piece.source.key] = records
+        own.append((piece.source.key, len(piece.own)))
+    return {**content, "own": np.array(own, [("key", "<U12"), ("count", "<i8")])}
 
 
 def read_results(
@@ -102,11 +119,11 @@ def read_results(
     seen = 0
     columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
     for name in tiles:
-        arrays = load_arrays(name, under=f"{source.key}/")
-        if "index" not in arrays:
+        arrays = load_arrays(name, [source.key, "own"])
+        if source.key not in arrays:
             continue
-        index = arrays["index"]
-        seen += int(arrays["own"])
+        points, index = arrays[source.key], arrays[source.key]["index"]
+        seen += dict(arrays["own"].tolist())[source.key]
         first, last = np.searchsorted(index, (start, end))
         mine = index[first:last] - start
         if (index.size and index[-1] >= count) or kept[mine].any():
@@ -114,9 +131,9 @@ def read_results(
                 "internal: two tiles hold the same point", where=source.path, found=name
             )
         kept[mine] = True
-        for dimension, column in arrays.items():
-            if dimension.startswith("dim/"):
-                columns.setdefault(dimension[4:], []).append((mine, column[first:last].copy()))
+        for field in list(points.dtype.fields or ())[1:]:
+            column = points[field][first:last].copy()
+            columns.setdefault(field.removeprefix("dim/"), []).append((mine, column))
     if seen != count:
         raise StageError(
             "the tiles do not hold all points of the file: the file changed during the run",
@@ -166,8 +183,8 @@ def run_tail(
     flags = las_output.files_with_flags_to_split([*readers, *tail])
     callbacks = Callbacks()
     with whole_files(*outputs, check=finish) as partials:
-        stages, inputs = read_with(callbacks, readers, new, flags)
-        stages.append({"type": "filters.merge", "inputs": inputs})
+        stages, last = read_with(callbacks, readers, new, flags)
+        stages.append({"type": "filters.merge", "inputs": [last]})
         waiting = iter(partials)
         for stage in tail:
             stage = {k: v for k, v in stage.items() if k != "inputs"}
@@ -183,32 +200,57 @@ def run_tail(
 
 def read_with(
     callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: Sequence[bool]
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Stages that read points and set their new values, and the tags of the last ones.
+) -> tuple[list[dict[str, Any]], str]:
+    """Return stages that read points, merge them in the order of the readers, and set new values; and the last one's tag.
 
-    `flags`: of each reader, whether flags must be split from the class (old PDAL); empty for none.
+    One filter sets the values of all readers: the time PDAL needs grows with the third power of the number of filters
+    that add dimensions. `flags`: of each reader, whether flags must be split from the class (old PDAL); empty for none.
     """
     stages: list[dict[str, Any]] = []
     last = []
-    for number, (reader, values) in enumerate(zip(readers, new, strict=True)):
-        holds_flags = flags_in_classes(reader["filename"])
-        stages += [{**reader, "tag": f"in{number}"}, *_put(callbacks, values, number, holds_flags)]
+    for number, reader in enumerate(readers):
+        stages.append({**reader, "tag": f"in{number}"})
         if flags and flags[number]:
-            stages.append(
-                las_output.flag_splitter([True], inputs=[stages[-1]["tag"]], tag=f"split{number}")
+            splitter = las_output.flag_splitter(
+                [True], inputs=[f"in{number}"], tag=f"split{number}"
             )
+            stages.append(splitter)
         last.append(stages[-1]["tag"])
-    return stages, last
+    if len(readers) > 1:
+        stages.append({"type": "filters.merge", "inputs": last, "tag": "merged"})
+        last = ["merged"]
+    counts = [len(each.kept) for each in new]
+    holds_flags = np.repeat([flags_in_classes(reader["filename"]) for reader in readers], counts)
+    stages += _put(callbacks, joined(new), last, holds_flags)
+    return stages, stages[-1]["tag"]
+
+
+def joined(new: Sequence[NewValues]) -> NewValues:
+    """Return new values for the points of several readers, one after the other."""
+    if len(new) == 1:
+        return new[0]
+    starts = np.cumsum([0, *(len(each.kept) for each in new)])
+    values: dict[str, tuple[NDArray[np.int64] | None, NDArray]] = {}
+    for name in dict.fromkeys(name for each in new for name in each.values):
+        parts = [(n, *each.values[name]) for n, each in enumerate(new) if name in each.values]
+        columns = np.concatenate([column for _, _, column in parts])
+        rows = None
+        if len(columns) < starts[-1] or any(at is not None for _, at, _ in parts):
+            rows = np.concatenate(
+                [starts[n] + (np.arange(len(c)) if at is None else at) for n, at, c in parts]
+            )
+        values[name] = rows, columns
+    return NewValues(np.concatenate([each.kept for each in new]), values)
 
 
 def _put(
-    callbacks: Callbacks, new: NewValues, number: int, holds_flags: bool
+    callbacks: Callbacks, new: NewValues, inputs: list[str], holds_flags: NDArray[np.bool_]
 ) -> Iterator[dict[str, Any]]:
-    """Filters that set new values of a reader's points, and drop some; PDAL needs two filters for this."""
+    """Yield filters that set new values of points, and drop some; PDAL needs two filters for this."""
 
     def put(module, ins, outs) -> None:
         if len(ins["X"]) != len(new.kept):
-            raise StageError(f"the reader gave {len(ins['X']):,} points of {len(new.kept):,}")
+            raise StageError(f"the readers gave {len(ins['X']):,} points of {len(new.kept):,}")
         for name, (rows, values) in new.values.items():
             outs[name] = changed_in(name, ins[name], rows, values, holds_flags)
 
@@ -217,9 +259,9 @@ def _put(
 
     types = {name: values.dtype.name for name, (_, values) in new.values.items()}
     adds = {name: _FLOATS.get(kind, f"{kind}_t") for name, kind in types.items()}
-    yield callbacks.filter(put, adds, inputs=[f"in{number}"], tag=f"put{number}")
+    yield callbacks.filter(put, adds, inputs=inputs, tag="put")
     if not new.kept.all():
-        yield callbacks.filter(drop, inputs=[f"put{number}"], tag=f"left{number}")
+        yield callbacks.filter(drop, inputs=["put"], tag="left")
 
 
 def with_dimensions(

@@ -13,10 +13,12 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.resources import available_threads, free_memory
 from ..stages.hag_morphological import Blocks
-from .grid import Box
+from .grid import Box, union
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
+#: Largest side of a tile, in units of the coordinates: more than the Earth's circumference in feet.
+LARGEST_TILE = 1e9
 #: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is
 #: assembled, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, STAGES = 350 << 20, 285, 250, 512 << 20
@@ -28,9 +30,9 @@ MOST_AT_ONCE = 4_000_000
 PARENT = 350 << 20
 #: Most points of a tile of automatic size: a failed tile is lost, and progress is counted in tiles.
 _MOST_OF_A_TILE = 3_000_000
-#: Sides to choose from, in units of the coordinates: round numbers, from 1 to 800,000.
+#: Sides to choose from, in units of the coordinates: round numbers, from 1 to 8,000,000.
 _SIDES = [
-    mantissa * 10**power for power in range(6) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+    mantissa * 10.0**power for power in range(7) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
 ]
 
 
@@ -55,7 +57,8 @@ class TilingOptions:
     def __post_init__(self) -> None:
         # 20 and 20.0 are one run
         if self.tile is not None:
-            object.__setattr__(self, "tile", checks.number("--tile", self.tile, 0, above=True))
+            side = checks.number("--tile", self.tile, 0, LARGEST_TILE, above=True)
+            object.__setattr__(self, "tile", side)
         if self.memory is not None:
             checks.whole("--memory", self.memory, 1, unit="bytes")
         if self.workers is not None:
@@ -106,11 +109,13 @@ class Density:
     largest: int  #: points of the largest input
     area: float  #: square units of the coordinates, of the inputs' boxes
     each: float  #: points per square unit, of the denser inputs
+    box: Box  #: of all inputs
 
     @classmethod
     def of(cls, extents: Iterable[Extent]) -> Density:
         """From the extents of inputs."""
         boxes = [(*one.box, one.count) for one in extents if one.count]
+        around = union([box[:4] for box in boxes])
         x0, y0, x1, y1, count = np.array(boxes, np.float64).reshape(-1, 5).T
         with np.errstate(over="ignore"):  # of odd headers
             area = (x1 - x0) * (y1 - y0)
@@ -123,6 +128,15 @@ class Density:
             int(count.max(initial=0)),
             float(area.sum()),
             float(dense[0]) if len(dense) else 0.0,
+            around,
+        )
+
+    def side_around(self) -> float | None:
+        """Return the smallest side of tiles of which one holds all inputs; None where the grid's lines cut them."""
+        x0, y0, x1, y1 = self.box
+        return next(
+            (s for s in _SIDES if x0 // s == x1 // s and y0 // s == y1 // s),
+            None,
         )
 
     def read_by(self, side: float, halo_units: float) -> int:
@@ -161,6 +175,12 @@ def settled(
         largest = density.largest if per_file else 0
         return worker_bytes(density.read_by(side, halo_units), largest, block)
 
+    # A small survey in one tile needs neither surroundings nor rounds before.
+    alone = density.side_around() if 0 < density.points <= _MOST_OF_A_TILE else None
+    if options.tile is None and not options.scheduler and alone:
+        room = whole - (PARENT if local else 0)
+        if worker_bytes(density.points, density.largest if per_file else 0) <= room:
+            return replace(options, tile=alone, workers=min(local, 1) if not fixed else local)
     for workers in [local] if fixed else range(local, 0, -1):
         room = (whole - PARENT) / workers if workers else whole
         fitting = [side for side in sides if needed(side) <= room]

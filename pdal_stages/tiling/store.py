@@ -134,17 +134,14 @@ def save_arrays(path: str | Path, arrays: Mapping[str, NDArray]) -> None:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def load_arrays(
-    path: str | Path, only: Collection[str] | None = None, under: str = ""
-) -> dict[str, NDArray]:
-    """The arrays of a file, or those named in `only`; with `under`, those with this prefix, without it.
+def load_arrays(path: str | Path, only: Collection[str] | None = None) -> dict[str, NDArray]:
+    """Return the arrays of a file by name, or those that are named in `only`.
 
     A file that cannot be read is removed, so that a later run makes it again.
     """
     try:
         with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-            names = [name.removeprefix(under) for name in file.files if name.startswith(under)]
-            return {name: file[under + name] for name in names if only is None or name in only}
+            return {name: file[name] for name in file.files if only is None or name in only}
     except MemoryError:
         raise
     except Exception as error:  # zipfile and numpy raise many types

@@ -79,16 +79,23 @@ def run_head(
 
     callbacks = Callbacks()
     readers = [{**piece.reader, "filename": piece.path} for piece in cuts]
-    stages, inputs = read_with(callbacks, readers, new, flags if len(set(flags)) > 1 else [])
+    stages, last_read = read_with(callbacks, readers, new, flags if len(set(flags)) > 1 else [])
+    apart = bool(len(cuts) > 1 and begin < len(plan.head)) and not _merges(plan.head[begin])
+    if apart:  # PDAL's own filters see one file at a time, until a stage merges them
+        stages.append({"type": "filters.groupby", "dimension": INPUT, "inputs": [last_read]})
+        last_read = stages[-1]["tag"] = "apart"
     begins, used = len(stages), {}
     for given, used_m in zip(plan.head[begin:], plan.later[begin:], strict=False):
+        if apart and _merges(given):
+            stages.append({"type": "filters.merge"})
+            apart = False
         used[len(stages)] = used_m
         stages.append(_with_threads(given, context.threads))
         kind = stage_types().get(given["type"])
         if kind is not None and kind.open_ended and not everything:
             stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
     stages += [callbacks.filter(function) for function in (take, last) if function is not None]
-    stages[begins]["inputs"] = inputs
+    stages[begins]["inputs"] = [last_read]
     pipeline = Pipeline(stages, whole=False)
     ours = {one.number: one for one in pipeline.expanded.ours}
     check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
@@ -106,6 +113,11 @@ def run_head(
     return HeadRun(
         _collect(views, cuts), max(needs), _messages(pipeline, context.scratch), pipeline.left_alone
     )
+
+
+def _merges(stage: Mapping[str, Any]) -> bool:
+    """Return whether a stage sees the points of all files together."""
+    return stage["type"] in ("filters.merge", *stage_types())
 
 
 def _messages(pipeline: Pipeline, scratch: str) -> list[str]:

@@ -343,8 +343,8 @@ def take_points(
         new.append(found)
     callbacks = Callbacks()
     flags = las_output.files_with_flags_to_split(readers)
-    stages, inputs = read_with(callbacks, readers, new, flags)
-    run = pdal_env.execute([*stages, {"type": "filters.merge", "inputs": inputs}])
+    stages, _ = read_with(callbacks, readers, new, flags)
+    run = pdal_env.execute(stages)
     if not run.count:
         return {"outputs": []}
     points = points_of_views(run.arrays, run.metadata, stage.points)

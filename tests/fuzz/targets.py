@@ -36,7 +36,7 @@ from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import apply_overrides, decode, parse_overrides, parse_pipeline
 from pdal_stages.tiling import inputs, outputs
 from pdal_stages.tiling.grid import TileGrid
-from pdal_stages.tiling.pieces import sort_points
+from pdal_stages.tiling.pieces import Piece, sort_points
 from pdal_stages.tiling.store import Store
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -213,14 +213,10 @@ _SOURCE = inputs.InputSource("/a.las", {"type": "readers.las"}, "las")
 
 def _results() -> list[bytes]:
     rows = np.arange(40, dtype=np.int64)
-    content = {
-        "index": rows,
-        "own": np.array(40),
-        "dim/Classification": (rows % 7).astype(np.uint8),
-        "dim/H": rows / 7,
-    }
-    content = {f"{_SOURCE.key}/{name}": value for name, value in content.items()}
-    np.savez(folder() / "result.npz", names=np.array(sorted(content)), **content)
+    piece = Piece(_SOURCE, "", rows, np.full(40, -1.0))
+    values = {"Classification": (rows % 7).astype(np.uint8), "H": rows / 7}
+    content = outputs.arrays_of([outputs.PieceResults(piece, rows, values)])
+    np.savez(folder() / "result.npz", **content)
     return [(folder() / "result.npz").read_bytes()]
 
 
