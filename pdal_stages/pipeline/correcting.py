@@ -17,6 +17,7 @@ from ..base.las import LEGACY_LIMIT, named_copc
 from ..classifier.algorithms import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
+from .las_output import finish
 from .parts import header_of, las_chunks, reads_in_parts
 from .references import reference_of_file
 
@@ -88,6 +89,7 @@ def write_corrections(
         las["Reliability"] = np.where(checked, 1.0, las["Reliability"])
     with whole_files(output) as (part,):
         las.write(str(part))
+        finish(part, [before])
     lines = [
         f"{len(codes):,} points, {changed.sum():,} changed, {checked.sum():,} checked ({100 * checked.mean():.2f} %)"
     ]

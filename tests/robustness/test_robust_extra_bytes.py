@@ -228,6 +228,37 @@ def test_several_files_by_a_pattern(command, tmp_path, write_las):
     assert np.array_equal(np.unique(values, axis=0), [[0, 2], [1, 0]])
 
 
+def test_a_survey_and_its_corrections(command, tmp_path, write_las, model):
+    """Files with odd extra bytes and without, an output for each file and for each tile; then what a person edits."""
+    (tmp_path / "in").mkdir()
+    right = odd(tmp_path / "in" / "a.laz", write_las)
+    write_las(tmp_path / "in" / "b.laz", scene(seed=2) | {"Mine": np.ones(600)}, point_format=6)
+    per_file, per_tile = tmp_path / "files", tmp_path / "each"
+    for target, words in ((per_file, []), (per_tile, ["--per", "tile"])):
+        command.runs(["classify", tmp_path / "in", f"{target}/", "--model", model, *TILES, *words])
+    out = laspy.read(per_file / "a.laz")
+    own = list(out.point_format.extra_dimension_names)[: len(right)]
+    assert own == list(right) and (laspy.read(per_file / "b.laz")["Mine"] == 1).all()
+    parts = [laspy.read(path) for path in per_tile.glob("*.laz")]
+    assert sum(map(len, parts)) == 1200
+    for name in own:
+        merged = np.concatenate([np.asarray(part[name], float) for part in parts])
+        expected = np.append(np.asarray(right[name], float), np.zeros(600))
+        assert np.allclose(np.sort(merged), np.sort(expected)), name
+    edited = laspy.read(per_file / "a.laz")
+    edited.classification[:20] = 5
+    edited.write(tmp_path / "edited.laz")
+    words = [
+        "corrections",
+        "--out",
+        tmp_path / "kept.laz",
+        per_file / "a.laz",
+        tmp_path / "edited.laz",
+    ]
+    command.runs(words)
+    assert set(own) <= set(laspy.read(tmp_path / "kept.laz").point_format.extra_dimension_names)
+
+
 # ---- dimensions of the input that stages make, too ----------------------------------------------
 
 
