@@ -17,7 +17,7 @@ from .grid import Box, union
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
-#: Largest side of a tile, in units of the coordinates: more than the Earth's circumference in feet.
+#: Largest side of a tile, in units of the coordinates, and buffer: more than the Earth's circumference in feet.
 LARGEST_TILE = 1e9
 #: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is
 #: assembled, and the `memory` option of our stages. See docs/large-areas.md.
@@ -80,7 +80,7 @@ class TilingOptions:
             )
         checks.one_of("--per", self.per, PER)
         if self.buffer is not None:
-            checks.number("--buffer", self.buffer, 0, unit="meters")
+            checks.number("--buffer", self.buffer, 0, LARGEST_TILE, unit="meters")
 
     @property
     def local_workers(self) -> int:

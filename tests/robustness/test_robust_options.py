@@ -106,6 +106,7 @@ USAGE = {
     "accuracy of two files": (["accuracy", "c.las", "c.las"], "--reference FILE, of the same points"),
     "unknown dimension": (["accuracy", "c.las", "--reference-dimension", "Clasification"], "Did you mean 'Classification'?"),
     "scheduler without its protocol": (["classify", "c.las", "o", "--scheduler", "localhost"], "For example tcp://localhost:8786"),
+    "a buffer larger than the Earth": (["pipeline", "job.json", "--tile", "50", "--buffer", "1e308"], "1e+09 meters"),
     "unknown flag": (["validate", "job.json", "--strict"], "unrecognized arguments: --strict"),
     "no pipeline file": (["pipeline"], "no pipeline file was given"),
     "options of a stage that is not there": (["options", "filters.hag_minimum"], "Did you mean 'filters.hag_minima'?"),
