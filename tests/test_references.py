@@ -11,8 +11,11 @@ import pytest
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
+from pdal_stages.base.units import Units, horizontal_part, units_of_wkt
 from pdal_stages.cli import main
 from pdal_stages.pipeline.references import reference_of_file
+from pdal_stages.stages.hag_minima import HagMinima
+from pdal_stages.synthetic import write_town
 
 pytestmark = pytest.mark.pdal
 
@@ -118,6 +121,21 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
             )
 
 
+def test_an_output_without_a_reference_is_said(tmp_path, inputs):
+    """The log says what was assumed, and that this is not written; `default_srs` writes it."""
+    stages = [
+        {"type": "readers.las", "filename": inputs(METERS, None)},
+        {"type": "filters.hag_minima"},
+        {"type": "writers.las", "filename": str(tmp_path / "o_#.las"), "forward": "all"},
+    ]
+    for options, given in (({}, False), ({"default_srs": METERS}, True)):
+        run = run_tiled([{**stages[0], **options}, *stages[1:]], 40, workers=0)
+        said = " ".join(run.messages)
+        assert ("the output gets none: --readers.las.default_srs=EPSG:CODE" in said) != given
+        out = laspy.read(tmp_path / "o_in1.las")
+        assert any(one.user_id == "LASF_Projection" for one in out.vlrs) == given
+
+
 def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, capsys):
     inputs(METERS, None)
     files = [str(tmp_path / f"in{number}.las") for number in range(2)]
@@ -137,3 +155,102 @@ def test_geotiff_keys_of_las_14_in_old_point_formats(tmp_path, write_las):
         las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", data))
         las.write(path)
         assert reference_of_file(str(path)).units.horizontal == pytest.approx(horizontal)
+
+
+# ---- units of x and y, and of z, the same for every command -------------------------------------------------
+
+FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
+HEIGHTS = 'VERT_CS["NAVD88",VERT_DATUM["North American Vertical Datum 1988",2005],UNIT["metre",1]]'
+HEIGHTS_IN_FEET = HEIGHTS.replace('"metre",1', '"foot",0.3048')
+#: GeoTIFF keys (3072 and 4096: systems, 3076 and 4099: units) or well-known text, and the units.
+KINDS = [
+    ({3072: 26910, 3076: 9002, 4099: 9001}, (FOOT, 1.0)),
+    ({3072: 26910, 3076: 9003, 4099: 9001}, (SURVEY_FOOT, 1.0)),
+    ({3072: 26910, 3076: 9001, 4099: 9002}, (1.0, FOOT)),
+    ({3072: 26910, 3076: 9001, 4099: 9003}, (1.0, SURVEY_FOOT)),
+    ({3072: 26910, 3076: 9002}, (FOOT, FOOT)),
+    ({3072: 26910}, (1.0, 1.0)),
+    ({3072: 2992, 4096: 5703}, (FOOT, 1.0)),
+    ({3072: 2992, 4096: 6360}, (FOOT, SURVEY_FOOT)),
+    ({3072: 26910, 4096: 6360}, (1.0, SURVEY_FOOT)),
+    ({3072: 2992}, (FOOT, FOOT)),
+    (f'COMPD_CS["a, ""b""",{FEET},{HEIGHTS}]', (SURVEY_FOOT, 1.0)),
+    (f'COMPD_CS["both",{METERS},{HEIGHTS_IN_FEET}]', (1.0, FOOT)),
+]
+
+
+def referenced(path, reference):
+    """Give a LAS file a spatial reference; its coordinates stay."""
+    las = laspy.read(path)
+    las.vlrs[:] = [one for one in las.vlrs if one.user_id != "LASF_Projection"]
+    las.header.global_encoding.wkt = isinstance(reference, str)
+    if isinstance(reference, str):
+        las.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(reference))
+    else:
+        keys = sorted({1024: 1, **reference}.items())
+        rows = [struct.pack("<4H", 1, 1, 0, len(keys))]
+        rows += [struct.pack("<4H", key, 0, 1, value) for key, value in keys]
+        las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", b"".join(rows)))
+    las.write(path)
+
+
+@pytest.mark.parametrize(("reference", "units"), KINDS)
+def test_commands_and_stages_take_the_same_units(
+    tmp_path, write_las, monkeypatch, reference, units
+):
+    n = 200
+    xyz = np.random.default_rng(0).uniform(0, 40, (n, 3))
+    minor = 4 if isinstance(reference, str) else 2
+    path = write_las(
+        tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), 6 if minor == 4 else 1
+    )
+    referenced(path, reference)
+    found = reference_of_file(str(path))
+    assert (found.units.horizontal, found.units.vertical) == pytest.approx(units)
+    seen = []
+    monkeypatch.setattr(HagMinima, "run", lambda self, points: seen.append(points.units) or {})
+    ps.run_pipeline([str(path), {"type": "filters.hag_minima"}])
+    assert seen == [found.units]
+    part = horizontal_part(found.wkt)
+    assert part.startswith("PROJCS[") and part.endswith("]") and "VERT" not in part
+    assert units_of_wkt(part).horizontal == pytest.approx(units[0])
+    assert reference_of_file(str(path), "ft", "m").units == Units(FOOT, 1.0)
+
+
+def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, write_las):
+    """Feet across, meters up: by `objects`, `writers.objects`, and of what `classify --objects` writes."""
+    pyogrio = pytest.importorskip("pyogrio")
+    town = ps.make_town(60.0, 6.0, seed=4, progress=False)
+    path = tmp_path / "town.las"
+    write_town(town, path)
+    las = laspy.read(path)
+    z, arrays = np.asarray(las.z), {"X": las.x / FOOT, "Y": las.y / FOOT, "Z": las.z}
+    arrays |= {"ReturnNumber": las.return_number, "NumberOfReturns": las.number_of_returns}
+    write_las(path, {**arrays, "Classification": las.classification}, point_format=1)
+    referenced(path, {3072: 2992, 3076: 9002, 4099: 9001})
+
+    def buildings(name):
+        about, _, _, columns = pyogrio.raw.read(tmp_path / name, layer="buildings")
+        return about["crs"], dict(zip(about["fields"], columns, strict=True))
+
+    def by_stage(source, name):
+        reader = {"type": "readers.las", "filename": str(source), "use_eb_vlr": True}
+        writer = {"type": "writers.objects", "filename": str(tmp_path / name)}
+        assert run_job([reader, writer])[0] == 0
+
+    def same(one, other):
+        assert one[0] == other[0] and one[1].keys() == other[1].keys()
+        for name, values in one[1].items():
+            np.testing.assert_array_equal(values, other[1][name], name)
+
+    assert run("objects", path, tmp_path / "a.gpkg")[0] == 0
+    by_stage(path, "b.gpkg")
+    crs, columns = buildings("a.gpkg")
+    same((crs, columns), buildings("b.gpkg"))
+    assert 3 < columns["h_ridge"].max() < np.ptp(z)
+    out = tmp_path / "out.las"
+    assert run("classify", path, out, "--objects", tmp_path / "c.gpkg")[0] == 0
+    by_stage(out, "d.gpkg")
+    same(buildings("c.gpkg"), buildings("d.gpkg"))
+    found = laspy.read(out)
+    assert 3 < np.percentile(found.HeightAboveGround, 99) < np.ptp(z)

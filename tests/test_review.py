@@ -184,3 +184,20 @@ def test_points_that_nobody_classified_are_refused(folder, tmp_path, run):
     code, _, err = run("review", tmp_path / "raw.laz", tmp_path / "r.gpkg")
     assert code == 1 and "no point is ground, vegetation or a building" in err
     assert run("review", folder / "whole.laz", tmp_path / "r.txt")[0] == 1
+
+
+@pytest.mark.pdal
+def test_files_without_points(tmp_path, run, write_las):
+    """Nothing to look at, as `classify` and `objects` have nothing to do."""
+    pytest.importorskip("pyogrio")
+    nothing = {**dict.fromkeys("XYZ", np.zeros(0)), "Classification": np.zeros(0, np.uint8)}
+    source = write_las(tmp_path / "in.las", nothing, point_format=6)
+    pages = ("--html", tmp_path / "r.html", "--json", tmp_path / "r.json")
+    code, said, err = run("review", source, tmp_path / "r.gpkg", *pages)
+    assert code == 0, err
+    assert (
+        "0 points judged" in said and json.loads((tmp_path / "r.json").read_text())["points"] == 0
+    )
+    with sqlite3.connect(tmp_path / "r.gpkg") as base:
+        for name in ("patches", "tiles"):
+            assert base.execute(f"select count(*) from {name}").fetchone() == (0,)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.base.units import Units, parse_wkt, units_of_wkt, utm_code
+from pdal_stages.base.units import Units, horizontal_part, parse_wkt, units_of_wkt, utm_code
 
 GEOGCS = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
 METERS = f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
@@ -41,6 +41,13 @@ def test_units_of_references():
             units_of_wkt(LOCAL.format(unit), horizontal="foot", vertical="foot").horizontal
             == 0.3048
         )
+
+
+def test_the_horizontal_part_of_a_reference():
+    assert horizontal_part(BOTH) == METERS
+    assert horizontal_part(f'COMPOUNDCRS["a ""[x]"" b",{WKT2},VERTCRS["v"]]') == WKT2
+    for whole in (METERS, WKT2, "", 'COMPD_CS["cut",PROJCS["x"'):
+        assert horizontal_part(whole) == whole
 
 
 @pytest.mark.parametrize(

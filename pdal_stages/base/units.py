@@ -210,6 +210,19 @@ def parse_wkt(text: str) -> WktNode | None:
     return stack[0].children[0] if stack[0].children else None
 
 
+def horizontal_part(wkt: str) -> str:
+    """Return the text of the horizontal system in that of a compound one, as vector files have it; others unchanged."""
+    compound = re.match(
+        r'\s*(?:COMPD_CS|COMPOUNDCRS)\s*[\[(]\s*"(?:[^"]|"")*"\s*,\s*', wkt, re.IGNORECASE
+    )
+    depth = 0
+    for match in _TOKEN.finditer(wkt, compound.end()) if compound else ():
+        depth += bool(match[3]) - bool(match[4])
+        if compound and match[4] and not depth:
+            return wkt[compound.end() : match.end()]
+    return wkt
+
+
 def name_of_wkt(wkt: str) -> str:
     """The name of a spatial reference in well-known text, with its authority's code; empty where it has none."""
     root = parse_wkt(wkt)

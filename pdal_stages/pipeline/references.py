@@ -11,6 +11,7 @@ from ..base.errors import PipelineError, StageError
 from ..base.las import header_there, named_las, projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from . import pdal as pdal_env
+from .runtime import wkt_of
 from .stagefiles import reader_files
 
 #: Stages that may bring points into one reference.
@@ -37,13 +38,14 @@ class Reference:
     )  #: the projection's parameters; empty where they are not known
     height: str = ""  #: the authority's code of the heights' system, where it is known
     name: str = ""
-    wkt: str = ""  #: of the horizontal system, for other programs
+    wkt: str = ""  #: of the whole system, with the heights' where the file names one
 
 
-def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
-    """The reference of what a reader reads, according to PDAL; `horizontal` overrides the unit of x and y.
+def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str = "") -> Reference:
+    """Return the reference of what a reader reads, according to PDAL.
 
-    The reader should be restricted to as few points as possible.
+    `horizontal` and `vertical` override the unit of x and y, and of z. The reader should be restricted to as few
+    points as possible.
     """
     # Without extra bytes: of a file with odd ones, all of it would be copied for a single point.
     plain = {"ignore_vlr": "LASF_Spec/4"} if reader["type"] == "readers.las" else {}
@@ -51,7 +53,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     said = run.metadata.get("metadata", {})
     node: Any = next((node for kind, node in said.items() if kind.startswith("readers.")), {})
     srs = (node[0] if isinstance(node, list) else node).get("srs", {})
-    wkt = str(srs.get("compoundwkt") or srs.get("wkt") or "")
+    wkt = wkt_of(srs)
     if not wkt and "GDAL failure" in run.log:
         raise PipelineError(
             pdal_env.BROKEN_REFERENCE,
@@ -65,7 +67,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
             (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
         )
         middle = ((x0 + x1) / 2, (y0 + y1) / 2) if count else None
-        units = units_of_wkt(wkt, horizontal=horizontal, place=middle)
+        units = units_of_wkt(wkt, horizontal=horizontal, vertical=vertical, place=middle)
         if units.assumed:
             refuse_likely_degrees(count, x0, y0, x1, y1)
     except StageError as error:
@@ -74,18 +76,17 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "") -> Reference:
     plane = frozenset(w for w in words if w not in _ALIKE and not _ASIDE.match(w))
     root = parse_wkt(wkt)
     height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
-    across = str(srs.get("horizontal") or srs.get("wkt") or "")
-    return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt), across)
+    return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt), wkt)
 
 
-def reference_of_file(path: str, horizontal: str = "") -> Reference:
-    """The same of a file."""
+def reference_of_file(path: str, horizontal: str = "", vertical: str = "") -> Reference:
+    """Return the reference of a file; see :func:`reference_of`."""
     las = (
         {"type": "readers.las", "count": 1}
         if named_las(path) and read_header(path) is not None
         else {}
     )
-    return reference_of(pdal_env.typed([{"filename": path, **las}])[0], horizontal)
+    return reference_of(pdal_env.typed([{"filename": path, **las}])[0], horizontal, vertical)
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> list[str]:

@@ -129,7 +129,11 @@ def review_files(
     work = [(path, references[path].wkt, model, side, number) for number, path in enumerate(files)]
     for cells_of_file in each_file(cells_of, work, workers):
         found += cells_of_file
-    if not any(map(len, found)):
+    headers = map(read_header, files)
+    if all(header is not None and not header.count for header in headers):
+        nothing = np.empty(0)
+        found = [ReviewCells.of(np.empty((0, 3)), nothing.astype(np.uint8), nothing, side)]
+    elif not any(map(len, found)):
         raise StageError(
             "no point is ground, vegetation or a building",
             found=", ".join(files[:3]),
@@ -138,7 +142,8 @@ def review_files(
     cells = ReviewCells.join(found)
     patches = find_patches(cells)
     held = np.cumsum(patches.errors)
-    listed = int(np.searchsorted(held, share * held[-1])) + 1 if held[-1] > 0 else 0
+    some = len(held) and held[-1] > 0
+    listed = int(np.searchsorted(held, share * held[-1])) + 1 if some else 0
     return Review(
         cells, patches, min(listed, len(patches)), files, references[files[0]].units.horizontal
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..base.errors import DependencyError, StageError
 from ..base.files import check_writable, whole_files
 from ..base.las import class_color
-from ..base.units import Units
+from ..base.units import Units, horizontal_part
 from ..objects.cells import CLASSES, Cells, Kind, refuse_unclassified
 from ..objects.find import find_objects
 from ..objects.found import Objects, ObjectSettings, Table
@@ -246,7 +246,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
                 list(layer.columns),
                 driver=driver,
                 geometry_type=layer.kind,
-                crs=wkt or None,
+                crs=horizontal_part(wkt) or None,
                 layer=named,
                 **({"VERSION": "1.2"} if named else {}),  # of which GDAL before 3.7 does not warn
             )

@@ -29,6 +29,7 @@ from .settings import Density, Extent, TilingOptions, block_bytes, settled
 from .store import fingerprint
 
 #: Options of readers.tindex that select files or points, or change them.
+_NAME_IT = "--readers.las.default_srs=EPSG:CODE names it in both"
 _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
 #: Bytes of the digest, at the beginning and the end.
 _ENDS = 1 << 16
@@ -277,7 +278,10 @@ class Survey:
             reasons = iter(self.unreadable.values())
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if needed:
-            self.messages += check_one_reference(found)
+            said = check_one_reference(found)
+            if said and self.per == "file":
+                said[0] += f", and the output gets none: {_NAME_IT}"
+            self.messages += said
         return next(iter(found.values())).units.horizontal
 
     def _reference_of(self, source: InputSource, horizontal: str) -> Reference:

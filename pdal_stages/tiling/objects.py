@@ -99,9 +99,10 @@ def _find_in_files(
     inputs: Sequence[str], stage: ObjectsWriter, workers: int
 ) -> tuple[Objects, Units, str]:
     """The objects of all files together; the units of the coordinates and their reference (WKT)."""
-    references = {path: reference_of_file(path, stage.horizontal_unit) for path in inputs}
+    units = (stage.horizontal_unit, stage.vertical_unit)
+    references = {path: reference_of_file(path, *units) for path in inputs}
     print_messages(*check_one_reference(references))
-    units, wkt = references[inputs[0]].units, references[inputs[0]].wkt
+    wkt = references[inputs[0]].wkt
     cells = _all_cells(inputs, stage, wkt, workers)
     size, thin = cells.size, cells.thin()
     while stage.widens and cells.thin() and cells.size < LARGEST:
@@ -113,7 +114,8 @@ def _find_in_files(
             if stage.widens
             else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
         )
-    return find_objects(cells, replace(stage.settings, cell=cells.size)), units, wkt
+    found = find_objects(cells, replace(stage.settings, cell=cells.size))
+    return found, references[inputs[0]].units, wkt
 
 
 def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
