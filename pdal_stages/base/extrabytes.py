@@ -88,7 +88,7 @@ def _valid_name(title: str, count: int, taken: set[str]) -> tuple[str, bool]:
         number += 1
         name = f"{stem[:26]}_{number}"
     taken.update(map(_plain, _elements(name, count)))
-    return name, clashes
+    return name, clashes or number > 1
 
 
 def _described(header: LasHeader, data: bytes) -> list[tuple[str, bytes]]:

@@ -97,7 +97,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
         )
     if clashing := [f"{one.title} as {one.name}" for one in fields if one.clashes]:
         return (
-            f"{path}: extra bytes named like dimensions of LAS are read and written under other names: "
+            f"{path}: extra bytes named like other dimensions are read and written under other names: "
             + ", ".join(clashing)
         )
     return None

@@ -259,6 +259,19 @@ def test_a_survey_and_its_corrections(command, tmp_path, write_las, model):
     assert set(own) <= set(laspy.read(tmp_path / "kept.laz").point_format.extra_dimension_names)
 
 
+def test_two_of_one_name(command, tmp_path, write_las, model):
+    """PDAL holds one dimension of a name, laspy refuses the file: the second one gets another name."""
+    extra = {"Qqq": np.full(600, 1.0), "Rrr": np.full(600, 2.0)}
+    source = write_las(tmp_path / "in.las", {**scene(), **extra}, point_format=6)
+    with_titles(source, {"Qqq": "Same", "Rrr": "Same"})
+    found = [
+        classified(command, source, tmp_path / f"{door}.las", model, *words)
+        for door, words in DOORS.items()
+    ]
+    is_same(*found)
+    assert (found[0]["Same"] == 1).all() and (found[0]["Extra_Same"] == 2).all()
+
+
 # ---- dimensions of the input that stages make, too ----------------------------------------------
 
 
