@@ -1,4 +1,4 @@
-"""Towers and poles: supports of generated corridors, what holds no wires, tiles, the stage, a real tower."""
+"""Towers: supports of generated corridors, what holds no wires, tiles, the stage, a real tower."""
 
 from __future__ import annotations
 
@@ -35,8 +35,6 @@ def found(xyz, height, wire):
         ("highest voltage", 1.0),
         ("high voltage, uphill", 1.0),
         ("two lines beside each other", 1.0),
-        ("low voltage along a street", 0.85),
-        ("medium voltage in woods", 0.6),
     ],
 )
 def test_supports_of_lines(name, share):
@@ -53,7 +51,7 @@ def test_supports_of_lines(name, share):
 
 
 def test_without_wires_there_are_no_towers():
-    xyz, codes, height, wire = scene("low voltage along a street")
+    xyz, codes, height, wire = scene("two lines beside each other")
     assert not found(xyz, height, np.zeros(len(xyz), bool)).any()
     assert not find_towers(xyz, height, wire, codes == 2).any()
     for few in (
@@ -66,14 +64,14 @@ def test_without_wires_there_are_no_towers():
 
 
 def test_wires_that_do_not_rise_have_no_support():
-    xyz, _, height, wire = scene("low voltage along a street")
+    xyz, _, height, wire = scene("two lines beside each other")
     level = np.where(
         wire, xyz[:, 2] - height + 8.0, xyz[:, 2]
     )  # no sag: nothing tells where they are held
     assert not found(np.column_stack([xyz[:, :2], level]), np.where(wire, 8.0, height), wire).any()
 
 
-@pytest.mark.parametrize("name", ["two lines beside each other", "low voltage along a street"])
+@pytest.mark.parametrize("name", ["two lines beside each other", "high voltage, uphill"])
 def test_order_of_points_and_tiles_change_nothing(name):
     xyz, _, height, wire = scene(name)
     whole = found(xyz, height, wire)
@@ -82,7 +80,9 @@ def test_order_of_points_and_tiles_change_nothing(name):
     middle = np.median(xyz[whole, 1])
     for low in (middle - 40.0, middle - 3.5, middle + 11.0):
         core = (xyz[:, 1] >= low) & (xyz[:, 1] < low + 30)
-        near = (xyz[:, 1] >= low - towers.REACH) & (xyz[:, 1] < low + 30 + towers.REACH)
+        near = (xyz[:, 1] >= low - towers.RULES.reach_m) & (
+            xyz[:, 1] < low + 30 + towers.RULES.reach_m
+        )
         assert near.sum() < 0.8 * len(xyz)
         assert np.array_equal(found(xyz[near], height[near], wire[near])[core[near]], whole[core])
 
@@ -116,4 +116,6 @@ def test_the_stage_gives_towers_their_class():
         points.report.figures["left"]["5"]
         == (after != before).sum() - (tower & (before != 5)).sum()
     )
-    assert stage.halo_m() == lines.REACH + towers.REACH and stage.largest_class() == 65
+    assert (
+        stage.halo_m() == lines.RULES.reach_m + towers.RULES.reach_m and stage.largest_class() == 65
+    )

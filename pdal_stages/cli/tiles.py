@@ -51,7 +51,7 @@ def add_commands(parser: Parser) -> None:
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
         ("--bridges", False, "Find bridge decks, class 17"),
         ("--wires", False, "Find wires, class 14; without it they become building"),
-        ("--towers", False, "Find wires, and towers and poles, class 15"),
+        ("--towers", False, "Find wires, and their towers, class 15"),
     ):
         takes(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
     takes(

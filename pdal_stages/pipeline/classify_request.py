@@ -49,7 +49,7 @@ class ClassifyRequest:
         False  #: find bridge decks, where heights come from ``filters.hag_morphological``
     )
     wires: bool = False  #: find wires, where heights are computed
-    towers: bool = False  #: find wires, and towers and poles
+    towers: bool = False  #: find wires, and their towers
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     #: Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
     vegetation_heights: str = ""

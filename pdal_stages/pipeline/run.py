@@ -41,7 +41,7 @@ LEFT_ALONE = {
     "outside_where": "outside where",
     "decks": "bridge decks (bridges)",
     "wires": "wires (wires)",
-    "towers": "towers and poles (wires)",
+    "towers": "towers (wires)",
 }
 
 

@@ -46,7 +46,7 @@ class ObjectOptions:
     trees: list[int] = _codes("trees", "vegetation that trees are looked for in")
     wires: list[int] = _codes("wires", "wires")
     decks: list[int] = _codes("decks", "bridge decks")
-    towers: list[int] = _codes("towers", "towers and poles, where spans of wires end")
+    towers: list[int] = _codes("towers", "towers, where spans of wires end")
     refuse: list[str] = option(
         "list",
         (),

@@ -1,4 +1,4 @@
-"""``filters.wires``: class of wires, long thin lines that hang in the air, and of the towers and poles that hold them."""
+"""``filters.wires``: class of wires, long thin lines that hang in the air, and of the towers that hold them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..base.las import TOWER, WIRE
 from ..structures import towers
 from ..structures.towers import find_towers
-from ..structures.wires import REACH, find_wires
+from ..structures.wires import RULES, find_wires
 from .base import ClassStage
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
@@ -21,9 +21,9 @@ class Wires(ClassStage):
     where_help = "Points outside keep their class but still serve as neighbors"
     code: int = code_option(WIRE, "Class code of wires")
     towers: bool = option(
-        "boolean", False, "Also give towers and poles their class, where wires end and meet"
+        "boolean", False, "Also give towers their class, where wires end and meet"
     )
-    tower_code: int = code_option(TOWER, "Class code of towers and poles")
+    tower_code: int = code_option(TOWER, "Class code of towers")
     ignore: Selection = ignore_option(
         "Points that are left out, even as neighbors, and keep their class"
     )
@@ -33,7 +33,7 @@ class Wires(ClassStage):
         return ["Classification", "HeightAboveGround"]
 
     def halo_m(self) -> float:
-        return REACH + (towers.REACH if self.towers else 0.0)
+        return RULES.reach_m + (towers.RULES.reach_m if self.towers else 0.0)
 
     def largest_class(self) -> int:
         return max(self.code, self.tower_code) if self.towers else self.code
