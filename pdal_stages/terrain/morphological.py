@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.resources import map_blocks
 from .cells import HIGHEST, CellWindow, columns, patches, usable
+from .givenground import given_pieces
 from .groundblocks import GroundCells
 from .groundcells import (
     FAR,
@@ -61,6 +62,7 @@ def filtered_ground(
     threads: int | None = None,
     figures: dict[str, Any] | None = None,
     cells: GroundCells | None = None,
+    given: ArrayLike | None = None,
 ) -> dict[str, NDArray]:
     """Height of every point above the ground that a progressive morphological filter finds.
 
@@ -90,6 +92,9 @@ def filtered_ground(
     cells : GroundCells, optional
         Cells whose ground was found before (:func:`.groundblocks.cells_of_block`), all within the `reach_of_cells` of
         :class:`.FilterOptions` of the points, which then need no others around them.
+    given : array_like of bool, shape (n,), optional
+        Points that are the ground: nothing is filtered, they alone form the surface. They are ``Ground``, and so are
+        others within the tolerance of the surface.
 
     Returns
     -------
@@ -107,11 +112,13 @@ def filtered_ground(
     options = FilterOptions(cell, slope, window, threshold, scalar, openings)
     x, y, z = columns(x, y, z)
     finite, use = usable(x, y, z), usable(x, y, z, mask=mask)
+    known = None if given is None else usable(x, y, z, mask=given)
     all_finite = bool(finite.all())
     if not all_finite:
         x, y, z, use = x[finite], y[finite], z[finite], use[finite]
+        known = None if known is None else known[finite]
     use &= np.abs(z) < HIGHEST
-    counts = {"without_terrain": 0} if cells is not None else {"pits": 0, "without_terrain": 0}
+    counts = {"without_terrain": 0} | ({"pits": 0} if cells is None and given is None else {})
     out: dict[str, NDArray] = {
         "HeightAboveGround": np.zeros(len(x)),
         "Ground": np.zeros(len(x), np.uint8),
@@ -120,15 +127,21 @@ def filtered_ground(
     }
     if len(x):
         points = GroundPoints.of(x, y, z, z, use, cell)
-        pieces = (
-            _found(points, options, counts) if cells is None else _given(points, options, cells)
-        )
+        pieces: Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]
+        if known is not None:
+            pieces = given_pieces(points, options, known & use)
+        elif cells is not None:
+            pieces = _from_cells(points, options, cells)
+        else:
+            pieces = _found(points, options, counts)
         for of, own, raster, means in pieces:
             found = _measured(
                 points.some(of), own, raster, means, options, slope_too, threads, counts
             )
             for name, values in found.items():
                 out[name][of if isinstance(of, slice) else of[own]] = values[own]
+        if known is not None:
+            out["Ground"][known & use] = 1
     if figures is not None:
         figures["ground_points"] = int(np.count_nonzero(out["Ground"]))
         figures.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
@@ -150,10 +163,10 @@ def _found(
         yield of, own, raster, None
 
 
-def _given(
+def _from_cells(
     points: GroundPoints, options: FilterOptions, cells: GroundCells
 ) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
-    """The same with the ground that was found before, as cells."""
+    """Yield pieces of the cloud with the ground raster that an earlier round computed."""
     for of, own in patches(points.column, points.row, 0, options.link):
         window = CellWindow.round(points.column[of], points.row[of]).grown(options.reach_of_cells)
         yield of, own, *cells.on(window, options.opening_radii)

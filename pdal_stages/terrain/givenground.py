@@ -1,0 +1,73 @@
+"""The ground raster of ground that is given: surveyed, edited, or found by another program."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .belowground import pits, pits_reach
+from .cells import HOLE, CellWindow, lowest_points, patches
+from .groundcells import (
+    FAR,
+    NEAR,
+    CellMeans,
+    FilterOptions,
+    GroundPoints,
+    add_ground,
+    means_of,
+)
+from .openings import objects_of
+from .planes import GroundRaster
+from .planes import reach as planes_reach
+
+
+def reach_of_given(options: FilterOptions) -> int:
+    """Return how far away, in cells, points can change a point's height above given ground, or an opening's."""
+    surfaces = sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
+    if not options.opening_radii:
+        return surfaces + 4
+    return max(surfaces, 2 * max(options.opening_radii) + pits_reach(options.cell)) + 4
+
+
+def given_pieces(
+    points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_]
+) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans]]:
+    """Yield pieces of the cloud with the raster of the points (n,) that are `ground`.
+
+    Numbers of the piece's points, which of them are its own, the raster, and the means of its ground points by cell.
+    """
+    margin = 2 + max([0, *options.opening_radii])
+    for of, own in patches(points.column, points.row, reach_of_given(options), options.link):
+        part = points.some(of)
+        window = CellWindow.round(part.column, part.row).grown(margin)
+        shape = window.height, window.width
+        count, place = np.zeros(shape, np.int64), np.zeros((*shape, 3))
+        add_ground(
+            part.x, part.y, part.z, ground[of], part.column, part.row,
+            options.cell, window.left, window.bottom, count, place,
+        )  # fmt: skip
+        held = means_of(count, place)
+        heights = np.where(held, place[..., 2], HOLE).astype(np.float32)
+        opened = _openings(part, options, window)
+        yield of, own, GroundRaster(window, heights, place, held, heights, opened), (held, place)
+
+
+def _openings(
+    points: GroundPoints, options: FilterOptions, window: CellWindow
+) -> dict[int, NDArray[np.float32]]:
+    """Return radius in cells -> opening (h, w) of the minimum grid of all points, low outliers left out; meters."""
+    radii = options.opening_radii
+    if not radii:
+        return {}
+    mine, shape = np.flatnonzero(points.use), (window.height, window.width)
+    inside = window.numbers(points.column[mine], points.row[mine])
+    low = lowest_points(points.x[mine], points.y[mine], points.z[mine], inside, shape[0] * shape[1])
+    lowest = np.append(mine, -1)[low.reshape(shape)]
+    raster = np.where(lowest >= 0, points.z[lowest], HOLE).astype(np.float32)
+    highest = np.full(raster.size, -np.inf)
+    np.maximum.at(highest, inside, points.top[mine])
+    raster[pits(raster, highest.reshape(shape), options.cell)] = HOLE
+    return objects_of(raster, options.cell, options.slope, max(radii), radii)[2]
