@@ -54,6 +54,8 @@ NAMES = {code: name for code, (name, _) in _CLASSES.items()}
 
 #: Codes of noise points: below ground (7) and in the air (18).
 NOISE = (7, 18)
+#: Ground.
+GROUND = 2
 #: ASPRS codes of low, medium and high vegetation.
 LOW, MEDIUM, HIGH = 3, 4, 5
 #: Conductors, towers and bridge decks.

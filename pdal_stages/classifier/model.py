@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, ModelError, OptionError, suggest
+from ..base.las import GROUND
 from ..base.messages import Report
 from ..features import FeaturePlan
 from ..features.cells import check_side, density, represent
@@ -183,6 +184,7 @@ class Model:
         *,
         current: npt.ArrayLike | None = None,
         ignore: npt.ArrayLike | None = None,
+        may_be_ground: npt.ArrayLike | None = None,
         progress: Any = None,
         **options: Any,
     ) -> Prediction:
@@ -204,6 +206,9 @@ class Model:
             the former get 0 (never classified) and the latter 1 (unclassified).
         ignore : (n,) bool, optional
             Points that are not there for the model: not classified, and not even neighbors. For noise.
+        may_be_ground : (n,) bool, optional
+            Points that may become class 2. Others for which it wins get the second class, with its probability as
+            reliability and a margin of 0.
         progress : object, optional
             Its ``update`` is called with the points done.
         **options
@@ -218,7 +223,7 @@ class Model:
             )
         xyz = check_xyz(xyz)
         n = len(xyz)
-        given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads)
+        given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads, current)
         asked = (
             np.ones(n, np.bool_)
             if where is None
@@ -252,6 +257,10 @@ class Model:
                 else {}
             ),
         }
+        second, may = may_be_ground is not None, asked
+        if may_be_ground is not None:
+            may = _checked("may_be_ground", may_be_ground, n, "b", "true or false")
+            out["second"], out["second_share"] = np.zeros(n, np.uint8), np.zeros(n, np.float32)
         values = known(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
         del values, there
@@ -279,7 +288,7 @@ class Model:
         # Before the search structures are there, with which it would be the most that is held.
         found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
         for at, decided in predict(
-            self.weighted_passes, request, lambda p: decide(weighed(p, factors), codes, how)
+            self.weighted_passes, request, lambda p: decide(weighed(p, factors), codes, how, second)
         ):
             place: Any = slice(None)
             if order is not None:
@@ -290,6 +299,9 @@ class Model:
                     progress.update(len(at))
             for name, values in decided.items():
                 out[name][at] = values[place]
+        if second:
+            moved = _move_from_ground(out, asked & ~may)
+            request.report.figures["too_far_for_ground"] = moved
         self._report_density(request.report, found, request.count)
         request.report.warnings.extend(self.outdated)
         if len(xyz) < n - ignored:
@@ -323,6 +335,7 @@ class Model:
         given: dict[str, npt.ArrayLike],
         ignore: npt.ArrayLike | None,
         threads: int | None,
+        current: npt.ArrayLike | None = None,
     ) -> dict[str, npt.ArrayLike]:
         """The dimensions, with heights made as in training where they are missing and the model says how."""
         missing = [name for name in self.required_dimensions if name not in given]
@@ -330,7 +343,8 @@ class Model:
         if not missing:
             return given
         usable = None if ignore is None else ~np.asarray(ignore, bool)
-        made = preparation_module().made_of_coordinates(preparation, xyz, usable, threads)
+        classes = None if current is None else np.asarray(current).astype(np.uint8)
+        made = preparation_module().made_of_coordinates(preparation, xyz, usable, threads, classes)
         if made.keys() & given.keys() and made.keys() & set(
             missing
         ):  # heights of two kinds would be mixed
@@ -365,15 +379,37 @@ class Model:
 
 
 def decide(
-    p: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], options: PredictionOptions
+    p: npt.NDArray[np.floating],
+    codes: npt.NDArray[np.uint8],
+    options: PredictionOptions,
+    second: bool = False,
 ) -> dict[str, npt.NDArray[Any]]:
-    """The winner of each row of probabilities (n, classes), of equal ones the first class, and what is asked for."""
+    """Return the winner of each row of probabilities (n, classes), of equal ones the first class, and what is wanted.
+
+    With `second`, also the class that would win without it, and its probability.
+    """
     best = p.argmax(axis=1)
     win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
     out = {"classification": codes[best], "reliability": win}
     if options.margin:
         out["margin"] = win - np.partition(p, -2, axis=1)[:, -2] if p.shape[1] > 1 else win
+    if second:
+        others = p.copy()
+        np.put_along_axis(others, best[:, None], -1.0, axis=1)
+        next_best = others.argmax(axis=1)
+        out["second"] = codes[next_best]
+        out["second_share"] = np.take_along_axis(p, next_best[:, None], axis=1)[:, 0]
     return {**out, "probabilities": p} if options.probabilities else out
+
+
+def _move_from_ground(out: dict[str, npt.NDArray[Any]], forbidden: npt.NDArray[np.bool_]) -> int:
+    """Give points (n,) that must not be ground, but are, their second class; returns how many there were."""
+    second, share = out.pop("second"), out.pop("second_share")
+    rows = np.flatnonzero(forbidden & (out["classification"] == GROUND))
+    out["classification"][rows], out["reliability"][rows] = second[rows], share[rows]
+    if "margin" in out:
+        out["margin"][rows] = 0.0
+    return len(rows)
 
 
 def _reject(

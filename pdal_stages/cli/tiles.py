@@ -36,11 +36,17 @@ _MOST_FAILURES, _MOST_TILES = 20, 50
 def add_commands(parser: Parser) -> None:
     """``classify``."""
     what = "Classify point clouds: ground, vegetation, buildings and more"
-    rare = ("dimensions", "bridges", "metadata", "scheduler", "per")
+    rare = ("ground", "dimensions", "bridges", "metadata", "scheduler", "per")
     takes = parser.command("classify", _classify, what, overrides=True, logged=True, rare=rare)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
     takes("output", help="A file, a folder, or a name with # for the input's")
     takes("--model", default="standard", help="A model file or a shipped model (default: standard)")
+    takes(
+        "--ground",
+        choices=("found", "given"),
+        default="found",
+        help="given: points of class 2 are the ground, and stay so (default: found)",
+    )
     takes(
         "--dimensions",
         metavar="LIST",
@@ -93,6 +99,7 @@ def _classify(options: argparse.Namespace) -> int:
         wires=options.wires or options.towers,
         polygons=tuple(options.polygons),
         vegetation_heights=options.vegetation_heights or "",
+        given_ground=options.ground == "given",
         **{name: getattr(options, name) for name in same},
     )
     print_messages(*request.cost)

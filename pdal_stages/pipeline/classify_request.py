@@ -9,6 +9,7 @@ from typing import Any
 
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.extrabytes import extra_dimensions
+from ..base.las import GROUND, OVERLAP
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation
@@ -21,7 +22,7 @@ from .run import Pipeline
 from .stagefiles import LAS_WRITERS
 
 #: The stage whose ground bridge decks lead on to.
-_GROUND = "filters.hag_morphological"
+_GROUND = preparation.GROUND_FILTER
 
 #: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
@@ -54,6 +55,7 @@ class ClassifyRequest:
     #: Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
     vegetation_heights: str = ""
     keep_sure: float | None = None  #: see ``filters.modelclassifier``
+    given_ground: bool = False  #: points of class 2 are the ground, and stay so
 
     @property
     def _inside(self) -> dict[str, str]:
@@ -108,14 +110,31 @@ class ClassifyRequest:
                 {**stage, "ground": True} if stage["type"] == _GROUND else stage
                 for stage in prepared
             ]
-        noise = [{"type": "filters.detachednoise", **self._inside}] if self.noise else []
-        return [*noise, *prepared, self._classifier, *self._corrections]
+        noise, classifier = {"type": "filters.detachednoise", **self._inside}, self._classifier
+        if self._ground_is_given:
+            ground = f"Classification != {GROUND}"
+            noise["where"] = f"({self.where}) && {ground}" if self.where else ground
+            classifier = {**classifier, "given_ground": True}
+        return [*([noise] if self.noise else []), *prepared, classifier, *self._corrections]
 
     @property
     def _prepared(self) -> list[dict[str, Any]]:
         """The stages before the classifier, as the model says or its dimensions need."""
         needed = self.loaded.required_dimensions
-        return self.loaded.info.get("preparation") or preparation.preparation_of(needed)
+        stages = self.loaded.info.get("preparation") or preparation.preparation_of(needed)
+        if not self.given_ground:
+            return stages
+        if not any(stage["type"] == _GROUND for stage in stages):
+            raise OptionError(
+                f"--ground given needs a model whose heights come from {_GROUND}",
+                found=f"{self.model}: {', '.join(stage['type'] for stage in stages) or 'no heights'}",
+                cure="Leave it out, or take another model",
+            )
+        return preparation.with_given_ground(stages)
+
+    @property
+    def _ground_is_given(self) -> bool:
+        return any(stage.get("given_ground") for stage in self._prepared)
 
     @property
     def _corrections(self) -> list[dict[str, Any]]:
@@ -137,6 +156,9 @@ class ClassifyRequest:
         for stage in stages:
             if stage["type"] == "filters.wires" and self.towers:
                 stage["towers"] = True
+            if self._ground_is_given and stage["type"] != "filters.polygons":
+                kept = stage.get("keep", OVERLAP)
+                stage["keep"] = [*(kept if isinstance(kept, list) else [kept]), GROUND]
         if self.polygons:
             stages[-1]["polygons"] = list(self.polygons)
         return stages

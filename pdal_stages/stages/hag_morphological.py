@@ -10,7 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.errors import NoTerrainError
+from ..base.las import GROUND
 from ..terrain.cells import SIDE
+from ..terrain.givenground import reach_of_given
 from ..terrain.groundblocks import (
     GroundCells,
     around_blocks,
@@ -61,6 +64,7 @@ class HagMorphological(Stage):
         "ground",
         "terrain_slope",
         "openings",
+        "given_ground",
         "where",
     )
     cell: float = option(
@@ -111,6 +115,13 @@ class HagMorphological(Stage):
         may_be_empty=True,
     )
 
+    given_ground: bool = option(
+        "boolean",
+        False,
+        "Points of class 2 are the ground: nothing is filtered, heights are measured from them alone, and Ground is 1 for "
+        "them and for others that are as near to the surface as threshold and scalar say",
+    )
+
     def check(self) -> None:
         self._filter = FilterOptions(
             **{one.name: self.options[one.name] for one in fields(FilterOptions)}
@@ -124,7 +135,12 @@ class HagMorphological(Stage):
             **dict.fromkeys(opening_names(self.openings), "float"),
         }
 
+    def reads(self) -> list[str]:
+        return ["Classification"] if self.given_ground else []
+
     def halo_m(self) -> float:
+        if self.given_ground:
+            return reach_of_given(self._filter) * self.cell
         return self._filter.reach_of_points * self.cell
 
     #: In tiles: what :meth:`made_of_blocks` gave.
@@ -168,6 +184,13 @@ class HagMorphological(Stage):
         wanted = points.wanting("HeightAboveGround", self.makes_again)
         all_wanted = bool(wanted.all())
         cells, self.from_blocks = self.from_blocks, None  # needed once
+        given = usable & (points.class_codes == GROUND) if self.given_ground else None
+        if given is not None and not given.any():
+            raise NoTerrainError(
+                "no ground is given: none of the points has class 2",
+                found=f"{points.count:,} points",
+                cure="Classify the ground first, or leave 'given_ground' out: ground is then found",
+            )
         found = filtered_ground(
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
@@ -176,6 +199,7 @@ class HagMorphological(Stage):
             threads=self.threads,
             cells=cells,
             figures=points.report.figures,
+            given=given if given is None or all_wanted else given[wanted],
         )
         out = {}
         for name in self.creates():

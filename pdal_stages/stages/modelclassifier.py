@@ -10,19 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import OptionError
+from ..base.las import GROUND, LOW, MEDIUM, by_height
 from ..base.las import HIGH as HIGH_VEGETATION
-from ..base.las import LOW, MEDIUM, by_height
 from ..base.messages import Progress
 from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.modelfile import find
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
-from .base import Stage
+from .base import Stage, stage_type
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
-from .preparation import as_json, same
+from .preparation import OF_PDAL, as_json, same, with_given_ground
 from .selection import Selection
 
 HEIGHT = "HeightAboveGround"
+#: Where points have no Ground, they lie this near to given ground or do not become ground, meters: the default
+#: threshold of filters.hag_morphological.
+_TOLERANCE = 0.5
 #: Parts of the unit that compact outputs are rounded to: probabilities and the like, and heights.
 _PARTS, _PARTS_OF_HEIGHT = 64, 32
 
@@ -100,6 +103,12 @@ class ModelClassifier(Stage):
         "Round HeightAboveGround to 1/32 of Z's unit, Reliability, Margin and probabilities to 1/64: compressed, they take "
         "a third of the bytes",
     )
+    given_ground: bool = option(
+        "boolean",
+        False,
+        "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is 1, or without that "
+        "dimension within 0.5 m of it (HeightAboveGround)",
+    )
     memory: int = option(
         "integer",
         256,
@@ -164,18 +173,47 @@ class ModelClassifier(Stage):
             else None
         )
 
+    #: Whether heights come from PDAL's stages, which measure from points of class 2.
+    measured_by_pdal: bool = False
+
     def follows(self, preparation: list[dict[str, Any]]) -> str | None:
+        types = [stage["type"] for stage in preparation]
+        self.measured_by_pdal = bool(types) and {*types} <= {*OF_PDAL}
         if not self.preparation or not preparation or same(preparation, self.preparation):
             return None
+        if self.given_ground and same(preparation, with_given_ground(self.preparation)):
+            return None
+        made = ", ".join(self.made_from_ground)
         return (
             f"{self.type}: the model was trained on other heights than this pipeline makes. Trained on: "
-            f"{as_json(self.preparation)}. Here: {as_json(preparation)}. Expect lower accuracy, or use the former"
+            f"{as_json(self.preparation)}. Here: {as_json(preparation)}"
+            f"{f', and from points of class 2 {made}' if made else ''}. Expect lower accuracy, or use the former"
         )
 
+    @property
+    def made_from_ground(self) -> list[str]:
+        """Dimensions that the model needs beside heights, and that are computed from class 2 as PDAL made the heights."""
+        if not self.measured_by_pdal or len(self.preparation) != 1 or not self._of_ground.creates():
+            return []
+        made = self._of_ground.creates().keys() - {HEIGHT}
+        return [name for name in self.model.required_dimensions if name in made]
+
+    @cached_property
+    def _of_ground(self) -> Any:
+        """The model's own stage of heights, for ground that is given."""
+        (stage,) = with_given_ground(self.preparation)
+        kind = stage_type(stage.pop("type"))
+        units = {name: getattr(self, name) for name in ("horizontal_unit", "vertical_unit")}
+        return kind({**stage, **units, "threads": self.threads})
+
     def reads(self) -> list[str]:
+        made = self.made_from_ground
         return list(
             dict.fromkeys(
-                [*self.model.required_dimensions, *([HEIGHT] if self.vegetation_heights else [])]
+                [
+                    *(one for one in self.model.required_dimensions if one not in made),
+                    *([HEIGHT] if self.vegetation_heights or self.given_ground else []),
+                ]
             )
         )
 
@@ -191,7 +229,8 @@ class ModelClassifier(Stage):
         }
 
     def halo_m(self) -> float:
-        return self.model.halo_m
+        more = self._of_ground.halo_m() if self.made_from_ground else 0.0
+        return self.model.halo_m + more
 
     def largest_class(self) -> int:
         return max([code for code, _ in self.model.classes] + [self._rejected or 0])
@@ -205,13 +244,18 @@ class ModelClassifier(Stage):
     def run(self, points: Points) -> dict[str, NDArray]:
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
+        current = points.class_codes
+        if self.given_ground:
+            kept = kept | (current == GROUND)
+        if missing := [name for name in self.made_from_ground if name not in points.arrays]:
+            self._add_from_ground(points, missing)
         points.report.figures["kept"] = points.counted(inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         dimensions = {
             n: points.arrays[n] for n in self.model.optional_dimensions if n in points.arrays
         }
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
-        current = points.class_codes
+        ground = self._may_be_ground(points) if self.given_ground else None
         points.keep_only([*dimensions, *self.creates(), HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(
@@ -220,6 +264,7 @@ class ModelClassifier(Stage):
                 None if wanted.all() else wanted,
                 current=current,
                 ignore=ignored if ignored.any() else None,
+                may_be_ground=ground,
                 threads=self.threads,
                 memory_mb=self.memory,
                 probabilities=self.probabilities,
@@ -269,6 +314,20 @@ class ModelClassifier(Stage):
         points.report.merge(found.report)
         points.report.figures["outside_where"] = points.counted(~inside)
         return values
+
+    def _add_from_ground(self, points: Points, names: list[str]) -> None:
+        """Compute dimensions from the points of class 2, as the model's own stage would."""
+        stage = self._of_ground
+        created = {name: np.zeros(points.count, np.float32) for name in stage.creates()}
+        arrays = {**points.arrays, **created}
+        made = stage.run(stage.points(arrays, wkt=points.wkt, legacy_flags=points.legacy_flags))
+        points.arrays = {**points.arrays, **{name: made[name] for name in names}}
+
+    def _may_be_ground(self, points: Points) -> NDArray[np.bool_]:
+        """Return which points (n,) are near enough to the ground that is given."""
+        if "Ground" in points.arrays:
+            return np.asarray(points.arrays["Ground"]) > 0
+        return np.abs(points.dimension(HEIGHT)) <= _TOLERANCE
 
 
 def _rounded(values: NDArray, parts: int) -> NDArray:

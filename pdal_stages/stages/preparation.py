@@ -24,6 +24,8 @@ from .options import Option, split_list
 PREPARATION: tuple[dict[str, Any], ...] = (
     {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
 )
+#: The stage that finds ground, or takes what is given.
+GROUND_FILTER = "filters.hag_morphological"
 #: PDAL's stages that heights come from; of ours, :meth:`Stage.creates` says what they make.
 OF_PDAL = (
     "filters.smrf",
@@ -171,6 +173,12 @@ def _number(value: float) -> int | float:
     return int(value) if value == int(value) else value
 
 
+def with_given_ground(preparation: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a preparation in which ground is given, and Ground says which points are near it."""
+    given = {"ground": True, "given_ground": True}
+    return [{**one, **given} if one["type"] == GROUND_FILTER else dict(one) for one in preparation]
+
+
 def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """The stage that makes these dimensions, as far as they are heights."""
     wanted = list(names)
@@ -193,10 +201,12 @@ def made_of_coordinates(
     xyz: npt.NDArray[np.float64],
     usable: npt.NDArray[np.bool_] | None = None,
     threads: int | None = None,
+    classes: npt.NDArray[np.uint8] | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
     """The dimensions that a preparation's only stage makes of coordinates in meters; none where it is not one of ours.
 
-    `usable` (n,) are points that may form the ground; the others only receive heights.
+    `usable` (n,) are points that may form the ground; the others only receive heights. `classes` (n,) are needed where
+    ground is given.
     """
     if (
         len(preparation) != 1
@@ -208,8 +218,12 @@ def made_of_coordinates(
     stage = stage_type(preparation[0]["type"])(
         {**options, "ignore": "withheld", "threads": threads or 0}
     )
+    if stage.reads() and classes is None:
+        return {}
     there = {name: np.zeros(len(xyz), number_type(kind)) for name, kind in stage.creates().items()}
     withheld = np.zeros(len(xyz), np.uint8) if usable is None else (~usable).view(np.uint8)
     columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **there}
+    if classes is not None:
+        columns["Classification"] = classes
     made = stage.run(stage.points(columns))
     return {name: values.astype(there[name].dtype, copy=False) for name, values in made.items()}

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .belowground import pits, pits_reach
-from .cells import HOLE, CellWindow, lowest_points, patches
+from .belowground import pits_reach
+from .cells import HOLE, CellWindow, patches
 from .groundcells import (
     FAR,
     NEAR,
@@ -18,6 +18,7 @@ from .groundcells import (
     GroundPoints,
     add_ground,
     means_of,
+    minimum_grid,
 )
 from .openings import objects_of
 from .planes import GroundRaster
@@ -62,12 +63,5 @@ def _openings(
     radii = options.opening_radii
     if not radii:
         return {}
-    mine, shape = np.flatnonzero(points.use), (window.height, window.width)
-    inside = window.numbers(points.column[mine], points.row[mine])
-    low = lowest_points(points.x[mine], points.y[mine], points.z[mine], inside, shape[0] * shape[1])
-    lowest = np.append(mine, -1)[low.reshape(shape)]
-    raster = np.where(lowest >= 0, points.z[lowest], HOLE).astype(np.float32)
-    highest = np.full(raster.size, -np.inf)
-    np.maximum.at(highest, inside, points.top[mine])
-    raster[pits(raster, highest.reshape(shape), options.cell)] = HOLE
+    _, raster, _ = minimum_grid(points, window, options.cell)
     return objects_of(raster, options.cell, options.slope, max(radii), radii)[2]

@@ -168,7 +168,7 @@ def ground_raster(
     """
     x, y, z, _, _, column, row = points
     window = CellWindow.round(column, row).grown(margin)
-    lowest, raster, low_outliers = _minimum_grid(points, window, options.cell)
+    lowest, raster, low_outliers = minimum_grid(points, window, options.cell)
     objects, floor, opened = objects_of(
         raster, options.cell, options.slope, options.radius, options.opening_radii
     )
@@ -198,7 +198,7 @@ def ground_raster(
     return made, low_outliers
 
 
-def _minimum_grid(
+def minimum_grid(
     points: GroundPoints, window: CellWindow, cell: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
     """Make the minimum grid of a window, without low outliers.

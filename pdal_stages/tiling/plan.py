@@ -194,7 +194,7 @@ def _first_round(
 ) -> FirstRound | None:
     """Find the far-reaching stage whose raster is computed first; it then needs no halo."""
     for at, step in enumerate(head):
-        if isinstance(step.ours, HagMorphological):
+        if isinstance(step.ours, HagMorphological) and not step.ours.given_ground:
             kept = _kept(readers, head[:at])
             found = FirstRound(at, sum(reaches[:at]), step.ours.blocks(), kept)
             reaches[at] = 0.0

@@ -1,0 +1,179 @@
+"""Ground that is given forms the surface, stays ground, and nothing far from it joins it."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+import pdal_stages as ps
+from pdal_stages.base.errors import StageError
+from pdal_stages.classifier.model import load_model
+from pdal_stages.cli import main
+from pdal_stages.pipeline.expansion import settle_upstream
+from pdal_stages.stages.base import stage_from
+from pdal_stages.terrain.givenground import reach_of_given
+from pdal_stages.terrain.groundcells import FilterOptions
+from pdal_stages.terrain.morphological import filtered_ground
+
+DATA = Path(__file__).parent / "data"
+OPTIONS = FilterOptions(openings=(5, 17))
+
+
+def clip(name):
+    las = laspy.read(DATA / f"{name}.laz")
+    return np.asarray(las.xyz), np.asarray(las.classification)
+
+
+@pytest.fixture
+def edited(tmp_path):
+    """A clip whose ground a person edited: a terrace of the roofs is ground, and a strip of ground is not marked."""
+    las = laspy.read(DATA / "city.laz")
+    codes, (x, y, _) = np.array(las.classification), np.asarray(las.xyz).T
+    part = (x < x.min() + 30) & (y < y.min() + 30)
+    las.points = las.points[part]
+    codes, x = codes[part], x[part]
+    given = (codes == 2) & ((x < x.min() + 10) | (x > x.min() + 14))
+    given[np.flatnonzero(codes == 6)[:40]] = True
+    las.classification = np.where(given, 2, 1).astype(np.uint8)
+    las.write(tmp_path / "edited.laz")
+    return tmp_path / "edited.laz"
+
+
+def far_from(xyz, given):
+    """Which points (n,) have a height above given ground beyond the tolerance."""
+    found = filtered_ground(xyz, given=given, slope_too=True)
+    slope = np.tan(np.radians(found["Slope"]))
+    return np.abs(found["HeightAboveGround"]) > OPTIONS.threshold + OPTIONS.scalar * slope + 0.05
+
+
+@pytest.mark.parametrize("name", ["city", "canals", "riverbank", "woods"])
+def test_the_surface_is_that_of_the_ground_that_is_given(name):
+    xyz, codes = clip(name)
+    ground, figures = codes == 2, {}
+    given = filtered_ground(xyz, given=ground, openings=(5, 17), figures=figures)
+    found = filtered_ground(xyz, openings=(5, 17))
+    height = np.abs(given["HeightAboveGround"][ground])
+    assert np.percentile(height, 99) < 0.25 and given["Ground"][ground].all()
+    assert np.percentile(height, 99) < np.percentile(np.abs(found["HeightAboveGround"][ground]), 99)
+    assert not given["Ground"][far_from(xyz, ground) & ~ground].any()
+    for opening in (
+        "HeightAboveOpening_5",
+        "HeightAboveOpening_17",
+    ):  # of all points, ground or not
+        assert np.array_equal(given[opening], found[opening])
+    assert figures["ground_points"] == np.count_nonzero(given["Ground"]) and "pits" not in figures
+
+
+def test_points_as_far_as_its_reach_decide():
+    """A part of a cloud gives the same bits with the reach around it, in any order."""
+    xyz, codes = clip("woods")
+    whole = filtered_ground(xyz, given=codes == 2, openings=(5, 17))
+    middle = np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20
+    near = np.flatnonzero(np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20 + reach_of_given(OPTIONS))
+    assert len(near) < 0.9 * len(xyz)
+    near = np.random.default_rng(0).permutation(near)
+    part = filtered_ground(xyz[near], given=codes[near] == 2, openings=(5, 17))
+    for name, values in part.items():
+        assert np.array_equal(values[middle[near]], whole[name][near][middle[near]]), name
+
+
+def test_only_points_near_enough_may_become_ground():
+    xyz, _ = clip("riverbank")
+    model = load_model("standard")
+    free = model.predict(xyz, margin=True)
+    may = np.arange(len(xyz)) % 2 == 0
+    bound = model.predict(xyz, may_be_ground=may, margin=True)
+    assert not (bound.classification[~may] == 2).any()
+    same = may | (free.classification != 2)
+    assert np.array_equal(bound.classification[same], free.classification[same])
+    moved = ~same
+    assert moved.any() and (bound.reliability[moved] <= 0.5).all() and not bound.margin[moved].any()
+    assert bound.report.figures["too_far_for_ground"] == np.count_nonzero(moved)
+
+
+def classified(path, out, *words):
+    assert main(["classify", str(path), str(out), "--ground", "given", *words]) == 0
+    las = laspy.read(out)
+    return np.asarray(las.xyz), np.asarray(las.classification), las
+
+
+@pytest.mark.pdal
+def test_classify_keeps_the_ground_that_is_given(edited, tmp_path, capsys):
+    given = np.asarray(laspy.read(edited).classification) == 2
+    xyz, codes, las = classified(edited, tmp_path / "out.laz", "--wires")
+    assert (codes[given] == 2).all()
+    assert not (codes[far_from(xyz, given) & ~given] == 2).any()
+    assert (codes[~given] == 2).sum() > 500  # the strip that was not marked
+    assert {5, 6} <= set(codes.tolist())
+    heights = filtered_ground(xyz, given=given)["HeightAboveGround"]
+    assert np.allclose(las["HeightAboveGround"], heights, atol=1 / 32)
+    found = tmp_path / "found.laz"
+    assert main(["classify", str(edited), str(found)]) == 0
+    assert (np.asarray(laspy.read(found).classification)[given] != 2).sum() > 20  # the terrace
+    assert "other heights" not in capsys.readouterr().err
+
+
+@pytest.mark.pdal
+def test_tiles_give_the_same(edited, tmp_path):
+    _, whole, _ = classified(edited, tmp_path / "whole.laz")
+    _, tiles, _ = classified(edited, tmp_path / "tiles.laz", "--tile", "12", "--workers", "0")
+    assert np.array_equal(whole, tiles)
+
+
+@pytest.mark.pdal
+def test_without_ground_there_is_none_to_take(tmp_path, capsys):
+    las = laspy.read(DATA / "city.laz")
+    las.classification = np.ones(len(las.x), np.uint8)
+    las.points = las.points[:2000]
+    las.write(tmp_path / "none.laz")
+    words = ["classify", str(tmp_path / "none.laz"), str(tmp_path / "o.laz"), "--ground", "given"]
+    assert main(words) == 1
+    assert "none of the points has class 2" in capsys.readouterr().err
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("heights", ["filters.hag_nn", "filters.hag_delaunay"])
+@pytest.mark.parametrize("ground", [[{"type": "filters.smrf"}], []])
+def test_the_shipped_model_after_heights_of_pdal(edited, tmp_path, ground, heights):
+    """Ground by PDAL, or as the file has it: a warning, and what the model reads beside heights is made of class 2."""
+    out = tmp_path / "out.laz"
+    apply = {"type": "filters.modelclassifier", "model": "standard"}
+    done = ps.run_pipeline([str(edited), *ground, {"type": heights}, apply, str(out)])
+    said = " ".join(done.messages)
+    assert "trained on other heights" in said and "from points of class 2 Ground, Height" in said
+    assert {2, 5, 6} <= set(np.asarray(laspy.read(out).classification).tolist())
+
+
+def test_after_csf_as_well():
+    """PDAL 2.2 runs out of memory in filters.csf on some clouds, so the stage alone is asked."""
+    stage = stage_from({"type": "filters.modelclassifier", "model": "standard"})
+    reach = stage.halo_m()
+    before = [({"type": name}, {"HeightAboveGround": "double"}) for name in ("filters.csf", "filters.hag_nn")]  # fmt: skip
+    _, warning = settle_upstream(stage, before)
+    assert "filters.csf" in warning and "from points of class 2 Ground, Height" in warning
+    assert stage.reads() == ["HeightAboveGround"] and stage.halo_m() > reach
+    settle_upstream(stage, [])
+    assert "Ground" in stage.reads() and stage.halo_m() == reach
+
+
+@pytest.mark.pdal
+def test_given_ground_in_a_pipeline_and_in_a_model(edited, tmp_path):
+    """A model that was trained on given ground says so, and `classify` then takes what is given."""
+    las = laspy.read(DATA / "city.laz")
+    keep = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
+    heights = {"type": "filters.hag_morphological", "given_ground": True, "ground": True}
+    write = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m.model"), "label": "Reference",
+             "classes": {"2": 2, "6": 6, "3,4,5": 5}, "neighborhoods": "k10", "count": 300, "trees": 5,
+             "passes": 1, "folds": 0, "dimensions": "HeightAboveGround,Ground"}  # fmt: skip
+    las.write(tmp_path / "labeled.laz")
+    ps.run_pipeline([str(tmp_path / "labeled.laz"), keep, heights, write])
+    model = load_model(tmp_path / "m.model")
+    assert model.info["preparation"] == [heights]
+    given = np.asarray(laspy.read(edited).classification) == 2
+    assert main(["classify", str(edited), str(tmp_path / "o.laz"), "--model", str(tmp_path / "m.model")]) == 0  # fmt: skip
+    assert (np.asarray(laspy.read(tmp_path / "o.laz").classification)[given] == 2).all()
+    with pytest.raises(StageError, match="HeightAboveGround"):
+        load_model(tmp_path / "m.model").predict(np.asarray(las.xyz))  # without classes
+    (warning,) = load_model(tmp_path / "m.model").outdated or [None]
+    assert warning is None
