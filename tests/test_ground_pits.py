@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_detached_noise import closed_wood, slow_below, slow_linked
+from test_detached_noise import slow_below, slow_linked
 
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.belowground import pits, pits_reach
@@ -108,14 +108,6 @@ def test_a_wide_floor_is_a_pit_where_others_lie_above_it():
     raster[20:29, 20:30] -= 12
     assert not pits(raster, raster, 1.0).any()
     assert np.array_equal(pits(raster, highest, 1.0), raster < -11)
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.65])
-def test_rare_ground_under_a_closed_canopy_is_found(slope):
-    xyz, ground = closed_wood(slope, 0.02, 3.0, 200)
-    found = filtered_ground(xyz)
-    assert found["Ground"][ground].mean() > 0.96
-    assert (np.abs(found["HeightAboveGround"][ground]) > 1).mean() < 0.04
 
 
 def points_of(side=60.0, density=10, seed=1):

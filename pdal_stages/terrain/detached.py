@@ -25,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.arrays import begins_run
 from ..base.jit import device, njit
 from ..base.las import NOISE
-from .belowground import ENOUGH, below_ground
+from .belowground import RULES as LOW_RULES
+from .belowground import below_ground
 from .belowground import reach as below_reach
 from .cells import (
     HIGHEST,
@@ -121,7 +122,7 @@ def detached_noise(
         column, row = cell_numbers(x, SIDE), cell_numbers(y, SIDE)
         found = np.zeros(len(x), np.uint8)
         for points, own in patches(column, row, math.ceil(REACH / SIDE), 3 * BLOCK + 2):
-            if len(x[points]) > ENOUGH:  # fewer tell nothing
+            if len(x[points]) > LOW_RULES.min_columns:  # fewer tell nothing
                 near = x[points], y[points], z[points], column[points], row[points]
                 marks = _judge(*near, cluster, gap, depth)
                 found[points if isinstance(points, slice) else points[own]] = marks[own]
@@ -331,10 +332,10 @@ def _high(place, lowest, suspect, size, spacing, top, hung, hung_suspect, gap, v
                     if (b - j) ** 2 + (a - i) ** 2 <= r * r and top[b, a] > -np.inf:
                         seen += 1
                         highest = max(highest, top[b, a])
-            if seen >= ENOUGH or r == FAR:
+            if seen >= LOW_RULES.min_columns or r == FAR:
                 break
             r = min(2 * r, FAR)
-        if seen >= ENOUGH and lowest[k] - highest >= least:
+        if seen >= LOW_RULES.min_columns and lowest[k] - highest >= least:
             verdict[k] = 0 if _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz) else HIGH
 
 
