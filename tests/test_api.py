@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 @pytest.fixture(scope="module")
 def scene():
     """Ground (2) and a block (6), meters."""
-    made = ground_and_block(1500, size=40.0)
+    made = ground_and_block(1500, size=30.0)
     return np.column_stack([made[axis] for axis in "XYZ"]), made["Classification"]
 
 

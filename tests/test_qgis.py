@@ -142,7 +142,7 @@ def test_forms_follow_the_command(capsys):
     assert arguments["per"]["choices"] == ["auto", "file", "tile"]
     assert "1/32 (3 cm" in arguments["dimensions"]["help"]
     options = {one["name"]: one for one in said["stages"]["filters.hag_morphological"]["options"]}
-    assert options["window"]["default"] == 75.0 and options["window"]["exclusive"]
+    assert options["window"]["default"] == 18.0 and options["window"]["exclusive"]
     assert main(["commands"]) == 0
     assert "classify " in capsys.readouterr().out
 

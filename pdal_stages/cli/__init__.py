@@ -252,6 +252,10 @@ class Parser(argparse.ArgumentParser):
         return takes
 
 
+#: Choices that take more columns stand in the help text instead of before it.
+_CHOICES_WIDTH = 40
+
+
 def takes_options(takes: Callable, stage: str, *names: str) -> None:
     """Add flags for options of a stage, with their declared help and defaults."""
     from ..stages.base import stage_type
@@ -261,7 +265,9 @@ def takes_options(takes: Callable, stage: str, *names: str) -> None:
         if option.name in names:
             default, choices = option.shown_default.replace(",", ", "), option.choices or None
             what = (option.help + f" (default: {default})" * bool(default)).replace("%", "%%")
-            value = None if choices else option.name.split("_")[-1].upper()
+            wide = choices is not None and len(", ".join(choices)) > _CHOICES_WIDTH
+            value = None if choices and not wide else option.name.split("_")[-1].upper()
+            what += f" (one of: {', '.join(choices)})" if choices and wide else ""
             how = {
                 "type": kinds.get(option.kind),
                 "choices": choices,
