@@ -178,8 +178,8 @@ def settled(
     # A small survey in one tile needs neither surroundings nor rounds before.
     alone = density.side_around() if 0 < density.points <= _MOST_OF_A_TILE else None
     if options.tile is None and not options.scheduler and alone:
-        room = whole - (PARENT if local else 0)
-        if worker_bytes(density.points, density.largest if per_file else 0) <= room:
+        free = whole - (PARENT if local else 0)
+        if worker_bytes(density.points, density.largest if per_file else 0) <= free:
             return replace(options, tile=alone, workers=min(local, 1) if not fixed else local)
     for workers in [local] if fixed else range(local, 0, -1):
         room = (whole - PARENT) / workers if workers else whole
