@@ -254,3 +254,18 @@ def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, wri
     same(buildings("c.gpkg"), buildings("d.gpkg"))
     found = laspy.read(out)
     assert 3 < np.percentile(found.HeightAboveGround, 99) < np.ptp(z)
+
+
+def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las):
+    """A wood of 40 m in feet; with a reference that names the heights' system it is a wood of 40 m."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 60, (2, 40_000))
+    wood = (np.arange(40_000) % 4 > 0) & (np.hypot(x - 30, y - 30) < 25)
+    z = np.where(wood, rng.uniform(25, 40, 40_000), 0.0) / FOOT
+    returns = {"ReturnNumber": np.where(wood, 1, 2), "NumberOfReturns": np.full(40_000, 2)}
+    source = write_las(tmp_path / "in.las", {"X": x + 5e5, "Y": y + 5e6, "Z": z, **returns}, 1)
+    referenced(source, {3072: 26910})
+    for words, doubted in ((), True), (("--readers.las.override_srs=EPSG:26910+8228",), False):
+        code, _, err = run("classify", source, tmp_path / "out.las", *words)
+        assert code == 0 and ("the unit of z may be wrong" in err) == doubted, err
+        assert (np.asarray(laspy.read(tmp_path / "out.las").classification) == 5).sum() > 5000

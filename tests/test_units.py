@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.base.units import Units, horizontal_part, parse_wkt, units_of_wkt, utm_code
+from pdal_stages.base.units import (
+    Units,
+    doubt_vertical_unit,
+    horizontal_part,
+    parse_wkt,
+    units_of_wkt,
+    utm_code,
+)
 
 GEOGCS = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],UNIT["degree",0.0174532925199433]]'
 METERS = f'PROJCS["UTM 32N",{GEOGCS},PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
@@ -41,6 +49,13 @@ def test_units_of_references():
             units_of_wkt(LOCAL.format(unit), horizontal="foot", vertical="foot").horizontal
             == 0.3048
         )
+
+
+def test_vegetation_too_high_to_be_true_doubts_the_unit_of_z():
+    feet = np.linspace(0, 40, 5000) / 0.3048  # of a wood 40 m high, taken for meters
+    assert "override_srs" in doubt_vertical_unit(feet, 1.0)
+    for fine in (np.linspace(0, 95, 5000), feet[:900], np.append(np.zeros(5000), [500.0] * 40)):
+        assert not doubt_vertical_unit(fine, 1.0)
 
 
 def test_the_horizontal_part_of_a_reference():

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .errors import OptionError, StageError, suggest
 
 #: Names users write, in meters.
@@ -35,6 +38,32 @@ class Units:
     horizontal: float = 1.0
     vertical: float = 1.0
     assumed: bool = False
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """Limits beyond which the unit of z is doubted, as heights are three times too large where feet are taken for meters."""
+
+    vegetation_m: float = (
+        100.0  #: the tallest trees known are 116 m; no wood has 1 % of its points above 100 m
+    )
+    share: float = 0.01  #: of the vegetation: single points may be birds or tips of masts
+    least_points: int = 1000  #: fewer say little
+
+
+def doubt_vertical_unit(height_m: NDArray, vertical: float, limits: Doubts = Doubts()) -> str:
+    """Return a warning where vegetation (n,) is too high above the ground to be true, else an empty text.
+
+    `vertical` is the unit of z that was assumed, in meters. The text is the same for all tiles of a survey.
+    """
+    high = np.count_nonzero(height_m > limits.vegetation_m)
+    if len(height_m) < limits.least_points or high <= limits.share * len(height_m):
+        return ""
+    return (
+        f"more than {100 * limits.share:g} % of the vegetation is higher than {limits.vegetation_m:g} m, so the unit of z "
+        f"may be wrong (taken to be {vertical:.6g} m). Override it by a reference that names the heights' system, such as "
+        "--readers.las.override_srs=EPSG:26910+6360 (US survey feet), or by 'vertical_unit' of each stage"
+    )
 
 
 def named_unit(name: str, option: str) -> float:

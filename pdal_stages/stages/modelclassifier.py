@@ -13,6 +13,7 @@ from ..base.errors import OptionError
 from ..base.las import GROUND, LOW, MEDIUM, by_height
 from ..base.las import HIGH as HIGH_VEGETATION
 from ..base.messages import Progress
+from ..base.units import doubt_vertical_unit
 from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.modelfile import find
 from ..classifier.sureness import Limit, Sureness, said, sureness_of
@@ -282,6 +283,10 @@ class ModelClassifier(Stage):
             high = wanted & ~rejected
             by_height(found.classification, high, points.dimension(HEIGHT), self.vegetation_heights)
             found.report.figures["classes"] = class_counts(found.classification[wanted])
+        if HEIGHT in points.arrays:
+            leaves = wanted & np.isin(found.classification, (LOW, MEDIUM, HIGH_VEGETATION))
+            doubt = doubt_vertical_unit(points.dimension(HEIGHT)[leaves], points.units.vertical)
+            points.report.warnings += [doubt] if doubt else []
         values: dict[str, NDArray] = {
             "Classification": found.classification,
             "Reliability": found.reliability,
