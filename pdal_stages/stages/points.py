@@ -38,6 +38,8 @@ HOLDS_NOWHERE = "'where' holds for none of the points:"
 TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
 #: The dimension in which `classify` marks the points that its `where` selects.
 SELECTED = "PdalStagesSelected"
+#: Steps to which coordinates are rounded; scales of LAS files are whole numbers of them, as a rule.
+_STEPS_PER_UNIT = 1e6
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 #: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical unit.
@@ -111,7 +113,10 @@ class Points:
 
     @cached_property
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Coordinates in meters, x, y and z each by itself.
+        """Return coordinates in meters, x, y and z each by itself.
+
+        They are rounded to a millionth of the unit of the file: the same coordinates under another scale and offset
+        differ by the rounding of `X * scale + offset`, which puts points on the edge of a cell on either side of it.
 
         Raises
         ------
@@ -120,9 +125,12 @@ class Points:
         """
         found = []
         for name in "XYZ":
-            values = np.asarray(self.dimension(name, meters=False))
+            with np.errstate(over="ignore"):  # such coordinates are refused below
+                values = np.asarray(self.dimension(name, meters=False)) * _STEPS_PER_UNIT
+            np.rint(values, out=values)
+            values /= _STEPS_PER_UNIT
             unit = self.units.vertical if name == "Z" else self.units.horizontal
-            found.append(values if unit == 1.0 and values.dtype == np.float64 else values * unit)
+            found.append(values if unit == 1.0 else values * unit)
         x, y, z = found
         if not all(np.isfinite(values).all() for values in found):
             bad = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))

@@ -16,7 +16,7 @@ from ..base.files import Output, check_outputs
 from ..base.lascheck import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
-from .report import Job, TiledRun
+from .report import Job, TiledRun, messages_on_folders
 from .settings import TilingOptions, fits_whole
 
 
@@ -98,13 +98,16 @@ class ClassifyTask:
     def run_whole(self) -> Written:
         """Classify the only input in one piece."""
         (source,), (target,) = self.files, self.outputs
+        named = is_folder(self.output)
+        before = messages_on_folders([target], [source]) if named else []
         with self.folders():
             pipeline = self.request.pipeline(source, target)
             pipeline.check_outputs(*self.extra_files, read=self.inputs)
             count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
         reports = [each[-1] for _, each in pipeline.reports if each]
         codes = [report.codes for report in reports if report.codes is not None]
-        messages = [*(f"PDAL says: {line}" for line in pipeline.log_lines), *pipeline.messages]
+        messages = [f"PDAL says: {line}" for line in pipeline.log_lines]
+        messages += [*before, *pipeline.messages]
         if all(is_las(name) and Path(name).is_file() for name in (source, target)):
             written = las.read_header(target)
             odd = beyond_box(source, written.box) if written else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -160,6 +161,39 @@ def summarize(tiles: list[Job], cpu_seconds: float, seconds: float) -> dict[str,
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
         "left_alone": {key: alone[key] for key in LEFT_ALONE if alone[key]},
     }
+
+
+def messages_on_folders(
+    outputs: Iterable[str], inputs: Iterable[str], resumed: bool = False
+) -> list[str]:
+    """Return what the user should know of LAS and LAZ files that are in the folders of outputs before a run.
+
+    Outputs that are there will be replaced, unless the run is `resumed` and may keep them; others stay.
+    """
+    names = {os.path.realpath(name) for name in outputs}
+    known = names | {os.path.realpath(name) for name in inputs}
+    there = {
+        entry.path
+        for folder in {os.path.dirname(name) for name in names}
+        if os.path.isdir(folder)
+        for entry in os.scandir(folder)
+        if entry.name.lower().endswith((".las", ".laz")) and entry.is_file()
+    }
+    told = []
+    if (replaced := names & there) and not resumed:
+        told.append(f"{counted(len(replaced), 'existing output file')} replaced: {_some(replaced)}")
+    if others := there - known:
+        told.append(
+            f"{counted(len(others), 'LAS or LAZ file')} in the folder of the outputs not written by this run, left as "
+            f"before: {_some(others)}"
+        )
+    return told
+
+
+def _some(paths: Iterable[str]) -> str:
+    """Return the names of a few files, in alphabetical order."""
+    names = sorted(map(os.path.basename, paths))
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
 def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> list[str]:

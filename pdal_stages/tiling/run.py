@@ -27,7 +27,14 @@ from .inputs import CloudIndex, IndexedSource, Survey
 from .outputs import write_file
 from .pieces import TEMPORARY, is_intact, sort_points
 from .plan import RunContext, TilePlan, make_plan, outputs_for
-from .report import InterruptedRun, Job, TiledRun, messages_of, summarize
+from .report import (
+    InterruptedRun,
+    Job,
+    TiledRun,
+    messages_of,
+    messages_on_folders,
+    summarize,
+)
 from .settings import TilingOptions, worker_bytes
 from .store import Store, fingerprint
 from .tile import run_first_round, run_tile
@@ -121,6 +128,8 @@ def run_plan(
                 run = _Run(plan, survey, store, workers, progress)
                 run.read_inputs()
                 run.find_jobs()
+                files = [file for job in (*run.tiles, *run.outputs) for file in job.outputs or ()]
+                survey.messages += messages_on_folders(files, survey.paths, chosen.resume)
                 if chosen.resume:
                     run.take_over()
                     run.read_inputs(run.inputs_of_waiting())
