@@ -18,8 +18,8 @@ from typing import Any
 
 import laspy
 import numpy as np
-from clouds import slug, true_classes
-from surveys import SHIPPED, SURVEYS
+from clouds import model_without, true_classes
+from surveys import SURVEYS
 
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.tiling.adapting import SURE, adapt
@@ -100,7 +100,7 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     parser.add_argument("--models", type=Path, required=True, help="folder of the models left out")
-    parser.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
+    parser.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     parser.add_argument("--sure", type=float, default=SURE)
     parser.add_argument("--json", type=Path, help="where the figures go")
     given = parser.parse_args()
@@ -111,7 +111,7 @@ def main() -> None:
                 run(
                     given.data,
                     survey,
-                    given.models / f"{slug(survey)}.model",
+                    model_without(given.models, survey),
                     given.sure,
                     Path(folder),
                 )

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 import time
 from pathlib import Path
 
+from clouds import load_test
+from leave_one_out import score
 from recipe import train_on
 from sources import check
-from surveys import SHIPPED, SURVEYS
+from surveys import SURVEYS, TESTS
 
 
 def main() -> None:
@@ -21,7 +24,8 @@ def main() -> None:
     )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument("--out", type=Path, required=True, help="the model file")
-    options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
+    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
+    options.add_argument("--tests", type=Path, help="where scores of the test parts go, as JSON")
     args = options.parse_args()
     check(args.data, [file for name in args.surveys for file in SURVEYS[name].files])
     started = time.process_time()
@@ -33,6 +37,12 @@ def main() -> None:
     print(
         f"{args.out}: {size:.2f} MB, sha256 {digest[:16]}, {time.process_time() - started:.0f} CPU s"
     )
+    if args.tests:
+        scores = []
+        for cloud in (load_test(args.data, name) for name in TESTS):
+            found = model.predict(cloud.xyz, cloud.dimensions).classification
+            scores.append(score(found, cloud))
+        args.tests.write_text(json.dumps(scores, indent=1) + "\n")
 
 
 if __name__ == "__main__":

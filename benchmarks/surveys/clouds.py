@@ -1,5 +1,5 @@
-"""The labeled surveys as they are trained on and scored, and copies of them that are thinner, steeper, without return
-numbers, or have one return of each pulse."""
+"""The labeled surveys as they are trained on and scored, and copies of them that are thinner, without return numbers, or
+have one return of each pulse."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from surveys import GROUND, SURVEYS, VEGETATION, LabeledSurvey
+from surveys import GROUND, SURVEYS, TESTS, VEGETATION, LabeledSurvey
 
 from pdal_stages.base.arrays import hash_of
+from pdal_stages.stages.preparation import PREPARATION
 from pdal_stages.terrain import filtered_ground
 
 #: Meters from the middle of a survey beyond which a point is a mistake.
@@ -18,8 +19,13 @@ FAR = 5000.0
 
 
 def slug(name: str) -> str:
-    """A survey's name in that of a file."""
-    return name.replace(" ", "-").replace("'", "")
+    """Return a survey's or a group's name as that of a file."""
+    return name.replace(" ", "-").replace("'", "").replace(",", "")
+
+
+def model_without(folder: Path, survey: str) -> Path:
+    """Return the file of the model that has seen nothing of the survey's group (`leave_one_out.py --save`)."""
+    return folder / f"{slug(SURVEYS[survey].group)}.model"
 
 
 def true_classes(
@@ -124,9 +130,14 @@ def published(
     return xyz[near], codes[near], {name: values[near] for name, values in dimensions.items()}
 
 
-def load(data: Path, survey: str) -> Cloud:
-    """A survey as it was published, with heights above filtered ground."""
-    known = SURVEYS[survey]
+def load_test(data: Path, survey: str) -> Cloud:
+    """Return the test part of a survey, which was not trained on."""
+    return load(data, survey, replace(SURVEYS[survey], files=TESTS[survey]))
+
+
+def load(data: Path, survey: str, known: LabeledSurvey | None = None) -> Cloud:
+    """Return a survey as it was published, with heights above filtered ground; `known`: other files of it."""
+    known = known or SURVEYS[survey]
     xyz, code, dimensions = published(data, known)
     kept = ~np.isin(code, known.dropped)
     xyz, code = xyz[kept], code[kept]
@@ -147,8 +158,9 @@ def load(data: Path, survey: str) -> Cloud:
 
 
 def with_heights(cloud: Cloud) -> Cloud:
-    """The cloud with what the ground filter makes of it."""
-    made = filtered_ground(*np.ascontiguousarray(cloud.xyz.T), openings=(5, 17))
+    """Return the cloud with the dimensions that the model's preprocessing makes of it."""
+    (stage,) = PREPARATION
+    made = filtered_ground(*np.ascontiguousarray(cloud.xyz.T), openings=stage["openings"])
     return replace(cloud, dimensions={**cloud.dimensions, **made})
 
 
@@ -177,40 +189,3 @@ def one_return(cloud: Cloud, last: bool) -> Cloud:
     kept = number >= of if last else number <= 1
     name = f"{cloud.name}, {'last' if last else 'first'} returns"
     return without_returns(cloud.part(np.flatnonzero(kept), name))
-
-
-def on_slopes(
-    cloud: Cloud, slope: float, seed: int, terraces: bool = False, most: int = 250_000
-) -> Cloud:
-    """A copy that stands on synthetic terrain: a tilted plane and waves, up to about that slope (rise over run);
-    with `terraces`, most of it in steps of 1.5 to 3 m.
-
-    Of a large cloud a strip of at most `most` points is taken.
-    """
-    random = np.random.default_rng(seed)
-    if len(cloud.xyz) > most:
-        order = np.argsort(cloud.xyz[:, 0], kind="stable")
-        first = int(random.integers(0, len(order) - most))
-        part = np.sort(order[first : first + most])
-    else:
-        part = np.arange(len(cloud.xyz))
-    xyz = cloud.xyz[part].copy()
-    u = xyz[:, :2] - xyz[:, :2].mean(axis=0)
-
-    def direction() -> np.ndarray:
-        angle = random.uniform(0, 2 * np.pi)
-        return np.array([np.cos(angle), np.sin(angle)])
-
-    rise = u @ direction() * random.uniform(0.3, 1.0) * slope
-    for length, share in ((150.0, 0.5), (60.0, 0.35), (25.0, 0.15)):
-        for _ in range(3):
-            number = 2 * np.pi / (length * random.uniform(0.7, 1.4))
-            wave = np.sin(number * (u @ direction()) + random.uniform(0, 2 * np.pi))
-            rise += share * slope / number / 3 * wave
-    if terraces:
-        height = random.uniform(1.5, 3.0)
-        level, above = np.divmod(rise, height)
-        stepped = height * (level + np.clip((above / height - 0.75) / 0.25, 0.0, 1.0))
-        rise = np.where(np.sin(u @ direction() / 40.0 + 1.0) > -0.3, stepped, rise)
-    xyz[:, 2] = np.round(xyz[:, 2] + rise, 3)
-    return cloud.part(part, f"{cloud.name}, slopes to {100 * slope:.0f} %", xyz)

@@ -20,7 +20,7 @@ from typing import Any
 import laspy
 import numpy as np
 import shapely
-from clouds import slug, true_classes
+from clouds import model_without, true_classes
 from surveys import SURVEYS
 
 from pdal_stages import cli
@@ -158,7 +158,7 @@ def main() -> None:
     rows = []
     for name in args.surveys:
         with tempfile.TemporaryDirectory() as folder:
-            rows.append(rounds(args.data, name, args.models / f"{slug(name)}.model", Path(folder)))
+            rows.append(rounds(args.data, name, model_without(args.models, name), Path(folder)))
         print(json.dumps(rows[-1]), flush=True)
     print(table(rows))
     if args.json:

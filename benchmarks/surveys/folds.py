@@ -1,13 +1,14 @@
-"""Models that miss one fold of the surveys each, at little more than the cost of one.
+"""Models that have not seen one group of the surveys, at little more than the cost of one model.
 
-What is computed of the points does not depend on who is left out, so it is computed once, for every point of every copy, and
-kept in a folder. The surroundings that a later pass reads of fold B where A is left out come from forests grown
-without both; that of the first pass serves where B is left out and A is read, too.
+The features of a point do not depend on who is left out, so they are computed once, for every point of every copy, and
+kept in a folder. Each model is trained as the shipped one is: a later pass reads what forests without the survey (and
+without the group) say of it.
 """
 
 from __future__ import annotations
 
 import copy
+import hashlib
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -28,129 +29,115 @@ from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
 from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.sampling import draw_samples
 
-#: Of a forest of a model that misses a survey, by default: what the card's and the review's figures are of.
-TREES = 20
+#: Trees of a forest of a model that judges: fewer than the shipped one's, for speed.
+TREES = 16
+#: Parts of the surveys that are left out in turn for the votes that a later pass reads.
+VOTE_FOLDS = 5
 FEATURES = Features(feature_plan(OPTIONS))
 CONTEXT = Context(tuple(OPTIONS.context))
-#: What a pass said of all points of a cloud, (n, classes), by the cloud's number.
+#: Votes (n, classes) for all points of a cloud, by the cloud's number.
 Votes = dict[int, npt.NDArray[np.uint16]]
 
 
-def features_of(cloud: TrainingCloud) -> npt.NDArray[np.float32]:
-    """What the first pass reads of all points, (n, features)."""
-    out = np.empty((len(cloud.xyz), len(FEATURES.plan.names)), np.float32)
-    request = PredictRequest(cloud.xyz, cloud.dimensions)
-    for rows, values in CloudFeatures(FEATURES, request).blocks(None, lambda values, rows: values):
-        out[rows] = values
-    return out
+def compute_features(cloud: TrainingCloud, folder: Path) -> npt.NDArray[np.float32]:
+    """Return the first pass's features (n, features) of all points; they are kept in the folder."""
+    arrays = [cloud.xyz, *(np.asarray(values) for _, values in sorted(cloud.dimensions.items()))]
+    contents = [repr(FEATURES.plan.names).encode(), *(one.tobytes() for one in arrays)]
+    path = folder / f"{hashlib.sha256(b''.join(contents)).hexdigest()[:24]}.npy"
+    if not path.exists():
+        out = np.empty((len(cloud.xyz), len(FEATURES.plan.names)), np.float32)
+        request = PredictRequest(cloud.xyz, cloud.dimensions)
+        blocks = CloudFeatures(FEATURES, request).blocks(None, lambda values, rows: values)
+        for rows, values in blocks:
+            out[rows] = values
+        np.save(path, out)
+    return np.load(path, mmap_mode="r")
 
 
-class LeaveOneOut:
-    """The copies of all surveys, and models of so many trees a pass without one fold of these."""
+class GroupsLeftOut:
+    """The copies of the surveys that are trained on, and models without one group of them."""
 
-    def __init__(
-        self, data: Path, surveys: Iterable[str], folder: Path, trees: int = TREES
-    ) -> None:
-        self.trees = trees
+    def __init__(self, data: Path, surveys: Iterable[str], folder: Path) -> None:
         names = sorted(surveys)
-        self.folds = sorted({SURVEYS[name].fold for name in names})
-        self.clouds: list[TrainingCloud] = []
-        self.tables: list[npt.NDArray[np.float32]] = []
-        for name in names:
-            for cloud in training_clouds(data, name):
-                path = folder / f"{len(self.clouds)}.npy"
-                np.save(path, features_of(cloud))
-                self.clouds.append(cloud)
-                self.tables.append(np.load(path, mmap_mode="r"))
+        self.clouds = [cloud for name in names for cloud in training_clouds(data, name)]
+        self.tables = [compute_features(cloud, folder) for cloud in self.clouds]
         labeled = label_classes(self.clouds, OPTIONS)
         self.classes = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
         of = [cloud.survey for cloud in self.clouds]
         self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
-        self.fold_of = np.array([SURVEYS[name].fold for name in of])
+        self.group_of = np.array([SURVEYS[name].group for name in of])
+        #: Surveys of one fold are left out together for the votes that a later pass reads, as the trainer does it.
+        self.fold_of = np.array([names.index(name) % VOTE_FOLDS for name in of])
+        self.group = self.group_of[self.samples.cloud]
         self.fold = self.fold_of[self.samples.cloud]
         self.values = self.samples.take(self.tables.__getitem__)
-        self._pair = cache(self._grown_without)
-        self.without_fold = cache(self._without_fold)
+        self.without = cache(self._train_without)
+
+    def _train_without(self, group: str) -> Model:
+        """Return the model of all surveys but those of this group."""
+        kept = self.group != group
+        passes, values = [], self.values
+        votes: Votes = {}
+        for number in range(OPTIONS.passes):
+            if number:
+                votes = self._vote(group, values, votes)
+                values = np.concatenate([self.values, self._context_of_samples(votes)], axis=1)
+            forest = self._grow(values, kept, TREES)
+            passes.append(FeatureForest(FEATURES, forest, CONTEXT if number else None))
+        # The shipped model is of the same make; its counts of samples are replaced.
+        info = {**copy.deepcopy(load_model("standard").info), "training": self._training(group)}
+        info["passes"] = [{"importances": None}] * len(passes)
+        return Model(tuple(passes), self.classes, {**info, "voxel": OPTIONS.voxel})
 
     def _grow(
         self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int
     ) -> Forest:
         names = ("seed", "min_samples_leaf", "max_samples", "max_features")
         setting = {name: getattr(OPTIONS, name) for name in names}
-        weight = self.samples.weight * kept
-        values = np.asfortranarray(values)
-        return grow_forest(values, self.samples.label, weight, trees, **setting)[0]
+        values = np.asfortranarray(values[kept])
+        label, weight = self.samples.label[kept], self.samples.weight[kept]
+        return grow_forest(values, label, weight, trees, **setting)[0]
 
-    def _grown_without(self, one: int, other: int) -> Forest:
-        kept = (self.fold != one) & (self.fold != other)
-        return self._grow(self.values, kept, self._few)
+    def _vote(self, group: str, values: npt.NDArray[np.float32], before: Votes) -> Votes:
+        """Return a pass's votes for the clouds that are trained on, by forests that have seen neither the group nor the
+        cloud's fold.
 
-    @property
-    def _few(self) -> int:
-        """Trees of a forest whose votes the next pass is trained on."""
-        return max(1, round(FOLD_TREES * self.trees))
-
-    def without(self, name: str) -> Model:
-        """The model of all surveys but those of this one's fold."""
-        return self.without_fold(SURVEYS[name].fold)
-
-    def _without_fold(self, left: int) -> Model:
-        kept = self.fold != left
-        passes, values = [], self.values
-        votes: Votes = {}
-        for number in range(OPTIONS.passes):
-            if number:
-                votes = self._votes(left, values, votes)
-                values = np.concatenate([self.values, self._around(votes)], axis=1)
-            forest = self._grow(values, kept, self.trees)
-            passes.append(FeatureForest(FEATURES, forest, CONTEXT if number else None))
-        # What is known of the shipped model, which is of the same make, but for what is known of its samples.
-        info = {**copy.deepcopy(load_model("standard").info), "training": self._training(left)}
-        info["passes"] = [{"importances": None}] * len(passes)
-        return Model(tuple(passes), self.classes, {**info, "voxel": OPTIONS.voxel})
-
-    def _votes(self, left: int, values: npt.NDArray[np.float32], before: Votes) -> Votes:
-        """What a pass says of all points of the clouds that are trained on where a fold is left out, by forests that have
-        seen neither that nor the cloud's own: `values` is what the pass reads of the samples, `before` what the pass before
-        said, nothing of the first pass."""
-        found = {}
-        for other in self.folds:
-            if other == left:
-                continue
-            if before:
-                kept = (self.fold != left) & (self.fold != other)
-                forest = self._grow(values, kept, self._few)
-            else:
-                forest = self._pair(*sorted((left, other)))
-            for number, (cloud, table) in enumerate(zip(self.clouds, self.tables, strict=True)):
-                if self.fold_of[number] != other or not len(self.samples.of_cloud(number)[0]):
-                    continue
-                read = np.ascontiguousarray(table)
+        `values` are what the pass reads of the samples, `before` the votes of the pass before it, if there is one.
+        """
+        votes, trees = {}, max(1, round(FOLD_TREES * TREES))
+        sampled = np.unique(self.samples.cloud[self.group != group])
+        for fold in np.unique(self.fold_of[sampled]).tolist():
+            forest = self._grow(values, (self.group != group) & (self.fold != fold), trees)
+            for number in sampled[self.fold_of[sampled] == fold].tolist():
+                read = np.ascontiguousarray(self.tables[number])
                 if before:
-                    around = self._context(cloud, before[number], np.arange(len(cloud.xyz)))
+                    every = np.arange(len(read))
+                    around = self._context(number, before[number], every)
                     read = np.concatenate([read, around], axis=1)
-                found[number] = count_shares(forest.predict_proba(read))
-        return found
+                votes[number] = count_shares(forest.predict_proba(read))
+        return votes
 
-    def _around(self, votes: Votes) -> npt.NDArray[np.float32]:
-        """The samples' context; 0 of those of clouds without votes."""
+    def _context_of_samples(self, votes: Votes) -> npt.NDArray[np.float32]:
+        """Return the samples' context (samples, columns); 0 for those of clouds without votes."""
         out = np.zeros((len(self.samples), len(CONTEXT.tokens) * len(self.classes)), np.float32)
         for number, shares in votes.items():
             at, rows = self.samples.of_cloud(number)
-            out[at] = self._context(self.clouds[number], shares, rows)
+            out[at] = self._context(number, shares, rows)
         return out
 
     def _context(
-        self, cloud: TrainingCloud, shares: npt.NDArray[np.uint16], rows: npt.NDArray[np.int64]
+        self, number: int, shares: npt.NDArray[np.uint16], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float32]:
-        """(m, columns) of some of a cloud's points."""
-        return CONTEXT.columns_of(cloud.xyz, shares)(rows)
+        """Return the context (m, columns) of some of a cloud's points."""
+        return CONTEXT.columns_of(self.clouds[number].xyz, shares)(rows)
 
-    def _training(self, without: int) -> dict[str, Any]:
-        """What a model file says of its training."""
+    def _training(self, without: str) -> dict[str, Any]:
+        """Return what a model file stores about its training."""
         used = [
-            cloud for cloud, fold in zip(self.clouds, self.fold_of, strict=True) if fold != without
+            cloud
+            for cloud, group in zip(self.clouds, self.group_of, strict=True)
+            if group != without
         ]
         clouds = [{"name": cloud.name, "points": len(cloud.xyz)} for cloud in used]
-        samples = int(np.count_nonzero(self.fold != without))
+        samples = int(np.count_nonzero(self.group != without))
         return {"clouds": clouds, "count": OPTIONS.count, "seed": OPTIONS.seed, "samples": samples}

@@ -1,10 +1,10 @@
-"""Ten places where models are wrong, chosen by chance, in pictures.
+"""Six places where models are wrong, chosen by chance, in pictures.
 
-    python benchmarks/surveys/places.py --data DIR --model FILE --json JSON --picture FILE [--models MODELS]
+    python benchmarks/surveys/places.py --data DIR --models MODELS --json JSON --picture FILE
 
-Each survey is classified by a model that has not seen it: by --model where that was not trained on it, else by the one
-that leave_one_out.py saved in MODELS (where there is none, the survey takes no part). Wrong points that touch are one
-patch. Patches are drawn with chances as their numbers of points, none twice nor beside another, and of each one point.
+Each survey is classified by the model that leave_one_out.py saved in MODELS, which has not seen its group.
+Wrong points that touch are one patch. Patches are drawn with chances as their numbers of points, none twice nor beside
+another, and of each one point.
 Around it the picture has heights, what the model says and what is true, from above, and below both of these in a
 vertical section.
 
@@ -15,23 +15,21 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from clouds import Cloud, load, slug
+from clouds import Cloud, load, model_without
 from leave_one_out import NAMES
 from PIL import Image, ImageDraw
 from scipy import ndimage
 from sources import check
 from surveys import SURVEYS
-from unseen import not_trained_on
 
-from pdal_stages import Model, load_model
+from pdal_stages import load_model
 from pdal_stages.reports.views import BACKGROUND, CLASS_COLORS, png, triptych
 
-PLACES, COLUMNS, SEED = 10, 2, 1
+PLACES, COLUMNS, SEED = 6, 2, 1
 #: Points that a picture must show: of fewer nothing can be seen.
 SHOWN = 200
 #: A place is so many meters wide, and its section so high and, where points are dense, thick.
@@ -89,15 +87,6 @@ class Place:
         )
         at = {"survey": self.of.cloud.survey, "x": round(x), "y": round(y), "points": self.points}
         return {**at, "truth": truth, "given": given}
-
-
-def models(shipped: Model, folder: Path | None) -> Iterator[tuple[str, Model]]:
-    """Surveys, each with a model that has not seen it."""
-    for name in SURVEYS:
-        if name in not_trained_on(shipped):
-            yield name, shipped
-        elif folder and (left_out := folder / f"{slug(name)}.model").exists():
-            yield name, load_model(left_out)
 
 
 def patches(of: Classified) -> np.ndarray:
@@ -230,15 +219,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
-    options.add_argument("--model", type=Path, required=True, help="the shipped model")
-    options.add_argument("--models", type=Path, help="folder of models that miss a survey each")
+    options.add_argument(
+        "--models", type=Path, required=True, help="folder that leave_one_out.py --save filled"
+    )
     options.add_argument("--json", type=Path, required=True, help="what the places are")
     options.add_argument("--picture", type=Path, required=True, help="where the picture goes")
     args = options.parse_args()
     surveys = []
-    for name, model in models(load_model(args.model), args.models):
-        check(args.data, list(SURVEYS[name].files))
-        cloud = load(args.data, name)
+    for name, survey in SURVEYS.items():
+        check(args.data, list(survey.files))
+        cloud, model = load(args.data, name), load_model(model_without(args.models, name))
         surveys.append(Classified(cloud, model.predict(cloud.xyz, cloud.dimensions).classification))
         print(
             f"{name}: {len(surveys[-1].wrong):,} of {len(cloud.xyz):,} points are wrong", flush=True

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from clouds import Cloud, load, on_slopes, one_return, thinned, without_returns
+from clouds import Cloud, load, one_return, thinned, without_returns
 from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
@@ -17,20 +17,12 @@ from pdal_stages.stages.preparation import PREPARATION
 
 #: Points per square meter of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)
-#: (slope, points per square meter, whether in terraces) of copies on synthetic terrain.
-SLOPES = (
-    (0.3, 8.0, False),
-    (0.6, 3.0, False),
-    (0.9, 1.0, False),
-    (0.5, 0.3, False),
-    (0.5, 1.0, True),
-)
 #: Points per square meter, at most, of copies that have one return of each pulse, the first or the last.
 ONE_RETURN = (12.0, 3.0)
 #: Height in meters below which a label of something standing is not believed.
 BELOW = 0.3
 #: Points of a copy at most: a strip of it, each copy's somewhere else.
-MOST = 50_000
+MOST = 15_000
 #: Steps by this share of a whole, over and over, fall evenly everywhere.
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 OPTIONS = TrainingOptions(
@@ -45,12 +37,12 @@ OPTIONS = TrainingOptions(
         "returns",
     ),
     classes={"2": 2, "5": 5, "6": 6},
-    count=80_000,
-    trees=24,
+    count=40_000,
+    trees=40,
     max_samples=1.0,
-    min_samples_leaf=20,
+    min_samples_leaf=10,
     prior_weight=0.0,
-    passes=3,
+    passes=2,
     context=("own", "box1", "box4", "columnvotes2", "columnvotes4"),
     folds=0,
     voxel=0.25,
@@ -58,12 +50,9 @@ OPTIONS = TrainingOptions(
 
 
 def copies(cloud: Cloud) -> Iterator[Cloud]:
-    """A survey and its thinned and tilted copies; where it has return numbers, each once more without these, and copies with
-    one return of each pulse."""
+    """Yield a survey and its thinned copies; where it has return numbers, each once more without these, and copies with one
+    return of each pulse."""
     made = [cloud, *(thinned(cloud, density) for density in DENSITIES)]
-    for number, (slope, density, terraces) in enumerate(SLOPES):
-        steep = on_slopes(cloud, slope, number, terraces)
-        made.append(thinned(steep, density) or steep)
     for one in made:
         if one is None:
             continue
@@ -95,9 +84,13 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
 
 
 def contradicted(cloud: Cloud | TrainingCloud) -> np.ndarray:
-    """(n,) points labeled as standing (4, 5, 6) that are Ground and lower than :data:`BELOW`: feet of walls, courtyards."""
+    """Return which points (n,) are labeled as standing (4, 5, 6), but are Ground and lower than :data:`BELOW`.
+
+    These are feet of walls and courtyards.
+    """
     low = np.asarray(cloud.dimensions["HeightAboveGround"]) < BELOW
-    return np.isin(cloud.labels, (4, 5, 6)) & (np.asarray(cloud.dimensions["Ground"]) > 0) & low
+    low &= np.asarray(cloud.dimensions["Ground"]) > 0
+    return low & np.isin(cloud.labels, (4, 5, 6))
 
 
 def strip(xyz: np.ndarray, most: int, where: float) -> np.ndarray:

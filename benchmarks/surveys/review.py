@@ -1,33 +1,27 @@
-"""How well `review` tells where the errors are, and the counts behind `classify --keep-sure`.
+"""How well `review` tells where the errors are.
 
-    python benchmarks/surveys/review.py --data DIR --models MODELS [--ship]
+    python benchmarks/surveys/review.py --data DIR --models MODELS
 
-MODELS may be a new folder: the models that miss a survey each are then made there (about 10 CPU minutes). Each survey is
-classified, by the command, with the model that has not seen it. The table: points expected wrong beside those that are,
-and the share of the wrong points in the patches that come first, up to a tenth of the area, beside what knowing the truth
-would find. --ship writes the counts of right and wrong points by reliability beside the shipped model.
+MODELS is the folder that leave_one_out.py --save filled. Each survey is classified, by the command, with the model that
+has not seen its group. The table: points expected wrong beside those that are, and the share of the wrong points in the
+patches that come first, up to a tenth of the area, beside what knowing the truth would find.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import laspy
 import numpy as np
-from clouds import slug, true_classes
-from folds import TREES, LeaveOneOut
-from surveys import SHIPPED, SURVEYS, VEGETATION
+from clouds import model_without, slug, true_classes
+from surveys import SURVEYS
 
-import pdal_stages
 from pdal_stages import cli
 from pdal_stages.accuracy.expected import ReviewCells, find_patches, side_for
-from pdal_stages.classifier.sureness import Sureness
 
 #: The part of the area that is looked at first.
 FIRST = 0.1
@@ -94,40 +88,6 @@ def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.
     return {key: values[there] for key, values in out.items()}
 
 
-def sureness(surveys: Sequence[Classified]) -> Sureness:
-    """How often the models were right where they were how sure, where the labels say what vegetation is."""
-    told = [
-        one for one in surveys if not SURVEYS[one.name].tall and SURVEYS[one.name].tells(VEGETATION)
-    ]
-    out = Sureness(
-        about=f"{len(told)} surveys ({', '.join(one.name for one in told)}), each classified by a model that had not seen it"
-    )
-    # Between all points alike and all surveys alike: limits should hold in a survey, not in the sum of all.
-    points = np.array([float(np.count_nonzero(one.truth)) for one in told])
-    weight = points**-0.25 * points.sum() / (points**0.75).sum()
-    for one, of_point in zip(told, weight, strict=True):
-        known = (one.truth > 0) & np.isin(one.codes, (2, 5, 6))
-        out.add(
-            one.codes[known],
-            one.truth[known],
-            one.reliability[known],
-            np.full(known.sum(), of_point),
-        )
-    return out
-
-
-def make_models(data: Path, folder: Path, surveys: Sequence[str], trees: int) -> None:
-    """The models that miss a survey each, where the folder has none."""
-    folder.mkdir(parents=True, exist_ok=True)
-    missing = [name for name in surveys if not (folder / f"{slug(name)}.model").exists()]
-    if missing:
-        with tempfile.TemporaryDirectory() as features:
-            left_out = LeaveOneOut(data, SHIPPED, Path(features), trees)
-            for name in missing:
-                left_out.without(name).save(folder / f"{slug(name)}.model")
-                print(f"a model without {name}", flush=True)
-
-
 def judged(one: Classified) -> tuple[int, int, float, float, float]:
     """Points judged, wrong, expected wrong; share of the wrong in the first tenth of the area, by the list and at best."""
     known = (one.truth > 0) & np.isin(one.codes, (2, 3, 4, 5, 6))
@@ -162,33 +122,21 @@ def main() -> None:
     )
     options.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     options.add_argument(
-        "--models", type=Path, required=True, help="folder of the models that miss a survey each"
+        "--models", type=Path, required=True, help="folder that leave_one_out.py --save filled"
     )
-    options.add_argument(
-        "--trees", type=int, default=TREES, help="of a forest of a model that is made"
-    )
-    options.add_argument("--surveys", nargs="+", default=SHIPPED, choices=list(SURVEYS))
-    options.add_argument(
-        "--ship", action="store_true", help="write the counts beside the shipped model"
-    )
+    options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     args = options.parse_args()
-    make_models(args.data, args.models, args.surveys, args.trees)
-    surveys = []
     print(
         "| survey | points judged | wrong | expected | in the first 10 % | at best |\n|---|---:|---:|---:|---:|---:|"
     )
     for name in args.surveys:
-        surveys.append(
-            classified(args.data, name, args.models / f"{slug(name)}.model", args.models)
-        )
-        points, wrong, expected, found, best = judged(surveys[-1])
+        model = model_without(args.models, name)
+        survey = classified(args.data, name, model, args.models)
+        points, wrong, expected, found, best = judged(survey)
         print(
             f"| {name} | {points:,} | {wrong:,} | {expected:,.0f} | {found:.0%} | {best:.0%} |",
             flush=True,
         )
-    if args.ship:
-        target = Path(pdal_stages.__file__).parent / "models" / "standard.sureness.json"
-        target.write_text(json.dumps(sureness(surveys).to_dict(), separators=(",", ":")) + "\n")
 
 
 if __name__ == "__main__":
