@@ -2,7 +2,7 @@
 
     python benchmarks/surveys/card.py > docs/models.md
 
-It reads the model and the figures in benchmarks/results, which leave_one_out.py, build.py and places.py wrote.
+It reads the model and the figures in benchmarks/results, which leave_one_out.py and build.py wrote.
 """
 
 from __future__ import annotations
@@ -50,22 +50,6 @@ def _percent(part: float, whole: float) -> str:
     return f"{100 * part / whole:.1f}" if whole > 0 else "-"
 
 
-def list_places(places: list[dict[str, Any]]) -> str:
-    """Return the picture of the places and a line for each, as Markdown; nothing where there are none."""
-    if not places:
-        return ""
-    lines = [
-        f"{len(places)} wrong places of surveys left out, drawn at random, large ones more likely:",
-        "",
-        "![Places: heights, the model, the truth, and a section through each](pictures/standard-places.png)",
-        "",
-    ]
-    for number, one in enumerate(places, 1):
-        where = f"{one['survey']} ({one['x']}, {one['y']}; {one['points']:,} points)"
-        lines.append(f"{number}. {where}: {one['truth']} called {one['given']}. {one['seen']}")
-    return "\n".join(lines)
-
-
 def list_tests(tests: list[dict[str, Any]]) -> str:
     """Return the scores of the shipped model on test parts, as a sentence."""
     found = " and ".join(f"{run['cloud']} {run['oa']:.1f} %" for run in tests)
@@ -92,18 +76,17 @@ def survey_list(runs: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    runs, tests, places = (
-        json.loads((RESULTS / f"{name}.json").read_text())
-        for name in ("surveys", "surveys-tests", "surveys-places")
+    scores, tests = (
+        json.loads((RESULTS / f"{name}.json").read_text()) for name in ("surveys", "surveys-tests")
     )
-    runs, trees = runs["surveys"], runs["trees"]
+    runs = scores["surveys"]
     text = Path(__file__).with_suffix(".md").read_text()
     print(
         text.format(
             stage=as_json(PREPARATION),
             passes=OPTIONS.passes,
             trees=OPTIONS.trees,
-            fewer=trees,
+            fewer=scores["trees"],
             voxel=OPTIONS.voxel,
             size=MODEL.stat().st_size / 1e6,
             digest=hashlib.sha256(MODEL.read_bytes()).hexdigest()[:16],
@@ -113,7 +96,6 @@ def main() -> None:
             scores=survey_table(runs),
             classes=class_table(at(runs, None)),
             tests=list_tests(tests),
-            places=list_places(places),
             surveys=survey_list(runs),
             count=OPTIONS.count,
             most=MOST,

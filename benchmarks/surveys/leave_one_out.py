@@ -20,7 +20,16 @@ import numpy as np
 from clouds import Cloud, load, slug, thinned
 from folds import TREES, GroupsLeftOut
 from recipe import contradicted
-from surveys import BUILDING, FOREST, GROUPS, SLOPE, SURVEYS, VEGETATION
+from surveys import (
+    BUILDING,
+    COAST,
+    FOREST,
+    GROUPS,
+    SLOPE,
+    SURVEYS,
+    VEGETATION,
+    LabeledSurvey,
+)
 
 from pdal_stages import TrainingCloud
 from pdal_stages.accuracy import Accuracy
@@ -29,8 +38,8 @@ from pdal_stages.reports.views import png, triptych
 
 #: Points per square meter that the surveys are thinned to.
 THINNED = (1.0,)
-#: The survey of which the card has a picture.
-PICTURED = "Seville"
+#: Surveys of which the card has a picture.
+PICTURED = ("Seville", "hamlet")
 NAMES = {2: "ground", 5: "vegetation", 6: "building"}
 
 
@@ -106,7 +115,7 @@ def group_table(runs: list[dict[str, Any]]) -> str:
     densities = (None, *THINNED)
     each = [group_means(at(runs, density)) for density in densities]
     false = [false_buildings(at(runs, density)) for density in densities]
-    heads = ("as flown", *(f"{density:g} points/m²" for density in THINNED))
+    heads = ("as flown", *(f"at {density:g}/m²" for density in THINNED))
     lines = [
         f"| group left out | surveys | {' | '.join(heads)} |",
         "|---|---:|" + "---:|" * len(heads),
@@ -126,27 +135,34 @@ def group_table(runs: list[dict[str, Any]]) -> str:
 
 
 def survey_table(runs: list[dict[str, Any]]) -> str:
-    """Return a line for each run as Markdown."""
+    """Return a line for each survey as flown, with its OA when thinned, as Markdown."""
+    heads = " | ".join(f"OA at {density:g}/m²" for density in THINNED)
     lines = [
-        "| survey | points/m² | OA | F1 ground | vegetation | building | what costs most |",
-        "|---|---:|---:|---:|---:|---:|---|",
+        f"| survey | points/m² | OA | {heads} | F1 ground | vegetation | building | what costs most |",
+        "|---|---:|---:|" + "---:|" * len(THINNED) + "---:|---:|---:|---|",
     ]
-    for run in runs:
-        f1 = " | ".join(
-            f"{run['f1'][name]:.1f}" if name in run["f1"] else "-" for name in NAMES.values()
-        )
-        lines.append(
-            f"| {run['cloud']} | {run['density']} | {run['oa']:.1f} | {f1} | {run['worst']} ({run['share']:.1f} %) |"
-        )
+    thin = [{run["survey"]: f"{run['oa']:.1f}" for run in at(runs, one)} for one in THINNED]
+    for run in at(runs, None):
+        name = run["survey"]
+        cells = [f"{run['oa']:.1f}", *(found.get(name, "-") for found in thin)]
+        cells += [f"{run['f1'][one]:.1f}" if one in run["f1"] else "-" for one in NAMES.values()]
+        cost = f"{run['worst']} ({run['share']:.1f} %)"
+        lines.append(f"| {name} | {run['density']} | {' | '.join(cells)} | {cost} |")
     return "\n".join(lines)
+
+
+def calibrates(survey: LabeledSurvey) -> bool:
+    """Return whether the limits of --keep-sure rest on a survey, see :func:`calibrate`."""
+    return survey.landscape != COAST and not survey.tall and survey.tells(VEGETATION)
 
 
 def calibrate(judged: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Sureness:
     """Return how often the models were right at which reliability, of surveys whose labels tell what vegetation is.
 
+    Rocks and scrub are left out: models that have seen no such land are surely wrong there, and the shipped one has seen it.
     `judged` has classes, truth and reliability (n,) of the scored points by survey.
     """
-    names = [name for name in judged if not SURVEYS[name].tall and SURVEYS[name].tells(VEGETATION)]
+    names = [name for name in judged if calibrates(SURVEYS[name])]
     out = Sureness(
         about=f"{len(names)} surveys ({', '.join(names)}), each classified by a model that had not seen its group"
     )
@@ -167,7 +183,7 @@ def main() -> None:
     options.add_argument("--json", type=Path, help="where the figures go")
     options.add_argument("--trained", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     options.add_argument("--groups", nargs="+", default=GROUPS, choices=GROUPS)
-    options.add_argument("--pictures", type=Path, help="folder for the card's picture of a survey")
+    options.add_argument("--pictures", type=Path, help="folder for the card's pictures")
     options.add_argument("--sureness", type=Path, help="where the counts behind --keep-sure go")
     options.add_argument(
         "--save", type=Path, required=True, help="folder for the models and the features"
@@ -196,7 +212,7 @@ def main() -> None:
                     known = one.truth > 0
                     parts = (found.classification, one.truth, found.reliability)
                     judged[name] = tuple(part[known] for part in parts)
-                    if args.pictures and name == PICTURED:
+                    if args.pictures and name in PICTURED:
                         draw(found.classification, one, args.pictures)
     print(group_table(runs), survey_table(runs), sep="\n\n")
     if args.json:
