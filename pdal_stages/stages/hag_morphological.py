@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,8 @@ from ..terrain.groundblocks import (
 from ..terrain.groundcells import FilterOptions
 from ..terrain.morphological import filtered_ground
 from ..terrain.openings import opening_names
-from .base import HEIGHTS_OUTSIDE, Stage
+from .base import HEIGHTS_OUTSIDE
+from .farreaching import Blocks, FarReaching, inside_block
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
@@ -33,22 +33,7 @@ from .selection import Selection
 _PART = 256
 
 
-class Blocks(NamedTuple):
-    """Squares of the grid for which the ground is made once, of points far around, before the tiles; meters."""
-
-    side: float
-    reach: float  #: how far around a block points matter
-    around: float  #: how far beyond the points that are read a tile needs blocks
-    spill: float  #: how far beyond all points blocks hold something
-    cell: float = 1.0  #: side of the cells that they are rasters of
-
-
-def inside_block(block: tuple[int, int]) -> str:
-    """What the array of the points inside a block (column, row) is called."""
-    return f"inside/{block[0]}/{block[1]}"
-
-
-class HagMorphological(Stage):
+class HagMorphological(FarReaching):
     type = "filters.hag_morphological"
     summary = "Height above ground found by a progressive morphological filter"
     source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
@@ -146,8 +131,10 @@ class HagMorphological(Stage):
     #: In tiles: what :meth:`made_of_blocks` gave.
     from_blocks: GroundCells | None = None
 
-    def blocks(self) -> Blocks:
+    def blocks(self) -> Blocks | None:
         """How far the rounds before the tiles reach; all that a point's height depends on is in cells."""
+        if self.given_ground:
+            return None
         cell = self.cell
         reach = (reach_of_block(self._filter) + 2) * cell
         return Blocks(SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)

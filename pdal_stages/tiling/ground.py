@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import places_among
 from ..stages.base import stage_from
-from ..stages.hag_morphological import HagMorphological, inside_block
+from ..stages.farreaching import FarReaching, inside_block
 from .grid import Box, TileGrid
 from .pieces import Piece
 from .plan import RunContext, TilePlan
@@ -46,10 +46,10 @@ def block_name(block: tuple[int, int]) -> str:
     return f"{block[0]}_{block[1]}.block"
 
 
-def stage_of(plan: TilePlan) -> HagMorphological:
+def stage_of(plan: TilePlan) -> FarReaching:
     """The stage that the rounds before the tiles are for."""
     assert plan.first is not None
-    return cast(HagMorphological, stage_from(plan.head[plan.first.at]))
+    return cast(FarReaching, stage_from(plan.head[plan.first.at]))
 
 
 def make_block(

@@ -17,7 +17,7 @@ from ..pipeline.references import MOVING
 from ..pipeline.run import Pipeline
 from ..pipeline.stagefiles import writes_las
 from ..stages.base import Stage
-from ..stages.hag_morphological import Blocks, HagMorphological
+from ..stages.farreaching import Blocks, FarReaching
 from .grid import Box, TileGrid
 
 #: Dimensions that follow a point through a tile's pipeline.
@@ -194,9 +194,10 @@ def _first_round(
 ) -> FirstRound | None:
     """Find the far-reaching stage whose raster is computed first; it then needs no halo."""
     for at, step in enumerate(head):
-        if isinstance(step.ours, HagMorphological) and not step.ours.given_ground:
+        blocks = step.ours.blocks() if isinstance(step.ours, FarReaching) else None
+        if blocks is not None:
             kept = _kept(readers, head[:at])
-            found = FirstRound(at, sum(reaches[:at]), step.ours.blocks(), kept)
+            found = FirstRound(at, sum(reaches[:at]), blocks, kept)
             reaches[at] = 0.0
             if kept is not None:
                 reaches[:at] = [0.0] * at

@@ -12,7 +12,7 @@ import numpy as np
 from ..base import checks
 from ..base.errors import OptionError
 from ..base.resources import available_threads, free_memory
-from ..stages.hag_morphological import Blocks
+from ..stages.farreaching import Blocks
 from .grid import Box, union
 
 #: Ways to cut the output.

@@ -19,7 +19,7 @@ from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages.base import stage_types
-from ..stages.hag_morphological import HagMorphological
+from ..stages.farreaching import FarReaching
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
 from .grid import inside
 from .ground import Changed, FromBefore, from_before, stage_of
@@ -102,7 +102,11 @@ def run_head(
     for one in ours.values():
         one.stage.own_points, one.stage.used_m = OUTSIDE, used[one.number]
     if before is not None:  # of the first one alone
-        far = next(one.stage for one in ours.values() if isinstance(one.stage, HagMorphological))
+        far = next(
+            one.stage
+            for one in ours.values()
+            if isinstance(one.stage, FarReaching) and one.stage.blocks() is not None
+        )
         far.from_blocks = before.blocks
     pipeline.execute(arrays=False)
     reports = [
