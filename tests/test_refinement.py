@@ -393,5 +393,5 @@ def test_through_pdal(tmp_path, write_las):
         f"on top of       standard, the passes before (SHA-256 {made.info['base']['sha256']})"
         in str(made)
     )
-    assert "pass 4" in str(made) and "pass 3" not in str(made)
+    assert "pass 3" in str(made) and "pass 2" not in str(made)
     assert made.info["preparation"] == ps.load_model("standard").info["preparation"]
