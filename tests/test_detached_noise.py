@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict, deque
+from collections import defaultdict, deque
 from itertools import product
 
 import laspy
@@ -21,6 +21,7 @@ from pdal_stages.terrain import belowground, detached
 from pdal_stages.terrain.detached import detached_noise
 
 SIDE = detached.SIDE
+RULES = detached.RULES
 
 
 def scene(seed=0, side=90, density=6.0, origin=(0.0, 0.0, 0.0)):
@@ -82,26 +83,16 @@ def slow_near(k):
 
 
 def slow_small(count, usual, most, widest):
-    """Voxels, as a mapping to their points, in small clusters; points of each one's cluster; and the first of each one's
-    cluster with weak ones, None where it is wide."""
-    strong = {k for k, n in count.items() if n > int(detached.WEAK * usual(k))}
-    small, size, whole = {}, {}, {}
+    """Voxels in small clusters as a mapping, and the first of each one's cluster, None where it is wide."""
+    small, whole = {}, {}
     for members in slow_components(count.keys()):
-        extent = np.ptp(np.array(members)[:, :2], axis=0).max()
-        whole |= dict.fromkeys(members, members[0] if extent < widest else None)
-    for members in slow_components(strong):
         start, total = members[0], sum(count[m] for m in members)
-        extent = np.ptp(np.array(members), axis=0).max()
-        widest = min(
-            detached.EXTENT + detached.EXTENT_GROWTH * usual(start), detached.LARGEST_EXTENT
-        )
+        extents = np.ptp(np.array(members), axis=0)
+        longest = min(RULES.extent + RULES.extent_growth * usual(start), RULES.max_extent)
         for m in members:
-            small[m], size[m] = total <= most and extent < widest, total
-    for k in count:
-        if k not in strong:
-            small[k] = not any(o in strong and not small[o] for o in slow_near(k))
-            size[k] = count[k]
-    return small, size, whole
+            small[m] = total <= most and extents.max() < longest
+            whole[m] = start if extents[:2].max() < widest else None
+    return small, whole
 
 
 def slow_covered(count, whole, spacing, most):
@@ -111,7 +102,7 @@ def slow_covered(count, whole, spacing, most):
         top[k[:2]] = k
     for k in count:
         if whole[k] is not None:
-            near = [n for n in range(3) if n < spacing(k) * detached.SPACINGS / SIDE + 0.5]
+            near = [n for n in range(3) if n < spacing(k) * RULES.spacings / SIDE + 0.5]
             columns = product(range(-near[-1], near[-1] + 1), repeat=2)
             tops = [top.get((k[0] + b, k[1] + a)) for b, a in columns]
             above[whole[k]].append(
@@ -121,8 +112,8 @@ def slow_covered(count, whole, spacing, most):
     for c, seen in above.items():
         members = [k for k in count if whole[k] == c]
         *wide, tall = np.ptp(members, axis=0)
-        steep = tall > detached.EXTENT and tall >= detached.STEEP * max(wide)
-        if np.mean(seen) >= detached.COVERED and (steep or sum(count[k] for k in members) > most):
+        steep = tall > RULES.extent and tall >= RULES.steep * max(wide)
+        if np.mean(seen) >= RULES.covered and (steep or sum(count[k] for k in members) > most):
             under |= set(members)
     return under
 
@@ -158,7 +149,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
     """From the definition, one voxel at a time, with dictionaries and searches over everything."""
     at = np.floor(xyz * (1.0 / SIDE)).astype(int)[:, [1, 0, 2]]
     block = detached.BLOCK
-    whole = block << detached.SCALES
+    whole = block << RULES.scales
     low = (at[:, :2].min(axis=0) - 1) // whole * whole
     at[:, :2] -= low
     h, w = -(-(at[:, :2].max(axis=0) + 2) // whole) * whole
@@ -185,12 +176,12 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
             known[key] = n / held, np.sqrt(blocks * (block * SIDE) ** 2 / n)
         return known[key]
 
-    small, size, cluster = slow_small(count, lambda k: density(k)[0], most, detached.LARGEST_EXTENT)
-    for scale in range(1, detached.SCALES + 1):
+    small, cluster = slow_small(count, lambda k: density(k)[0], most, RULES.max_extent)
+    for scale in range(1, RULES.scales + 1):
         thin = [
             k
             for k in count
-            if small[k] and density(k)[1] * detached.SPACINGS > SIDE * 2 ** (scale - 1)
+            if small[k] and density(k)[1] * RULES.spacings > SIDE * 2 ** (scale - 1)
         ]
         if not thin:
             break
@@ -198,11 +189,9 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         coarse = defaultdict(int)
         for k, n in count.items():
             coarse[wider(k)] += n
-        still, total, all_of = slow_small(
-            coarse, lambda k: 1.0, most, detached.LARGEST_EXTENT >> scale
-        )
+        still, all_of = slow_small(coarse, lambda k: 1.0, most, RULES.max_extent >> scale)
         for k in thin:
-            small[k], size[k] = still[wider(k)], total[wider(k)]
+            small[k] = still[wider(k)]
             cluster[k] = all_of[wider(k)] and (scale, all_of[wider(k)])
     covered = slow_covered(count, cluster, lambda k: density(k)[1], most)
     top, base = np.full((h, w), -np.inf), np.full((h, w), np.inf)
@@ -217,8 +206,8 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
     for c in full:
         levels = sorted(k[2] for k in count if k[:2] == c)
         k = (*c, levels[-1])
-        alone = len(levels) == 1 or levels[-1] - levels[-2] > detached.BENEATH
-        if alone and (small[k] or highest[k] - base[c] > detached.HANGING):
+        alone = len(levels) == 1 or levels[-1] - levels[-2] > RULES.beneath
+        if alone and (small[k] or highest[k] - base[c] > RULES.hanging_m):
             hung[c] = highest[k], small[k]
     j, i = np.mgrid[:h, :w]
     codes = {}
@@ -227,25 +216,19 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
             continue
         square = (j - k[0]) ** 2 + (i - k[1]) ** 2
         apart = density(k)[1]
-        least = (
-            gap
-            + detached.GAP_OF_POINT * size[k]
-            + detached.GAP_GROWTH * max(0, apart - detached.DENSE)
-        )
-        r = min(
-            max(detached.ASIDE, int(np.ceil(detached.SPACINGS_ASIDE * apart / SIDE))), detached.FAR
-        )
+        least = gap + RULES.gap_growth * max(0, apart - RULES.dense_m)
+        r = min(max(RULES.aside, int(np.ceil(RULES.spacings_aside * apart / SIDE))), RULES.far)
         while True:
             near = top[(square <= r * r) & np.isfinite(top)]
-            if len(near) >= belowground.RULES.min_columns or r == detached.FAR:
+            if len(near) >= belowground.RULES.min_columns or r == RULES.far:
                 break
-            r = min(2 * r, detached.FAR)
+            r = min(2 * r, RULES.far)
         if len(near) < belowground.RULES.min_columns or lowest[k] - near.max() < least:
             continue
         others = []
         for (b, a), (z, suspect) in hung.items():
             square = (b - k[0]) ** 2 + (a - k[1]) ** 2
-            if 4 < square <= detached.FAR**2 and abs(z - lowest[k]) <= 1 + 0.3 * SIDE * np.sqrt(
+            if 4 < square <= RULES.far**2 and abs(z - lowest[k]) <= 1 + 0.3 * SIDE * np.sqrt(
                 square
             ):
                 others.append((a - k[1], b - k[0], z - lowest[k], suspect))
@@ -257,9 +240,9 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
                 for p, q, rise, _ in others
                 if abs(u * q - v * p) / far <= 1 and abs(rise - (u * p + v * q) / far**2 * dz) <= 2
             ]
-            places = {int((part + detached.FAR) / 3) for part in on}
-            few = detached.STRUNG_SHARE * sum(other[3] for other in others)
-            if len(places) >= detached.STRUNG and len(on) > few:
+            places = {int((part + RULES.far) / 3) for part in on}
+            few = RULES.strung_share * sum(other[3] for other in others)
+            if len(places) >= RULES.strung and len(on) > few:
                 del codes[k]
                 break
     low = np.full((h, w), np.inf)
@@ -268,20 +251,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         low[k[:2]] = min(low[k[:2]], lowest[k])
     limit = slow_below(low, base, SIDE, depth)
     codes |= {k: 7 for k in lone if highest[k] < limit[k[:2]]}
-    out = np.array([codes.get(k, 0) for k in voxel], np.uint8)
-    points, lows, clusters = np.zeros((3, h, w), np.int64)
-    np.add.at(points, (at[:, 0], at[:, 1]), 1)
-    np.add.at(lows, (at[:, 0], at[:, 1]), out == 7)
-    of = Counter(cluster.values())
-    for k in (k for k, code in codes.items() if code == 7):
-        clusters[k[:2]] += detached.PARTS // (of[cluster[k]] if cluster[k] else 1)
-    for c in zip(*np.nonzero(lows), strict=True):
-        near = np.maximum(abs(j - c[0]), abs(i - c[1])) <= 20
-        held, filled = clusters[near].sum() / detached.PARTS, (points[near] > 0).sum()
-        share = min(held / filled, lows[near].sum() / points[near].sum())
-        if held > detached.CLUSTERS and share > detached.TOO_MANY:
-            out[(at[:, 0] == c[0]) & (at[:, 1] == c[1]) & (out == 7)] = 0
-    return out
+    return np.array([codes.get(k, 0) for k in voxel], np.uint8)
 
 
 def slow_below(low, base, side, depth=1.0):

@@ -4,8 +4,8 @@ Echoes from below (multiple reflections), birds, clouds, the sun. All is decided
 extremes, so that no order of points and no tile matters:
 
 1. A point is suspect if it is of a small cluster that nothing joins to the rest: a component of voxels that touch, by a
-   corner at least, with few points and little extent. In dense clouds, voxels with next to no points do not join others;
-   in thin ones, voxels are widened until they hold several spacings of points. A cluster that lies under others in nearly
+   corner at least, with few points and little extent. In thin clouds voxels are widened until they hold several spacings
+   of points. A cluster that lies under others in nearly
    all of its columns may have any number of points, or be taller. What is not suspect gives every column of the grid its
    lowest and its highest point.
 2. A suspect is high noise if it lies above all that is near, by a gap. The thinner the cloud, the wider the gap and the
@@ -40,39 +40,42 @@ from .cells import (
 )
 
 LOW, HIGH = NOISE
-#: Side of a voxel, meters.
+#: Side of a voxel in meters.
 SIDE = 1.5
-#: The greatest extent of a cluster in voxels: it grows with the points in a column, as clusters touch where they are many.
-EXTENT, EXTENT_GROWTH, LARGEST_EXTENT = 3, 0.3, 10
 #: Columns along the side of a block in which the density is measured.
 BLOCK = 8
-#: Voxels with fewer points than this share of those in a column of the surroundings join nothing.
-WEAK = 0.02
-#: Voxels are doubled in width so often, until that is so many spacings of points.
-SCALES, SPACINGS = 2, 1.6
-#: Levels of voxels above and below 0, and their bits in a key.
-LEVELS, BITS = 1 << 21, 22
+#: Levels of voxels above and below 0.
+LEVELS = 1 << 21
+#: Bits of a level in a key.
+BITS = 22
+
+
+class DetachedRules(NamedTuple):
+    """Thresholds of detached clusters, which kernels take as they are."""
+
+    extent: float = 3.0  #: voxels that a cluster is long, at most, where a column holds few points
+    extent_growth: float = 0.3  #: and so many more per point in a column: dense clusters touch more
+    max_extent: int = 10  #: voxels that no cluster is longer than
+    scales: int = 2  #: times that voxels are doubled in width in thin clouds
+    spacings: float = 1.6  #: of points, which a voxel is wide then
+    gap_growth: float = 10.0  #: meters that the gap of high noise grows per meter of spacing
+    dense_m: float = 0.55  #: beyond this spacing: about 3 points/m2
+    aside: int = 3  #: columns around within which nothing is as high as high noise, at least
+    spacings_aside: float = 2.5  #: and so many spacings of points
+    hanging_m: float = 5.0  #: height above the lowest point of a column from which points hang
+    beneath: int = 2  #: empty voxels below what hangs
+    far: int = 20  #: columns within which others of a line are looked for: a span of wires
+    strung: int = 4  #: places of three columns along a line that hold others: a wire
+    strung_share: float = 0.3  #: of all suspects near: two wires hang side by side at pylons
+    covered: float = 0.8  #: share of a low cluster's voxels that others lie above
+    steep: float = 0.5  #: rise per meter of a low cluster of few points, which ground hardly has
+
+
+RULES = DetachedRules()
 #: How far away, in meters, points can decide whether a point is of a small cluster: a component in full and its density.
-CLUSTER_REACH = (LARGEST_EXTENT + 3 * BLOCK + 2) * SIDE
-#: The gap in meters grows by this with each point of a cluster, and with the spacing of points beyond DENSE meters.
-GAP_OF_POINT, GAP_GROWTH, DENSE = 0.1, 10.0, 0.55
-#: The least columns within which nothing is as high, and so many spacings of points.
-ASIDE, SPACINGS_ASIDE = 3, 2.5
-#: How high what hangs is above the lowest point of its column, where nothing is in so many voxels beneath it.
-HANGING, BENEATH = 5.0, 2
-#: Columns within which others of a line are looked for.
-FAR = 20
-#: A line has others at so many places of three columns each, and such a share of all suspects near: two wires hang side
-#: by side, as over pylons.
-STRUNG, STRUNG_SHARE = 4, 0.3
-#: Within so many columns around, low noise has at most such a share of the points, or no more clusters than such a share of
-#: the columns, or so many. A voxel counts as its part of a cluster, in whole numbers of which a cluster has so many.
-AROUND, TOO_MANY, CLUSTERS, PARTS = 20, 0.025, 5, 1 << 20
-#: Low noise of any size has others above it in such a share of its voxels; of few points, it rises by so much per meter, as
-#: ground hardly does.
-COVERED, STEEP = 0.8, 0.5
+CLUSTER_REACH = (RULES.max_extent + 3 * BLOCK + 2) * SIDE
 #: How far away, in meters, points can change what a point is: the halo a tile needs.
-REACH = (below_reach(SIDE) + FAR + 2) * SIDE + CLUSTER_REACH
+REACH = (below_reach(SIDE) + RULES.far + 2) * SIDE + CLUSTER_REACH
 
 
 def detached_noise(
@@ -133,7 +136,7 @@ def detached_noise(
 def _judge(x, y, z, column, row, cluster, gap, depth):
     """Codes of points, on one raster round them."""
     # One empty column on every side at least, and whole blocks.
-    whole = BLOCK << SCALES
+    whole = BLOCK << RULES.scales
     left, bottom = (int(v.min() - 1) // whole * whole for v in (column, row))
     w, h = (
         -(-(int(v.max()) + 2 - start) // whole) * whole
@@ -141,7 +144,7 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     )
     voxels, voxel = Voxels.of(row - bottom, column - left, cell_numbers(z, SIDE), w)
     usual, spacing = surroundings(voxels)
-    suspect, size, number = small_clusters(voxels, usual, spacing, cluster)
+    suspect, number = small_clusters(voxels, usual, spacing, cluster)
     place = voxels.keys >> BITS
     lowest, highest = np.full(len(place), np.inf), np.full(len(place), -np.inf)
     np.minimum.at(lowest, voxel, z)
@@ -153,26 +156,18 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     np.maximum.at(top, place[~suspect], highest[~suspect])
     # The highest voxel of a column hangs, with nothing close beneath it, as a wire does.
     begins = np.append(begins_run(place), True)
-    hangs = begins[1:] & (begins[:-1] | (np.diff(voxels.keys, prepend=0) > BENEATH))
-    hangs &= suspect | (highest - base[place] > HANGING)
+    hangs = begins[1:] & (begins[:-1] | (np.diff(voxels.keys, prepend=0) > RULES.beneath))
+    hangs &= suspect | (highest - base[place] > RULES.hanging_m)
     hung, hung_suspect = np.full(h * w, np.nan), np.zeros(h * w, bool)
     hung[place[hangs]], hung_suspect[place[hangs]] = highest[hangs], suspect[hangs]
     verdict = np.zeros(len(place), np.uint8)
     rasters = (a.reshape(h, w) for a in (top, hung, hung_suspect))
-    _high(place, lowest, suspect, size, spacing, *rasters, gap, verdict)
+    _high(place, lowest, suspect, spacing, *rasters, gap, verdict)
     suspect = (suspect | large) & (verdict == 0)
     np.minimum.at(low, place[suspect], lowest[suspect])
     limit = below_ground(low.reshape(h, w), base.reshape(h, w), SIDE, depth)
     low = suspect & (highest < limit.ravel()[place])
-    # Where more is low than noise is, it is none.
-    part, grouped = np.full(len(place), PARTS), number >= 0
-    part[grouped] //= np.bincount(number[grouped])[number[grouped]]
-    lows, points, clusters, full = (
-        sums_around(np.bincount(place, counts, h * w).astype(np.int64).reshape(h, w), AROUND)
-        for counts in (low * voxels.counts, voxels.counts, low * part, begins[:-1] * PARTS)
-    )
-    many = (lows > TOO_MANY * points) & (clusters > TOO_MANY * full) & (clusters > CLUSTERS * PARTS)
-    verdict[low & ~many.ravel()[place]] = LOW
+    verdict[low] = LOW
     return verdict[voxel]
 
 
@@ -211,35 +206,28 @@ def surroundings(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 def _small(
     voxels: Voxels, usual: NDArray[np.float64], most: int, extent: int
-) -> tuple[NDArray[np.bool_], NDArray, NDArray]:
-    """Voxels of small components, and weak ones that no large component touches; points of each one's component; and its
-    number, weak ones joined as well, -1 where it is wider than `extent`, in voxels."""
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Find the voxels (n,) of small components, and number the components.
+
+    Numbers (n,) are -1 where a component is as wide as `extent`, in voxels.
+    """
     keys, number = voxels.keys, len(voxels.keys)
-    strong = voxels.counts > (WEAK * usual).astype(np.int64)
     ahead = np.array(
         [(dj * voxels.width + di) << BITS for dj, di in ((0, 1), (1, -1), (1, 0), (1, 1))]
     )
-    spans = np.array(
-        [[1, 1], *zip(ahead - 1, ahead + 1, strict=True)]
-    )  # above, and in columns ahead
+    # Above, and in columns ahead.
+    spans = np.array([[1, 1], *zip(ahead - 1, ahead + 1, strict=True)])
     pairs = np.empty((2, _touching(keys, spans, np.empty((2, 0), np.int64))), np.int64)
     _touching(keys, spans, pairs)
-    one, other = pairs
-    both = strong[one] & strong[other]
     label = np.empty(number, np.int64)
-    count = number_sets(one[both], other[both], label)
-    size = np.bincount(label, voxels.counts).astype(np.int64)
+    count = number_sets(*pairs, label)
+    size = np.bincount(label, voxels.counts)
     first = np.empty(count, np.int64)
     first[label[::-1]] = np.arange(number)[::-1]  # a component's first voxel stands for it
-    widest = np.minimum(EXTENT + EXTENT_GROWTH * usual[first], LARGEST_EXTENT)
-    small = ((size <= most) & (longest_sides(label, voxels.places, count) < widest))[label]
-    large = strong & ~small
-    small[~strong] = True
-    for weak, beside in ((one, other), (other, one)):
-        small[weak[~strong[weak] & large[beside]]] = False
-    whole = np.empty(number, np.int64)
-    sides = longest_sides(whole, voxels.places[:2], number_sets(one, other, whole))
-    return small, size[label], np.where(sides[whole] < extent, whole, -1)
+    widest = np.minimum(RULES.extent + RULES.extent_growth * usual[first], RULES.max_extent)
+    small = (size <= most) & (longest_sides(label, voxels.places, count) < widest)
+    wide = longest_sides(label, voxels.places[:2], count) >= extent
+    return small[label], np.where(wide[label], -1, label)
 
 
 @njit
@@ -265,16 +253,16 @@ def _touching(keys, spans, pairs):
 
 def small_clusters(
     voxels: Voxels, usual: NDArray[np.float64], spacing: NDArray[np.float64], most: int
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """Which voxels are of clusters of at most `most` points that nothing joins to the rest, points of each one's, and the
-    number of clusters that are not wide, whatever their size; -1 for none.
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Find the voxels (n,) of clusters of at most `most` points that nothing joins to the rest.
 
-    `usual` and `spacing` are what :func:`surroundings` says.
+    Also number (n,) the clusters that are not wide, whatever their size; -1 for none. `usual` and `spacing` (n,) are of
+    :func:`surroundings`.
     """
-    small, size, number = _small(voxels, usual, most, LARGEST_EXTENT)
+    small, number = _small(voxels, usual, most, RULES.max_extent)
     row, column, level = voxels.places
-    for scale in range(1, SCALES + 1):
-        thin = small & (spacing * SPACINGS > SIDE * 2 ** (scale - 1))
+    for scale in range(1, RULES.scales + 1):
+        thin = small & (spacing * RULES.spacings > SIDE * 2 ** (scale - 1))
         if not thin.any():
             break
         # With one empty column on every side.
@@ -282,12 +270,10 @@ def small_clusters(
         wider, of = Voxels.of(
             (row >> scale) + 1, (column >> scale) + 1, level, width, voxels.counts
         )
-        still, total, numbers = _small(
-            wider, np.ones(len(wider.keys)), most, LARGEST_EXTENT >> scale
-        )
-        small[thin], size[thin] = still[of[thin]], total[of[thin]]
+        still, numbers = _small(wider, np.ones(len(wider.keys)), most, RULES.max_extent >> scale)
+        small[thin] = still[of[thin]]
         number[thin] = np.where(numbers < 0, -1, numbers + number.max() + 1)[of[thin]]
-    return small, size, number
+    return small, number
 
 
 def _covered(voxels, number, spacing, columns, most):
@@ -297,7 +283,11 @@ def _covered(voxels, number, spacing, columns, most):
     top = np.full(columns, -1)
     top[place] = np.arange(len(place))  # the last of a column is its highest
     asked = np.flatnonzero(number >= 0)
-    place, number_of, within = place[asked], number[asked], spacing[asked] * SPACINGS / SIDE + 0.5
+    place, number_of, within = (
+        place[asked],
+        number[asked],
+        spacing[asked] * RULES.spacings / SIDE + 0.5,
+    )
     row, column, level = voxels.places
     above = np.zeros(len(asked), bool)
     for dj, di in product(range(-2, 3), repeat=2):
@@ -307,24 +297,24 @@ def _covered(voxels, number, spacing, columns, most):
     size = np.bincount(number_of, voxels.counts[asked])
     wide = longest_sides(number_of, (row[asked], column[asked]), len(size))
     tall = longest_sides(number_of, (level[asked],), len(size))
-    mostly = np.bincount(number_of, above) >= COVERED * np.bincount(number_of)
-    mostly &= (size > most) | (tall > EXTENT) & (tall >= STEEP * wide)
+    mostly = np.bincount(number_of, above) >= RULES.covered * np.bincount(number_of)
+    mostly &= (size > most) | (tall > RULES.extent) & (tall >= RULES.steep * wide)
     covered = np.zeros(len(number), bool)
     covered[asked] = mostly[number_of]
     return covered
 
 
 @njit
-def _high(place, lowest, suspect, size, spacing, top, hung, hung_suspect, gap, verdict):
+def _high(place, lowest, suspect, spacing, top, hung, hung_suspect, gap, verdict):
     """Say which suspects are above all that is near, and not of a line."""
     h, w = top.shape
-    u, v, dz = np.empty((3, (2 * FAR + 1) ** 2))
+    u, v, dz = np.empty((3, (2 * RULES.far + 1) ** 2))
     for k in range(len(place)):
         if not suspect[k]:
             continue
         j, i = place[k] // w, place[k] % w
-        least = gap + GAP_OF_POINT * size[k] + GAP_GROWTH * max(0.0, spacing[k] - DENSE)
-        r = min(max(ASIDE, int(np.ceil(SPACINGS_ASIDE * spacing[k] / SIDE))), FAR)
+        least = gap + RULES.gap_growth * max(0.0, spacing[k] - RULES.dense_m)
+        r = min(max(RULES.aside, int(np.ceil(RULES.spacings_aside * spacing[k] / SIDE))), RULES.far)
         while True:
             seen, highest = 0, -np.inf
             for b in range(max(j - r, 0), min(j + r + 1, h)):
@@ -332,9 +322,9 @@ def _high(place, lowest, suspect, size, spacing, top, hung, hung_suspect, gap, v
                     if (b - j) ** 2 + (a - i) ** 2 <= r * r and top[b, a] > -np.inf:
                         seen += 1
                         highest = max(highest, top[b, a])
-            if seen >= LOW_RULES.min_columns or r == FAR:
+            if seen >= LOW_RULES.min_columns or r == RULES.far:
                 break
-            r = min(2 * r, FAR)
+            r = min(2 * r, RULES.far)
         if seen >= LOW_RULES.min_columns and lowest[k] - highest >= least:
             verdict[k] = 0 if _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz) else HIGH
 
@@ -344,12 +334,12 @@ def _in_line(hung, hung_suspect, j, i, z, u, v, dz):
     """Whether others that hang are strung along a line through a place, as wires are, or single points of them."""
     h, w = hung.shape
     n = suspects = 0
-    for b in range(max(j - FAR, 0), min(j + FAR + 1, h)):
-        for a in range(max(i - FAR, 0), min(i + FAR + 1, w)):
+    for b in range(max(j - RULES.far, 0), min(j + RULES.far + 1, h)):
+        for a in range(max(i - RULES.far, 0), min(i + RULES.far + 1, w)):
             square = (b - j) ** 2 + (a - i) ** 2
-            if 4 < square <= FAR * FAR and abs(hung[b, a] - z) <= 1.0 + 0.3 * SIDE * np.sqrt(
-                square
-            ):
+            if 4 < square <= RULES.far * RULES.far and abs(
+                hung[b, a] - z
+            ) <= 1.0 + 0.3 * SIDE * np.sqrt(square):
                 u[n], v[n], dz[n] = a - i, b - j, hung[b, a] - z
                 n += 1
                 suspects += hung_suspect[b, a]
@@ -361,11 +351,11 @@ def _in_line(hung, hung_suspect, j, i, z, u, v, dz):
             aside = abs(u[a] * v[b] - v[a] * u[b]) / far
             if aside <= 1.0 and abs(dz[b] - part / far * dz[a]) <= 2.0:
                 along += 1
-                places |= 1 << int((part + FAR) / 3.0)
+                places |= 1 << int((part + RULES.far) / 3.0)
         number = 0
         while places > 0:
             number += places & 1
             places >>= 1
-        if number >= STRUNG and along > STRUNG_SHARE * suspects:
+        if number >= RULES.strung and along > RULES.strung_share * suspects:
             return True
     return False
