@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +217,7 @@ SETS = ("measures", "distributions", "both")
 RADII = ("c1", "c2", "c3", "c5")
 
 
+@cache
 def our_runs(paper: str, scene: str) -> list[dict[str, Any]]:
     """Return our finished runs of a paper's experiments on a scene."""
     runs: list[dict[str, Any]] = json.loads((OURS / f"{paper}-{scene}.json").read_text())["runs"]

@@ -20,7 +20,7 @@ from .groundcells import (
     means_of,
     minimum_grid,
 )
-from .openings import objects_of
+from .openings import openings_of
 from .planes import GroundRaster
 from .planes import reach as planes_reach
 
@@ -60,8 +60,7 @@ def _openings(
     points: GroundPoints, options: FilterOptions, window: CellWindow
 ) -> dict[int, NDArray[np.float32]]:
     """Return radius in cells -> opening (h, w) of the minimum grid of all points, low outliers left out; meters."""
-    radii = options.opening_radii
-    if not radii:
+    if not options.opening_radii:
         return {}
     _, raster, _ = minimum_grid(points, window, options.cell)
-    return objects_of(raster, options.cell, options.slope, max(radii), radii)[2]
+    return dict(openings_of(raster, {*options.opening_radii}))

@@ -7,7 +7,7 @@ whatever their direction, as discs do, but fall apart into lines, so an opening 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,26 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
     return np.ascontiguousarray(rows)
 
 
+def openings_of(
+    raster: NDArray[np.float32], radii: Iterable[int]
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield radii in cells, ascending, and the openings (h, w) of a minimum grid by octagons of them; meters."""
+    measured = raster != HOLE
+    # Heights by their rank: that takes half the bytes, and order is all that openings look at.
+    heights, rank = np.unique(raster[measured], return_inverse=True)
+    heights = np.concatenate(([-HOLE], heights, [HOLE]))
+    last = len(heights) - 1
+    most = measured * np.min_scalar_type(last).type(last)
+    upended = np.zeros_like(most)
+    upended[measured] = last - 1 - rank
+    taken = 0, 0
+    for radius in sorted(radii):
+        squares, diamonds = _steps(min(radius, sum(raster.shape)))
+        upended = highest_around(upended, squares - taken[0], diamonds - taken[1])
+        taken = squares, diamonds
+        yield radius, heights[highest_around(np.minimum(last - upended, most), squares, diamonds)]
+
+
 def objects_of(
     raster: NDArray[np.float32], cell: float, slope: float, window: int, keep: Collection[int] = ()
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]]]:
@@ -96,24 +116,13 @@ def objects_of(
     openings : dict
         Radius -> (h, w) float32, of `keep`.
     """
-    measured = raster != HOLE
-    # Heights by their rank: that takes half the bytes, and order is all that openings look at.
-    heights, rank = np.unique(raster[measured], return_inverse=True)
-    heights = np.concatenate(([-HOLE], heights, [HOLE]))
-    last = len(heights) - 1
-    most = measured * np.min_scalar_type(last).type(last)
-    upended = np.zeros_like(most)
-    upended[measured] = last - 1 - rank
-    openings, taken = {}, (0, 0)
+    measured, openings = raster != HOLE, {}
     objects, floor, before = np.zeros(raster.shape, bool), raster.copy(), raster
     # An opening lowers nothing by more than all heights differ.
+    range_m = np.ptp(raster[measured]) if measured.any() else 0.0
     drops = {radius: np.float32(slope * radius * cell) for radius in opening_radii(window)}
-    drops = {radius: drop for radius, drop in drops.items() if drop < heights[-2] - heights[1]}
-    for radius in sorted({*drops, *keep}):
-        squares, diamonds = _steps(min(radius, sum(raster.shape)))
-        upended = highest_around(upended, squares - taken[0], diamonds - taken[1])
-        taken = squares, diamonds
-        opened = heights[highest_around(np.minimum(last - upended, most), squares, diamonds)]
+    drops = {radius: drop for radius, drop in drops.items() if drop < range_m}
+    for radius, opened in openings_of(raster, {*drops, *keep}):
         if radius in keep:
             openings[radius] = opened
         if radius in drops:
