@@ -12,6 +12,7 @@ from pdal_stages.classifier.foresttraining import limit_to_percentiles
 from pdal_stages.classifier.recipes import NOT_STATED, RECIPES, describe_recipes, with_recipe
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.trainoptions import feature_plan
+from pdal_stages.cli import main
 from pdal_stages.features import FeaturePlan
 from pdal_stages.stages.base import stage_from
 
@@ -163,3 +164,9 @@ def test_a_given_curvature_threshold_is_used_and_stored():
     )
     model = train(TrainingCloud(xyz, labels), options, progress=False)
     assert model.passes[0].features.copt_threshold == 0.05
+
+
+def test_a_mistyped_recipe_gets_the_whole_name(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "a.laz", "--model", "b.model", "--recipe", "weinman2018"])
+    assert "Did you mean 'weinmann2018'?" in capsys.readouterr().err

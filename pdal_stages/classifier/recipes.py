@@ -156,7 +156,8 @@ def with_recipe(given: Mapping[str, Any]) -> dict[str, Any]:
         if given.get(option) is None:
             raise OptionError(
                 f"the recipe '{name}' needs the option '{option}'",
-                cure=f"Give {option}, the code of the class to find",
+                cure=f"Give {option}, the code of the class to find; with the command train as "
+                f"--writers.classifiermodel.{option}=6",
             )
     values = recipe.values() | dict(given)
     if isinstance(network := given.get("alsnet"), Mapping) and "alsnet" in recipe.options:

@@ -31,6 +31,7 @@ _COMMANDS = {
 OVERRIDES = "Stages take options as in PDAL: --stage.TAG.option=V, --filters.name.option=V"
 INPUTS = "Files, folders, patterns, tile indexes, EPT sources"
 _NO_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
+_WORD = re.compile(r"[\w-]+")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -219,7 +220,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         if chosen := _NO_CHOICE.search(message):
-            message += f". {suggest(chosen[1], re.findall(r'[a-z_-]+', chosen[2]))}".rstrip(". ")
+            message += f". {suggest(chosen[1], _WORD.findall(chosen[2]))}".rstrip(". ")
         super().error(message)
 
     @property
