@@ -35,8 +35,8 @@ _WHERE = {
     "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline.run",
     "run_stage": "pipeline.runtime",
-    "run_tiled": "tiling.run",
-    "TilingOptions": "tiling.settings",
+    "run_tiled": "tiling.tiled_run",
+    "TilingOptions": "tiling.options",
     "train": "classifier.training",
     "write_accuracy_report": "reports.accuracypage",
 }
@@ -61,8 +61,8 @@ if TYPE_CHECKING:
     from .reports.objectlayers import object_frames, object_layers
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima
-    from .tiling.run import run_tiled
-    from .tiling.settings import TilingOptions
+    from .tiling.options import TilingOptions
+    from .tiling.tiled_run import run_tiled
 
 
 def __getattr__(name: str):

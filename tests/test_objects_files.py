@@ -270,7 +270,7 @@ def test_layers_are_written_all_or_none_and_nothing_older_is_left(
 def test_classify_of_many_files_with_options_report_and_resume(
     folder, tmp_path, capsys, monkeypatch
 ):
-    from pdal_stages.tiling import objects
+    from pdal_stages.tiling import objects_from_files as objects
 
     parts = [str(folder / "parts" / f"{n}.laz") for n in (0, 1)]
     out, html = tmp_path / "out", tmp_path / "run.html"

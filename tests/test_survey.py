@@ -17,7 +17,7 @@ from pdal_stages.base.resources import free_memory, parse_size
 from pdal_stages.cli import main
 from pdal_stages.stages.farreaching import Blocks
 from pdal_stages.synthetic.town import WKT
-from pdal_stages.tiling.settings import PARENT, Density, Extent, block_bytes, settled, worker_bytes
+from pdal_stages.tiling.options import PARENT, Density, Extent, block_bytes, settled, worker_bytes
 
 pytestmark = pytest.mark.pdal
 OPTIONS = ("--filters.hag_minima.cell=5", "--no-progress")
@@ -186,7 +186,7 @@ def test_a_cloud_beyond_the_memory_is_cut(survey, classify, whole, tmp_path):
 
 
 def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, fresh, tmp_path, monkeypatch):
-    from pdal_stages.tiling import run
+    from pdal_stages.tiling import tiled_run as run
 
     real, calls = run.run_tile, []
 

@@ -8,7 +8,7 @@ from test_training_scores import QUICK_WORDS, scene
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError
 from pdal_stages.cli import main
-from pdal_stages.tiling.training import surveys_of
+from pdal_stages.tiling.train_survey import surveys_of
 
 
 def test_surveys_are_files_or_groups_of_them():

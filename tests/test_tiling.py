@@ -19,10 +19,10 @@ from pdal_stages.pipeline.inputs_outputs import locations
 from pdal_stages.synthetic.town import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.grid import TileGrid
 from pdal_stages.tiling.inputs import CloudIndex, InputSource, find_sources, las_extent, one_format
-from pdal_stages.tiling.pieces import cut_all, sort_points
-from pdal_stages.tiling.run import TilingOptions, run_tiled
+from pdal_stages.tiling.sorted_points import cut_all, sort_points
+from pdal_stages.tiling.tile_grid import TileGrid
+from pdal_stages.tiling.tiled_run import TilingOptions, run_tiled
 
 pytestmark = pytest.mark.pdal
 
@@ -168,7 +168,7 @@ def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole)
 
 
 def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole, monkeypatch):
-    from pdal_stages.tiling import outputs
+    from pdal_stages.tiling import write_outputs as outputs
 
     monkeypatch.setattr(outputs, "MOST_AT_ONCE", 7_000)
     out = tmp_path / "out.laz"
@@ -608,7 +608,7 @@ def test_a_reference_that_stands_after_the_points(
     tmp_path, random_cloud, write_las, monkeypatch, at_once
 ):
     """In feet: a piece without it would be taken for one in meters. Other records are kept too."""
-    monkeypatch.setattr("pdal_stages.tiling.outputs.MOST_AT_ONCE", at_once)
+    monkeypatch.setattr("pdal_stages.tiling.write_outputs.MOST_AT_ONCE", at_once)
     points = dict(zip("XYZ", random_cloud(200, seed=1).T, strict=True))
     las = laspy.read(write_las(tmp_path / "in.las", points, 6))
     wkt = b'LOCAL_CS["feet",UNIT["foot",0.3048]]'

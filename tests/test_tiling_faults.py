@@ -28,9 +28,9 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.base.resources import available_threads
 from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform
-from pdal_stages.tiling import cluster as dask_cluster
-from pdal_stages.tiling import run as tiled_run
-from pdal_stages.tiling.store import Store
+from pdal_stages.tiling import dask_workers as dask_cluster
+from pdal_stages.tiling import tiled_run
+from pdal_stages.tiling.checkpoint import Store
 
 pytestmark = pytest.mark.pdal
 WORKERS = min(2, available_threads())

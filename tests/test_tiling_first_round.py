@@ -20,7 +20,8 @@ from pdal_stages.terrain.groundblocks import (
     reach_of_block,
 )
 from pdal_stages.terrain.groundcells import FilterOptions
-from pdal_stages.tiling import run, tile
+from pdal_stages.tiling import run_tile as tile
+from pdal_stages.tiling import tiled_run as run
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
 MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")

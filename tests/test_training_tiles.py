@@ -10,8 +10,8 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.cli import main
-from pdal_stages.tiling import training
-from pdal_stages.tiling.settings import TilingOptions
+from pdal_stages.tiling import train_survey as training
+from pdal_stages.tiling.options import TilingOptions
 
 pytestmark = pytest.mark.pdal
 

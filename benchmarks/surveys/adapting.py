@@ -22,8 +22,8 @@ from clouds import model_without, true_classes
 from surveys import SURVEYS
 
 from pdal_stages.pipeline.classify_request import ClassifyRequest
-from pdal_stages.tiling.adapting import SURE, adapt
 from pdal_stages.tiling.classify import ClassifyTask
+from pdal_stages.tiling.self_training import SURE, adapt
 
 CODES = (2, 5, 6)
 

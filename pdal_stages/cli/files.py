@@ -77,7 +77,7 @@ def add_commands(parser: Parser) -> None:
 
 
 def _objects(options: argparse.Namespace) -> None:
-    from ..tiling.objects import objects_of_files, writer
+    from ..tiling.objects_from_files import objects_of_files, writer
 
     given = {name: value for name in _OF_OBJECTS if (value := getattr(options, name)) is not None}
     stage = writer(options.output, options.overrides, **given)

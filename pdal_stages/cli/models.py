@@ -103,7 +103,7 @@ def _models(options: argparse.Namespace) -> None:
 def _train(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
     from ..pipeline.inputs_outputs import input_files
-    from ..tiling.training import TrainTask, surveys_of
+    from ..tiling.train_survey import TrainTask, surveys_of
 
     extra = {name: value for name in _OF_TRAINING if (value := getattr(options, name)) is not None}
     files = input_files(options.inputs)
@@ -129,7 +129,7 @@ def _train(options: argparse.Namespace) -> None:
 
 def _adapt(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
-    from ..tiling.adapting import adapt
+    from ..tiling.self_training import adapt
 
     how = tiles.options_of(options)
     with tiles.interruptible():

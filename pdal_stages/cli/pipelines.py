@@ -105,7 +105,7 @@ def _in_tiles(options: argparse.Namespace) -> int:
     from ..pipeline.run import Pipeline
     from ..pipeline.stagefiles import writers_outputs
     from ..tiling.plan import make_plan
-    from ..tiling.run import run_tiled
+    from ..tiling.tiled_run import run_tiled
 
     chosen, extra = tiles.options_of(options), tiles.extra_files(options)
     pipeline = Pipeline(_source(options), options.overrides, whole=False)

@@ -21,13 +21,13 @@ from ..base.las import class_name
 from ..base.messages import counted, one_line, print_messages
 from ..base.resources import parse_size
 from ..pipeline.run import LEFT_ALONE
-from ..tiling.report import InterruptedRun, TiledRun
-from ..tiling.settings import PER, TilingOptions
+from ..tiling.jobs import InterruptedRun, TiledRun
+from ..tiling.options import PER, TilingOptions
 from . import INPUTS, Parser, takes_options
 
 if TYPE_CHECKING:
     from ..tiling.classify import ClassifyTask
-    from ..tiling.report import Job
+    from ..tiling.jobs import Job
 
 #: Failures printed, and tiles of a dry run.
 _MOST_FAILURES, _MOST_TILES = 20, 50
@@ -80,7 +80,7 @@ def _classify(options: argparse.Namespace) -> int:
 
     own, others = [], list(options.overrides)
     if options.objects:
-        from ..tiling.objects import OPTIONS_OF, objects_of_files, refuse_tiles, writer
+        from ..tiling.objects_from_files import OPTIONS_OF, objects_of_files, refuse_tiles, writer
 
         own = [one for one in others if not one.by_tag and one.selector in OPTIONS_OF]
         others = [one for one in others if one not in own]

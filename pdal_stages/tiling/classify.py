@@ -16,8 +16,8 @@ from ..base.files import Output, check_outputs
 from ..base.lascheck import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
-from .report import Job, TiledRun, messages_on_folders
-from .settings import TilingOptions, fits_whole
+from .jobs import Job, TiledRun, messages_on_folders
+from .options import TilingOptions, fits_whole
 
 
 @dataclass
@@ -121,7 +121,7 @@ class ClassifyTask:
         """Classify all inputs in tiles; `finished` is called with every output that was written."""
         from .inputs import one_format
         from .plan import plan_of_files
-        from .run import run_plan
+        from .tiled_run import run_plan
 
         if odd := [name for name in self.files if not is_las(name) and not is_ept(name)]:
             raise OptionError(

@@ -23,10 +23,10 @@ from ..pipeline.inputs_outputs import ept_address, is_ept, is_las, locations
 from ..pipeline.las_output import replaced
 from ..pipeline.references import Reference, check_one_reference, reference_of
 from ..pipeline.stagefiles import LAS_READERS, named_files
-from .grid import Box, TileGrid, check_number, touching, union
+from .checkpoint import fingerprint
+from .options import Density, Extent, TilingOptions, block_bytes, settled
 from .plan import TilePlan, outputs_for
-from .settings import Density, Extent, TilingOptions, block_bytes, settled
-from .store import fingerprint
+from .tile_grid import Box, TileGrid, check_number, touching, union
 
 #: Options of readers.tindex that select files or points, or change them.
 _NAME_IT = "--readers.las.default_srs=EPSG:CODE names it in both"

@@ -18,7 +18,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.stagefiles import writes_las
 from ..stages.base import Stage
 from ..stages.farreaching import Blocks, FarReaching
-from .grid import Box, TileGrid
+from .tile_grid import Box, TileGrid
 
 #: Dimensions that follow a point through a tile's pipeline.
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
@@ -36,7 +36,7 @@ _GLOBAL = (
 
 @dataclass(frozen=True)
 class FirstRound:
-    """The first round, before the tiles, for a far-reaching stage: see :mod:`.ground`."""
+    """The first round, before the tiles, for a far-reaching stage: see :mod:`.first_round`."""
 
     at: int  #: index of the stage in the head
     halo_m: float  #: halo of the stages before it

@@ -34,10 +34,11 @@ from pdal_stages.classifier.model import assemble
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.read import apply_overrides, decode, parse_overrides, parse_pipeline
-from pdal_stages.tiling import inputs, outputs
-from pdal_stages.tiling.grid import TileGrid
-from pdal_stages.tiling.pieces import Piece, sort_points
-from pdal_stages.tiling.store import Store
+from pdal_stages.tiling import inputs
+from pdal_stages.tiling import write_outputs as outputs
+from pdal_stages.tiling.checkpoint import Store
+from pdal_stages.tiling.sorted_points import Piece, sort_points
+from pdal_stages.tiling.tile_grid import TileGrid
 
 TESTS = Path(__file__).resolve().parents[1]
 #: Name -> what is called, and good inputs to start from.

@@ -22,8 +22,8 @@ from ..base.arrays import begins_run
 from ..base.files import whole_files
 from ..pipeline.parts import header_of, las_chunks
 from ..terrain.cells import refuse_scattered
-from .grid import Box, TileGrid, check_number
 from .inputs import CloudIndex, IndexedSource, InputSource, digest_of, fetch_ept
+from .tile_grid import Box, TileGrid, check_number
 
 if (
     TYPE_CHECKING

@@ -13,7 +13,7 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.resources import available_threads, free_memory
 from ..stages.farreaching import Blocks
-from .grid import Box, union
+from .tile_grid import Box, union
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")

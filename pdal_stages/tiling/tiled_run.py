@@ -22,12 +22,10 @@ from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.read import Override, PipelineSource
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
-from .ground import block_name, blocks_around, left_name, make_block
+from .checkpoint import Store, fingerprint
+from .first_round import block_name, blocks_around, left_name, make_block
 from .inputs import CloudIndex, IndexedSource, Survey
-from .outputs import write_file
-from .pieces import TEMPORARY, is_intact, sort_points
-from .plan import RunContext, TilePlan, make_plan, outputs_for
-from .report import (
+from .jobs import (
     InterruptedRun,
     Job,
     TiledRun,
@@ -35,9 +33,11 @@ from .report import (
     messages_on_folders,
     summarize,
 )
-from .settings import TilingOptions, worker_bytes
-from .store import Store, fingerprint
-from .tile import run_first_round, run_tile
+from .options import TilingOptions, worker_bytes
+from .plan import RunContext, TilePlan, make_plan, outputs_for
+from .run_tile import run_first_round, run_tile
+from .sorted_points import TEMPORARY, is_intact, sort_points
+from .write_outputs import write_file
 
 #: A run stops when this many tiles failed for the same reason and none succeeded.
 _HOPELESS = 10
@@ -158,7 +158,7 @@ def run_plan(
 def _workers(options: TilingOptions, folder: str) -> Any:
     """The workers of a run whose working folder is `folder`."""
     if options.scheduler:
-        from .cluster import Cluster
+        from .dask_workers import Cluster
 
         return Cluster(options.scheduler, folder)
     workers, threads = options.local_workers, options.threads

@@ -33,12 +33,12 @@ from ..stages.checked import CheckedChoice, CheckedPoints
 from ..stages.classifiermodel import ClassifierModel
 from ..stages.points import Points
 from ..stages.preparation import preparation_of
+from .checkpoint import load_arrays, save_arrays, written
 from .inputs import find_sources, read_extent
-from .outputs import NewValues, PieceResults, of_own_points, read_with
+from .options import TilingOptions, fits_whole
 from .plan import plan_of_files, readers_of
-from .run import run_plan
-from .settings import TilingOptions, fits_whole
-from .store import load_arrays, save_arrays, written
+from .tiled_run import run_plan
+from .write_outputs import NewValues, PieceResults, of_own_points, read_with
 
 #: Memory of a point in training in one piece, with voxels and neighborhoods of samples.
 TRAIN_POINT = 400

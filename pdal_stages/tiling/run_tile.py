@@ -21,13 +21,20 @@ from ..pipeline.runtime import Callbacks, Function, points_of
 from ..stages.base import stage_types
 from ..stages.farreaching import FarReaching
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
-from .grid import inside
-from .ground import Changed, FromBefore, from_before, stage_of
+from .checkpoint import save_arrays, written
+from .first_round import Changed, FromBefore, from_before, stage_of
 from .inputs import IndexedSource
-from .outputs import NewValues, PieceResults, arrays_of, flags_in_classes, read_with, write_tile
-from .pieces import Piece, cut_all
 from .plan import INPUT, OUTSIDE, ROW, RunContext
-from .store import save_arrays, written
+from .sorted_points import Piece, cut_all
+from .tile_grid import inside
+from .write_outputs import (
+    NewValues,
+    PieceResults,
+    arrays_of,
+    flags_in_classes,
+    read_with,
+    write_tile,
+)
 
 #: How many times a tile is read again with a wider halo.
 _WIDENINGS = 3
@@ -40,7 +47,7 @@ class HeadRun(NamedTuple):
     results: list[PieceResults]
     need: float = 0.0  #: the halo that was needed, meters
     messages: Sequence[str] = ()  #: warnings and notes
-    left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.report`
+    left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.jobs`
 
 
 def run_head(

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from ..base.arrays import places_among
 from ..stages.base import stage_from
 from ..stages.farreaching import FarReaching, inside_block
-from .grid import Box, TileGrid
-from .pieces import Piece
+from .checkpoint import load_arrays, save_arrays, written
 from .plan import RunContext, TilePlan
-from .store import load_arrays, save_arrays, written
+from .sorted_points import Piece
+from .tile_grid import Box, TileGrid
 
 Changed = dict[str, tuple[NDArray[np.int64] | None, NDArray]]
 

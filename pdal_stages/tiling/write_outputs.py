@@ -25,11 +25,11 @@ from ..pipeline.parts import header_of, las_chunks
 from ..pipeline.runtime import Callbacks
 from ..pipeline.stagefiles import LAS_WRITERS
 from ..stages.points import class_counts
+from .checkpoint import load_arrays, written
 from .inputs import InputSource
-from .pieces import BLOCK, Piece, write_records
+from .options import MOST_AT_ONCE
 from .plan import TilePlan
-from .settings import MOST_AT_ONCE
-from .store import load_arrays, written
+from .sorted_points import BLOCK, Piece, write_records
 
 #: PDAL's type names that are not NumPy's plus ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}

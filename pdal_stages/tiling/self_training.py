@@ -22,8 +22,8 @@ from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las
 from ..pipeline.parts import las_chunks
 from .classify import ClassifyTask
-from .settings import TilingOptions
-from .training import TrainTask
+from .options import TilingOptions
+from .train_survey import TrainTask
 
 #: Least reliability of points to train on. With 0.55 the gain is smaller, as errors are learned, too.
 SURE = 0.7
