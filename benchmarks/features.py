@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdal_stages.base.resources import resolve_threads
+from pdal_stages.base.threads import resolve_threads
 from pdal_stages.features import FeatureEngine, FeaturePlan, warmup
 
 RADII = (1.0, 2.0, 3.0, 5.0)

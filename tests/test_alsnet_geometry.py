@@ -17,7 +17,7 @@ from pdal_stages.alsnet.geometry import (
     three_nearest,
 )
 from pdal_stages.base.errors import OptionError
-from pdal_stages.features.cells import density
+from pdal_stages.features.cell_means import density
 
 # ---- references ------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdal_stages.base import checks, resources
+from pdal_stages.base import checks, threads
 from pdal_stages.base.errors import OptionError
 
 
@@ -49,15 +49,15 @@ def test_what_is_taken_and_what_is_not():
 
 
 def test_cores_are_bounded_by_affinity_quota_and_what_a_worker_is_told(tmp_path, monkeypatch):
-    count = resources.available_threads.__wrapped__
-    monkeypatch.setattr(resources.os, "cpu_count", lambda: 16)
-    monkeypatch.setattr(resources.os, "sched_getaffinity", lambda _: range(12), raising=False)
-    monkeypatch.delenv(resources.CORES, raising=False)
-    quota = resources._quota
-    monkeypatch.setattr(resources, "_quota", lambda: quota(str(tmp_path)))
+    count = threads.available_threads.__wrapped__
+    monkeypatch.setattr(threads.os, "cpu_count", lambda: 16)
+    monkeypatch.setattr(threads.os, "sched_getaffinity", lambda _: range(12), raising=False)
+    monkeypatch.delenv(threads.CORES, raising=False)
+    quota = threads._quota
+    monkeypatch.setattr(threads, "_quota", lambda: quota(str(tmp_path)))
     assert count() == 12
     for told, cores in (("3", 3), ("0", 1), ("many", 12), ("40", 12)):
-        monkeypatch.setenv(resources.CORES, told)
+        monkeypatch.setenv(threads.CORES, told)
         assert count() == cores
     (tmp_path / "cpu").mkdir()
     (tmp_path / "cpu/cpu.cfs_quota_us").write_text("-1\n")

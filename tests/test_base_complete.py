@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.lascheck import check_complete
+from pdal_stages.base.las_check import check_complete
 
 COUNT = 300
 FAUX = {
@@ -56,6 +56,6 @@ def test_other_formats_are_held_against_disk_and_limits(tmp_path, monkeypatch):
     check_complete(path, path, writer)
     for name, value in (("_largest_file", lambda: 100), ("disk_is_full", lambda path: True)):
         with monkeypatch.context() as patch:
-            patch.setattr(f"pdal_stages.base.lascheck.{name}", value)
+            patch.setattr(f"pdal_stages.base.las_check.{name}", value)
             with pytest.raises(StageError, match="Make room"):
                 check_complete(path, path, writer)

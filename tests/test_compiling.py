@@ -11,7 +11,7 @@ import pytest
 
 #: A job of two kernels, of which one calls the other.
 TWO_KERNELS = (
-    "from pdal_stages.base.messages import Progress; Progress.delay = 0.0; "
+    "from pdal_stages.base.progress import Progress; Progress.delay = 0.0; "
     "import numpy as np; from pdal_stages.synthetic.townplan import Plan, ground, heights; plan = Plan(1, "
     "np.ones((2, 4)), 0, np.eye(2)); assert ground(3.0, 40.0, plan)[0] == heights(np.array([[3.0, 40.0]]), plan)"
 )

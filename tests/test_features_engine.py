@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from processes import printed, python
 
 from pdal_stages.base.errors import DimensionError, OptionError, StageError
-from pdal_stages.base.messages import Progress
+from pdal_stages.base.progress import Progress
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins, compute_features
 from pdal_stages.features.registry import GROUPS
 

@@ -6,7 +6,7 @@ import pytest
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.features import FeatureEngine, FeaturePlan
 from pdal_stages.features.engine import fit_clouds
-from pdal_stages.features.shapes import SAMPLES, smallest_hashes
+from pdal_stages.features.shape_distributions import SAMPLES, smallest_hashes
 
 PLAN = FeaturePlan.parse("c1,s2,k5,kopt(5,20),copt", ("all",))
 

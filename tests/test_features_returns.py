@@ -7,7 +7,7 @@ import pytest
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.algorithms import gather, optional, required, with_returns
-from pdal_stages.features import FeaturePlan, returns
+from pdal_stages.features import FeaturePlan, return_features
 
 
 def cloud(n=400, seed=0, spread=12.0):
@@ -25,57 +25,69 @@ def slow(name, xyz, dimensions):
         dimensions["NumberOfReturns"].astype(int),
     )
     flag = total > 1 if name.startswith("MultipleReturn") else (number > 0) & (number < total)
-    one = returns.parse(name)
+    one = return_features.parse(name)
     if not one.axes:
         return flag.astype(float)
     cell = np.floor(xyz[:, : one.axes] / one.side).astype(int)
     return np.array([flag[(abs(cell - mine) <= 1).all(axis=1)].mean() for mine in cell])
 
 
-@pytest.mark.parametrize("name", [*returns.NAMES, "EarlierReturn_box0_5", "MultipleReturn_column8"])
+@pytest.mark.parametrize(
+    "name", [*return_features.NAMES, "EarlierReturn_box0_5", "MultipleReturn_column8"]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_they_are_the_slow_reference_s(name, seed):
     xyz, dimensions = cloud(seed=seed)
-    got = returns.return_features([name], xyz, dimensions)[name]
-    assert got.dtype == (np.float32 if returns.parse(name).axes else np.uint8)
+    got = return_features.return_features([name], xyz, dimensions)[name]
+    assert got.dtype == (np.float32 if return_features.parse(name).axes else np.uint8)
     assert got == pytest.approx(slow(name, xyz, dimensions), abs=1e-6)
 
 
 def test_any_order_of_points_and_a_tile_with_its_halo_give_the_same_bits():
     xyz, dimensions = cloud(3000, seed=5, spread=60.0)
-    whole = returns.return_features(returns.NAMES, xyz, dimensions)
+    whole = return_features.return_features(return_features.NAMES, xyz, dimensions)
     order = np.random.default_rng(1).permutation(len(xyz))
-    moved = returns.return_features(
-        returns.NAMES, xyz[order], {name: values[order] for name, values in dimensions.items()}
+    moved = return_features.return_features(
+        return_features.NAMES,
+        xyz[order],
+        {name: values[order] for name, values in dimensions.items()},
     )
     low, high = xyz[:, :2].min(axis=0) + 20, xyz[:, :2].min(axis=0) + 40
-    halo = FeaturePlan.parse("s1", "Linearity", returns.NAMES).halo_m
+    halo = FeaturePlan.parse("s1", "Linearity", return_features.NAMES).halo_m
     near = ((xyz[:, :2] >= low - halo) & (xyz[:, :2] < high + halo)).all(axis=1)
-    tile = returns.return_features(
-        returns.NAMES, xyz[near], {k: v[near] for k, v in dimensions.items()}
+    tile = return_features.return_features(
+        return_features.NAMES, xyz[near], {k: v[near] for k, v in dimensions.items()}
     )
     inside = ((xyz[near, :2] >= low) & (xyz[near, :2] < high)).all(axis=1)
-    for name in returns.NAMES:
+    for name in return_features.NAMES:
         assert np.array_equal(moved[name], whole[name][order])
         assert inside.any() and np.array_equal(tile[name][inside], whole[name][near][inside])
 
 
 def test_without_return_numbers_all_is_zero():
     xyz, _ = cloud(50)
-    assert required(returns.NAMES) == () and optional(returns.NAMES) == returns.SOURCES
-    for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in returns.SOURCES}):
+    assert (
+        required(return_features.NAMES) == ()
+        and optional(return_features.NAMES) == return_features.SOURCES
+    )
+    for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in return_features.SOURCES}):
         fed = gather(
-            returns.NAMES, with_returns(returns.NAMES, xyz, dimensions), 50, np.arange(0, 50, 7)
+            return_features.NAMES,
+            with_returns(return_features.NAMES, xyz, dimensions),
+            50,
+            np.arange(0, 50, 7),
         )
-        assert all(len(fed[name]) == 8 and not fed[name].any() for name in returns.NAMES)
-    assert not len(returns.return_features(returns.NAMES, xyz[:0], {})["MultipleReturn_box2"])
+        assert all(len(fed[name]) == 8 and not fed[name].any() for name in return_features.NAMES)
+    assert not len(
+        return_features.return_features(return_features.NAMES, xyz[:0], {})["MultipleReturn_box2"]
+    )
 
 
 def test_names():
-    assert returns.parse("Linearity_c1") is None
+    assert return_features.parse("Linearity_c1") is None
     assert FeaturePlan.parse("s1", "Linearity", "returns,Intensity").dimensions == (
-        *returns.NAMES,
+        *return_features.NAMES,
         "Intensity",
     )
     with pytest.raises(OptionError, match="power of two"):
-        returns.parse("MultipleReturn_box3")
+        return_features.parse("MultipleReturn_box3")

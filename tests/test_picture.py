@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from pdal_stages.base.asprs import class_color
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.las import class_color
 from pdal_stages.reports import views
 from pdal_stages.reports.views import (
     BACKGROUND,

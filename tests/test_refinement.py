@@ -23,7 +23,7 @@ from pdal_stages.classifier.context import count_shares
 from pdal_stages.classifier.featureforest import EVEN, Blend, trust, weighed
 from pdal_stages.classifier.passes import predict
 from pdal_stages.features import FeatureEngine
-from pdal_stages.features.cells import WHOLE
+from pdal_stages.features.cell_means import WHOLE
 
 BEFORE = (2, 5, 6)
 

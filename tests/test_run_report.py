@@ -1,6 +1,6 @@
 """One type for what stages, predictions and engines report: filled and merged by name."""
 
-from pdal_stages.base.messages import Report
+from pdal_stages.base.report import Report
 
 
 def test_merging_keeps_its_own_figures_and_joins_the_rest():

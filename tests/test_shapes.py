@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features import compute_features
-from pdal_stages.features.bins import METRICS, ShapeBins
 from pdal_stages.features.engine import FeatureEngine
 from pdal_stages.features.plan import FeaturePlan
-from pdal_stages.features.shapes import (
+from pdal_stages.features.shape_bins import METRICS, ShapeBins
+from pdal_stages.features.shape_distributions import (
     PULLS,
     ROOM,
     draw,

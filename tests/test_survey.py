@@ -13,7 +13,7 @@ import tiling_clouds as clouds
 
 from pdal_stages import TilingOptions
 from pdal_stages.base.errors import OptionError
-from pdal_stages.base.resources import free_memory, parse_size
+from pdal_stages.base.memory import free_memory, parse_size
 from pdal_stages.cli import main
 from pdal_stages.stages.farreaching import Blocks
 from pdal_stages.synthetic.town import WKT

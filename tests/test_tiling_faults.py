@@ -25,7 +25,7 @@ import tiling_clouds as clouds
 
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.resources import available_threads
+from pdal_stages.base.threads import available_threads
 from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform
 from pdal_stages.tiling import dask_workers as dask_cluster

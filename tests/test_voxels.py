@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.features import compute_features
-from pdal_stages.features.cells import represent
+from pdal_stages.features.voxels import represent
 
 
 def crowd(seed=0, n=6000, side=12.0, dense=4.0):

@@ -19,7 +19,7 @@ from kit import Cache, Results, draw, figures, finish, limits, note, parser, pre
 from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.base.las import class_name
+from pdal_stages.base.asprs import class_name
 from pdal_stages.features.registry import GROUPS
 
 NEIGHBORHOODS = {

@@ -22,7 +22,7 @@ from kit import Cache, Results, draw, figures, finish, grow_forest, limits, note
 from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.base.las import class_name
+from pdal_stages.base.asprs import class_name
 from pdal_stages.features.registry import GROUPS
 
 EXPERIMENT = 3  # raised when runs mean something else than before, so that none is resumed

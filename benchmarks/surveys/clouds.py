@@ -10,7 +10,7 @@ import laspy
 import numpy as np
 from surveys import GROUND, SURVEYS, TESTS, VEGETATION, LabeledSurvey
 
-from pdal_stages.base.arrays import hash_of
+from pdal_stages.base.hashing import hash_of
 from pdal_stages.stages.preparation import PREPARATION
 from pdal_stages.terrain import filtered_ground
 

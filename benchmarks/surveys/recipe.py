@@ -11,8 +11,8 @@ from clouds import Cloud, load, one_return, thinned, without_returns
 from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
-from pdal_stages.base.arrays import hash_of
-from pdal_stages.features.cells import represent
+from pdal_stages.base.hashing import hash_of
+from pdal_stages.features.voxels import represent
 from pdal_stages.stages.preparation import PREPARATION
 
 #: Points per square meter of thinned copies.

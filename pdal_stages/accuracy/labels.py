@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
+from ..base.asprs import NAMES, class_name
 from ..base.errors import StageError
-from ..base.las import NAMES, class_name
 
 #: The largest label; LAS itself stops at 255, other dimensions that hold classes do not.
 MAX_LABEL = 65535

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.asprs import UNINFORMATIVE, class_name
 from ..base.errors import StageError
-from ..base.las import UNINFORMATIVE, class_name
 from .confidence import Grading
 from .labels import (
     CHUNK,

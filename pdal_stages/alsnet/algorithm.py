@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import ModelError, StageError
-from ..base.resources import map_blocks, resolve_threads
+from ..base.threads import map_blocks, resolve_threads
 from ..classifier.algorithms import (
     ArrayRule,
     Column,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from ..base.arrays import hash_of
+from ..base.hashing import hash_of
 from ..base.jit import njit
 from .configuration import Configuration
 

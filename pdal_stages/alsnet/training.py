@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import hash_of
 from ..base.errors import ModelError, OptionError
 from ..base.files import CHECKPOINT, Output, write_whole
-from ..base.messages import Progress
-from ..base.resources import map_blocks, resolve_threads
+from ..base.hashing import hash_of
+from ..base.progress import Progress
+from ..base.threads import map_blocks, resolve_threads
 from ..classifier.algorithms import gather, with_returns
 from ..classifier.classes import ClassMap
 from ..classifier.clouds import TrainingCloud, label_classes
 from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.trainoptions import TrainingOptions
-from ..features.cells import density
+from ..features.cell_means import density
 from . import batches
 from .algorithm import AlsNet, make_pyramid, scaled
 from .circles import Circles, spacing_for

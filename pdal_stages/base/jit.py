@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 from .errors import DependencyError
 from .files import exposed_folder
-from .messages import Progress, print_messages
+from .messages import print_messages
+from .progress import Progress
 
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})

@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, ModelError
-from ..base.messages import Report
+from ..base.report import Report
 from ..base.settings import Settings, setting
-from ..features import returns
-from ..features.index import CellGrid
+from ..features import return_features
+from ..features.point_grid import CellGrid
 
 #: What every point has: the feature engine takes these from the coordinates.
 COORDINATES = ("X", "Y", "Z")
@@ -38,7 +38,7 @@ _MAKERS = {
         "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological before this stage, or "
         "what the model was trained with"
     ),
-    **dict.fromkeys(("Intensity", *returns.SOURCES), _READ),
+    **dict.fromkeys(("Intensity", *return_features.SOURCES), _READ),
 }
 #: Each kind by its word in manifests and options: its class, and what trains it, imported when asked for.
 ALGORITHMS = {
@@ -163,14 +163,20 @@ def required(names: Iterable[str]) -> tuple[str, ...]:
     """Dimensions the cloud must have for these dimension features."""
     return tuple(
         dict.fromkeys(
-            name for name in names if name not in COORDINATES and returns.parse(name) is None
+            name
+            for name in names
+            if name not in COORDINATES and return_features.parse(name) is None
         )
     )
 
 
 def optional(names: Iterable[str]) -> tuple[str, ...]:
     """Dimensions that these features can do without but use where the cloud has them."""
-    return returns.SOURCES if any(returns.parse(name) is not None for name in names) else ()
+    return (
+        return_features.SOURCES
+        if any(return_features.parse(name) is not None for name in names)
+        else ()
+    )
 
 
 def known(
@@ -194,7 +200,7 @@ def with_returns(
     threads: int | None = None,
 ) -> Mapping[str, npt.ArrayLike]:
     """The dimensions and those of `names` that are made of return numbers and the points around."""
-    made = returns.return_features(names, xyz, dimensions, threads)
+    made = return_features.return_features(names, xyz, dimensions, threads)
     return {**dimensions, **made} if made else dimensions
 
 

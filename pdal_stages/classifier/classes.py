@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..accuracy.labels import MAX_LABEL, code_of
+from ..base.asprs import NAMES, UNINFORMATIVE, class_name
 from ..base.errors import OptionError, suggest
-from ..base.las import NAMES, UNINFORMATIVE, class_name
 
 #: The largest code a point can carry.
 MAX_CODE = 255

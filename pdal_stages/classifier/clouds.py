@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ..accuracy.labels import as_codes
-from ..base.arrays import hash_of
+from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
-from ..base.las import UNINFORMATIVE
-from ..base.messages import Progress
+from ..base.hashing import hash_of
+from ..base.progress import Progress
 from ..base.version import __version__
-from ..features.cells import density, represent
-from ..features.index import check_xyz
+from ..features.cell_means import density
+from ..features.point_grid import check_xyz
+from ..features.voxels import represent
 from .algorithms import known
 from .classes import MAX_LABEL, ClassMap
 from .trainoptions import TrainingOptions

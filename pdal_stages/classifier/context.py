@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import places_among
 from ..base.errors import OptionError
-from ..base.resources import map_blocks
-from ..features.cells import WHOLE, cell_means
-from ..features.index import cell_keys
+from ..base.grid import places_among
+from ..base.threads import map_blocks
+from ..features.cell_means import WHOLE, cell_means
 from ..features.neighborhoods import SIDES
+from ..features.point_grid import cell_keys
 
 #: Word of a token, which the side of a cell in meters follows: axes of the cells (3 x 3 x 3 around the point's, or 3 x 3
 #: columns of any height), and whether it reads the share of votes for each class in place of mean probabilities.

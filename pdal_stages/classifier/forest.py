@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.jit import njit
-from ..base.messages import Progress
-from ..base.resources import map_blocks
+from ..base.progress import Progress
+from ..base.threads import map_blocks
 from .algorithms import ArrayRule
 
 #: Levels below the root a tree may have.

@@ -13,12 +13,12 @@ import numpy.typing as npt
 
 from ..base.errors import DimensionError, OptionError
 from ..base.files import Output
-from ..base.messages import Progress
-from ..base.resources import free_memory
+from ..base.memory import free_memory
+from ..base.progress import Progress
 from ..features import FeaturePlan
 from ..features.engine import fit_clouds
 from ..features.registry import SHAPE_FEATURES
-from ..features.returns import SOURCES
+from ..features.return_features import SOURCES
 from .algorithms import OPTIONAL_DIMENSIONS, PredictRequest, gather, required
 from .clouds import TrainingCloud, label_classes
 from .context import OWN, Context

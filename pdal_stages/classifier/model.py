@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.asprs import GROUND
 from ..base.errors import DimensionError, ModelError, OptionError, suggest
-from ..base.las import GROUND
-from ..base.messages import Report
+from ..base.report import Report
 from ..features import FeaturePlan
-from ..features.cells import check_side, density, represent
-from ..features.index import build_grid, check_xyz
+from ..features.cell_means import density
+from ..features.point_grid import build_grid, check_xyz
 from ..features.registry import ALGORITHM_VERSION
+from ..features.voxels import check_side, represent
 from . import modelfile, summary
 from .algorithms import (
     InputPlan,

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import begins_run
-from ..base.resources import map_blocks
+from ..base.grid import begins_run
+from ..base.threads import map_blocks
 from ..features import FeaturePlan
-from ..features.index import cell_numbers
+from ..features.point_grid import cell_numbers
 from .algorithms import InputPlan, PredictRequest
 from .context import Context, around, count_shares
 from .featureforest import CloudFeatures, FeatureForest, weighed

@@ -21,9 +21,10 @@ import numpy.typing as npt
 
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import summary
-from ..base.arrays import hash_of, places_among
 from ..base.errors import OptionError
-from ..base.messages import Progress
+from ..base.grid import places_among
+from ..base.hashing import hash_of
+from ..base.progress import Progress
 
 #: Side of a cell of the curve in meters.
 CELL = 0.5

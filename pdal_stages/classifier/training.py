@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from ..features.index import check_xyz
+from ..features.point_grid import check_xyz
 from .algorithms import (
     DEFAULT_DIMENSIONS,
     OPTIONAL_DIMENSIONS,

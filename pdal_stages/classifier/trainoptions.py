@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..base import checks
+from ..base.asprs import NOISE
 from ..base.errors import OptionError
-from ..base.las import NOISE
-from ..base.resources import resolve_threads
 from ..base.settings import Settings, setting
+from ..base.threads import resolve_threads
 from ..features import FeaturePlan
-from ..features.cells import LARGEST, check_side
+from ..features.voxels import LARGEST, check_side
 from .algorithms import ALGORITHMS, trainer
 from .classes import MAX_LABEL
 from .context import OWN, Context

@@ -16,7 +16,8 @@ from typing import Any, NoReturn
 
 from ..base.errors import StageError, suggest
 from ..base.files import Output, check_outputs
-from ..base.messages import LoggedStream, PlainStream, RunLog, print_messages
+from ..base.messages import PlainStream, print_messages
+from ..base.run_log import LoggedStream, RunLog
 from ..base.version import __version__
 from .watcher import watched
 

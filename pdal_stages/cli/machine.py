@@ -148,7 +148,7 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     ``help``, ``default``, ``choices``, ``required``, ``many`` (takes several, or may be repeated) and ``value`` (what usage
     calls its value).
     """
-    from ..base.las import NAMES, class_color
+    from ..base.asprs import NAMES, class_color
     from ..base.version import __version__
     from ..classifier.modelfile import shipped
     from ..stages.base import stage_types

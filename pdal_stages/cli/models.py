@@ -90,7 +90,7 @@ def add_commands(parser: Parser) -> None:
 
 
 def _models(options: argparse.Namespace) -> None:
-    from ..base.las import class_name
+    from ..base.asprs import class_name
     from ..classifier.model import load_model
     from ..classifier.modelfile import shipped
 

@@ -15,11 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
 from ..base.files import HTML, JSON, Output, write_json, write_whole
-from ..base.las import class_name
+from ..base.memory import parse_size
 from ..base.messages import counted, one_line, print_messages
-from ..base.resources import parse_size
 from ..pipeline.run import LEFT_ALONE
 from ..tiling.jobs import InterruptedRun, TiledRun
 from ..tiling.options import PER, TilingOptions

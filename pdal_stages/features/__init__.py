@@ -3,10 +3,10 @@
 Importing this package is light; numba and the kernels are loaded when an engine is made.
 """
 
-from .bins import ShapeBins
 from .engine import FeatureEngine, compute_features, warmup
+from .feature_table import FeatureTable
 from .plan import FeaturePlan
-from .table import FeatureTable
+from .shape_bins import ShapeBins
 
 __all__ = [
     "FeatureEngine",

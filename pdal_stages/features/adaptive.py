@@ -21,21 +21,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..base.jit import device, njit
-from ..base.resources import map_blocks
-from .bins import ShapeBins
-from .entropy import (
-    add_up,
-    eigenvalues_of,
-    lowest_dimensionality,
-    lowest_entropy,
-    write_moments,
-)
-from .index import CellGrid, build_tree
+from ..base.threads import map_blocks
+from .kdtree import build_tree
 from .moments import COINCIDENT, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
-from .neighborhoods import AROUND, COPT_REACH
-from .plan import Columns, FeaturePlan, columns_of
-from .registry import MOMENT_FEATURES, SURFACE_FEATURES
-from .search import (
+from .nearest_neighbors import (
     CROWD,
     FIRST2,
     LEAST2,
@@ -46,8 +35,20 @@ from .search import (
     make_near,
     sort_near,
 )
-from .shapes import Axes, shapes_of, write_shapes
-from .surfaces import COLUMNS, FAR, SURFACE, UP, agreement
+from .neighbor_surfaces import COLUMNS, FAR, SURFACE, UP, agreement
+from .neighborhoods import AROUND, COPT_REACH
+from .plan import Columns, FeaturePlan, columns_of
+from .point_grid import CellGrid
+from .registry import MOMENT_FEATURES, SURFACE_FEATURES
+from .scale_selection import (
+    add_up,
+    eigenvalues_of,
+    lowest_dimensionality,
+    lowest_entropy,
+    write_moments,
+)
+from .shape_bins import ShapeBins
+from .shape_distributions import Axes, shapes_of, write_shapes
 
 #: Members of a candidate among numbers of neighbors.
 LEAST = 3

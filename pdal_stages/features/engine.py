@@ -12,17 +12,18 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.messages import Progress, Report
-from ..base.resources import map_blocks, resolve_threads
-from .bins import ShapeBins
-from .index import CellGrid, build_grid, check_xyz
+from ..base.progress import Progress
+from ..base.report import Report
+from ..base.threads import map_blocks, resolve_threads
+from .feature_table import FeatureTable
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
-from .shapes import SAMPLES, smallest_hashes
-from .table import FeatureTable
+from .point_grid import CellGrid, build_grid, check_xyz
+from .shape_bins import ShapeBins
+from .shape_distributions import SAMPLES, smallest_hashes
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
-    from .fixed import FixedRadius
+    from .fixed_radius import FixedRadius
 
 
 #: Rows of a block, whatever the memory allows: Ctrl-C waits for the blocks in work.
@@ -164,7 +165,7 @@ class FeatureEngine:
         """The plan's neighborhoods, made for the cloud once."""
         with self._lock:
             if self._parts is None:
-                from .fixed import FixedRadius
+                from .fixed_radius import FixedRadius
 
                 adaptive = None
                 if any(

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..base import checks
 from ..base.errors import OptionError, suggest
-from . import returns
+from . import return_features
 from .neighborhoods import (
     AROUND,
     BY_RADIUS,
@@ -152,7 +152,13 @@ class FeaturePlan:
         names = dict.fromkeys(own)
         for name in (name.strip() for name in given):
             names.update(
-                dict.fromkeys(returns.NAMES if name == returns.GROUP else [name] if name else [])
+                dict.fromkeys(
+                    return_features.NAMES
+                    if name == return_features.GROUP
+                    else [name]
+                    if name
+                    else []
+                )
             )
         return cls(parsed, _expand(parsed, words), tuple(names))
 
@@ -212,7 +218,7 @@ class FeaturePlan:
         counted in ``FeatureEngine.report.beyond_halo``.
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
-        reach = max(reach, returns.reach(self.dimensions))
+        reach = max(reach, return_features.reach(self.dimensions))
         if any(n.reach is None for n in self.neighborhoods):
             reach = max(reach, POINTS_HALO)
         for k in self._surfaced:

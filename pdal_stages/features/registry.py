@@ -79,7 +79,8 @@ def _names(*groups: str) -> tuple[str, ...]:
     return tuple(feature.name for feature in FEATURES if feature.group in groups)
 
 
-#: Features that ``moments.finish``, the shape kernels and ``surfaces.agreement`` compute, in the order of their rows.
+#: Features that ``moments.finish``, the shape kernels and ``neighbor_surfaces.agreement``
+#: compute, in the order of their rows.
 MOMENT_FEATURES = _names(*_OF_MOMENTS)
 SHAPE_FEATURES = _names("shapes")
 SURFACE_FEATURES = _names("surfaces")

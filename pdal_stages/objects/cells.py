@@ -13,8 +13,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import NOISE
 from ..base.errors import StageError
-from ..base.las import NOISE
 
 
 class Kind(IntEnum):

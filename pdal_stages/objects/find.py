@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..base.messages import Progress
+from ..base.progress import Progress
 from . import crowns, measure, roofs
 from .cells import Cells, Kind, cell_keys, object_id, unpack
 from .found import Objects, ObjectSettings, Table

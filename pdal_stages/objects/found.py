@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import places_among
+from ..base.grid import places_among
 from ..base.settings import Settings, setting
 from .cells import Kind, point_keys
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, StageError, suggest
 from ..base.files import check_outputs
-from ..base.messages import Progress, Report
+from ..base.progress import Progress
+from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.base import stage_from
 from ..stages.points import Points

@@ -7,9 +7,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from ..base.asprs import GROUND, OVERLAP
 from ..base.errors import ModelError, OptionError, suggest
-from ..base.extrabytes import extra_dimensions
-from ..base.las import GROUND, OVERLAP
+from ..base.extra_bytes import extra_dimensions
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD
 from ..stages import preparation

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import checks
-from ..base.arrays import places_among
+from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
-from ..base.las import LEGACY_LIMIT, named_copc
+from ..base.grid import places_among
+from ..base.las import named_copc
 from ..classifier.algorithms import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of

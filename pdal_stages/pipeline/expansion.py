@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..base.errors import DimensionError, PipelineError, StageError
-from ..base.extrabytes import extra_dimensions
+from ..base.extra_bytes import extra_dimensions
 from ..base.las import read_header
 from ..stages import preparation
 from ..stages.base import PDAL_OWN, Stage, stage_from, stage_type, stage_types

@@ -11,17 +11,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..base.corrected import restore_texts
+from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
-from ..base.extrabytes import MOST_ENTRIES, extra_dimensions, restore_titles
-from ..base.las import (
-    LEGACY_LIMIT,
-    LasHeader,
-    header_there,
-    named_copc,
-    named_las,
-    supersede_copc,
-)
+from ..base.extra_bytes import MOST_ENTRIES, extra_dimensions, restore_titles
+from ..base.las import LasHeader, header_there, named_copc, named_las, supersede_copc
+from ..base.las_repair import restore_texts
 from ..stages.base import stage_types
 from . import pdal as pdal_env
 from .runtime import ExpandedStage, python_filter

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.corrected import corrected
 from ..base.errors import StageError
 from ..base.las import POINTWISE, laszip_record, named_las, read_header
+from ..base.las_repair import corrected
 from . import pdal as pdal_env
 from .inputs_outputs import reader_of
 

@@ -20,11 +20,11 @@ from functools import cache
 from types import CodeType, FrameType
 from typing import Any, BinaryIO, TypeVar
 
-from ..base.corrected import LARGEST_HEAD, corrected
 from ..base.errors import DependencyError, PipelineError
-from ..base.extrabytes import overwritten
+from ..base.extra_bytes import overwritten
 from ..base.las import geotiff_code, read_header, source_id
-from ..base.lascheck import DAMAGED, check_readable
+from ..base.las_check import DAMAGED, check_readable
+from ..base.las_repair import LARGEST_HEAD, corrected
 from .stagefiles import reader_files, readers_files, writers_outputs
 
 INSTALL = (
@@ -127,7 +127,7 @@ def execute(
 def readable(stages: list[dict[str, Any]], points: bool = True) -> Iterator[list[dict[str, Any]]]:
     """Give the stages with readers of copies in place of LAS files that PDAL cannot read as they are.
 
-    See :mod:`..base.corrected`. The copies lie beside what is written, and are removed on leaving. Without `points`
+    See :mod:`..base.las_repair`. The copies lie beside what is written, and are removed on leaving. Without `points`
     they hold what stands before the points.
     """
     beside = [os.path.dirname(output.path) for output in writers_outputs(stages)][:1]

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from ..accuracy.expected import Patches, ReviewCells, find_patches, side_for
 from ..base import checks
+from ..base.asprs import NOISE
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, whole_files
-from ..base.las import NOISE, read_header
+from ..base.las import read_header
 from ..base.messages import counted, duration, one_line, print_messages
 from ..base.version import __version__
 from ..classifier.model import loaded_model

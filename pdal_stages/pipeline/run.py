@@ -15,8 +15,8 @@ from typing import Any
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
 from ..base.las import refuse_pipe
-from ..base.lascheck import check_complete, check_readable
-from ..base.messages import Report
+from ..base.las_check import check_complete, check_readable
+from ..base.report import Report
 from ..stages.base import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env

@@ -23,7 +23,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
-from ..base.messages import Report
+from ..base.report import Report
 from ..stages.base import Stage, place, stage_from
 from ..stages.points import Points
 from ..stages.preparation import NEEDS_GROUND

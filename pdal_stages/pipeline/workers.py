@@ -21,8 +21,10 @@ from typing import Any
 from ..base import checks
 from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
-from ..base.messages import LoggedStream, PlainStream, Progress
-from ..base.resources import CORES, available_threads
+from ..base.messages import PlainStream
+from ..base.progress import Progress
+from ..base.run_log import LoggedStream
+from ..base.threads import CORES, available_threads
 from .pdal import check_interrupt, gentle
 
 #: The reason where a worker died.

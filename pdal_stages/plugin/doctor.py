@@ -13,7 +13,8 @@ from pathlib import Path
 
 from ..base.errors import PipelineError, StageError, how_to_add
 from ..base.jit import kept_kernels
-from ..base.resources import available_threads, free_memory
+from ..base.memory import free_memory
+from ..base.threads import available_threads
 from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.modelfile import STANDARD

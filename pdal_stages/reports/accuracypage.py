@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from ..accuracy.labels import as_codes, same_length
 from ..accuracy.measures import Accuracy
+from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
-from ..base.las import class_color
 from .page import render
 from .views import IGNORED, RIGHT, WRONG, embedded, nice_step, paint, shading, surface, verdict
 

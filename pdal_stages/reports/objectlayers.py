@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import class_color
 from ..base.errors import DependencyError, StageError
 from ..base.files import check_writable, whole_files
-from ..base.las import class_color
 from ..base.units import Units, horizontal_part
 from ..objects.cells import CLASSES, Cells, Kind, refuse_unclassified
 from ..objects.find import find_objects

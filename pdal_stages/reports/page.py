@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..accuracy.text import percent
-from ..base.las import class_color
+from ..base.asprs import class_color
 from ..base.messages import duration, plain
 from ..base.version import __version__
 

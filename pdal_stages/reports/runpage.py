@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..base.las import class_name
+from ..base.asprs import class_name
 from ..base.messages import counted, duration
 from .page import render
 

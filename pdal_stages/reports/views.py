@@ -18,9 +18,9 @@ import numpy.typing as npt
 from PIL import Image
 from scipy import ndimage
 
+from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
-from ..base.las import class_color
 
 RIGHT, WRONG, IGNORED = (196, 196, 192), (204, 24, 32), (232, 232, 228)
 #: The color of each class code, (256, 3) uint8.

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
+from ..base.asprs import HIGH, LOW, MEDIUM, UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, whole_files
-from ..base.las import HIGH, LOW, MEDIUM, UNINFORMATIVE
-from ..base.messages import Report, plain
+from ..base.messages import plain
+from ..base.report import Report
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
 from .base import Stage, files_read

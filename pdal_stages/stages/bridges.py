@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.las import BRIDGE
+from ..base.asprs import BRIDGE
 from ..structures.decks import RULES, find_decks
 from .base import ClassStage
 from .options import code_option, ignore_option, keep_option

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import hash_of
 from ..base.errors import StageError
-from ..base.messages import Report
+from ..base.hashing import hash_of
+from ..base.report import Report
 from ..classifier.algorithms import CHECKED
 from .points import class_counts
 

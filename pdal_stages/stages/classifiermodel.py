@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
-from ..base.messages import Report
+from ..base.report import Report
 from ..classifier import summary
 from ..classifier.algorithms import (
     ALGORITHMS,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.las import NOISE
+from ..base.asprs import NOISE
 from ..terrain.detached import REACH, detached_noise
 from .base import ClassStage
 from .options import code_option, ignore_option, option

@@ -9,8 +9,8 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import GROUND
 from ..base.errors import NoTerrainError
-from ..base.las import GROUND
 from ..terrain.cells import SIDE
 from ..terrain.givenground import reach_of_given
 from ..terrain.groundblocks import (

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import GROUND, LOW, MEDIUM, by_height
+from ..base.asprs import HIGH as HIGH_VEGETATION
 from ..base.errors import OptionError
-from ..base.las import GROUND, LOW, MEDIUM, by_height
-from ..base.las import HIGH as HIGH_VEGETATION
-from ..base.messages import Progress
+from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit
 from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.modelfile import find

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from ..base.checks import strict_json
 from ..base.errors import OptionError
 from ..base.files import JSON, Output, write_whole
-from ..base.messages import Progress
+from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
-from ..features.cells import LARGEST, check_side, represent
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.registry import ALGORITHM_VERSION
+from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage
 from .options import ignore_option, option
 from .points import Points

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import checks
-from ..base.arrays import places_among
 from ..base.errors import StageError
+from ..base.grid import places_among
 from ..objects.cells import CLASSES, ENOUGH, Cells, Kind, kind_of_code, refuse_unclassified
 from ..objects.find import find_objects
 from ..objects.found import Objects, ObjectSettings

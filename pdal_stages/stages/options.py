@@ -11,8 +11,8 @@ from functools import partial
 from typing import Any
 
 from ..base import checks
+from ..base.asprs import OVERLAP
 from ..base.errors import OptionError, suggest
-from ..base.las import OVERLAP
 from .selection import UNWANTED, Selection
 
 _LISTED = ["array", "string"], "a list, or text separated by commas"

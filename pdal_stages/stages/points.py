@@ -11,10 +11,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.las import LEGACY_LIMIT, OVERLAP
-from ..base.messages import Report
-from ..base.resources import give_back
+from ..base.memory import give_back
+from ..base.report import Report
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .selection import Expression, Selection
 

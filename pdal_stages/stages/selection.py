@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import NOISE
 from ..base.errors import DimensionError, OptionError, suggest
-from ..base.las import NOISE
 
 #: Noise, and points that their supplier withheld: neither neighbors nor overwritten, unless told.
 UNWANTED = (*NOISE, "withheld")

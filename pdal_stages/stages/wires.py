@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.las import TOWER, WIRE
+from ..base.asprs import TOWER, WIRE
 from ..structures import towers
 from ..structures.towers import find_towers
 from ..structures.wires import RULES, find_wires

@@ -15,9 +15,9 @@ from ..base import checks
 from ..base.errors import OptionError, StageError, suggest
 from ..base.files import whole_files
 from ..base.las import named_las
-from ..base.messages import Progress
-from ..base.resources import map_blocks
+from ..base.progress import Progress
 from ..base.settings import Settings, setting
+from ..base.threads import map_blocks
 from ..base.version import __version__
 from .districts import fill
 from .solids import VEGETATION, build_scene, cast

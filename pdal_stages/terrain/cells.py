@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.arrays import begins_run, places_among
 from ..base.errors import StageError
+from ..base.grid import begins_run, places_among
 from ..base.jit import device, njit
-from ..base.lascheck import DAMAGED
+from ..base.las_check import DAMAGED
 
 #: What a raster has where nothing was measured.
 HOLE = np.float32(np.inf)

@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.arrays import begins_run
+from ..base.asprs import NOISE
+from ..base.grid import begins_run
 from ..base.jit import device, njit
-from ..base.las import NOISE
 from .belowground import RULES as LOW_RULES
 from .belowground import below_ground
 from .belowground import reach as below_reach

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.resources import map_blocks
+from ..base.threads import map_blocks
 from .cells import HIGHEST, CellWindow, columns, patches, usable
 from .givenground import given_pieces
 from .groundblocks import GroundCells

@@ -13,7 +13,7 @@ from typing import Any
 from ..base import las
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs
-from ..base.lascheck import beyond_box
+from ..base.las_check import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
 from .jobs import Job, TiledRun, messages_on_folders

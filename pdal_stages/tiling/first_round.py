@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import places_among
+from ..base.grid import places_among
 from ..stages.base import stage_from
 from ..stages.farreaching import FarReaching, inside_block
 from .checkpoint import load_arrays, save_arrays, written

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import las, lascheck
+from ..base import las, las_check
 from ..base.errors import OptionError, PipelineError, StageError
-from ..base.octree import check_ept, read_ept
+from ..base.octree_check import check_ept, read_ept
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import ept_address, is_ept, is_las, locations
@@ -241,7 +241,7 @@ class Survey:
                         cure="Rename the file",
                     )
                 if source.kind == "las":
-                    odd += filter(None, [lascheck.check_readable(source.path)])
+                    odd += filter(None, [las_check.check_readable(source.path)])
             except StageError as error:
                 self.unreadable[source.path] = str(error)
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""

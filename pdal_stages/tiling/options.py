@@ -11,7 +11,8 @@ import numpy as np
 
 from ..base import checks
 from ..base.errors import OptionError
-from ..base.resources import available_threads, free_memory
+from ..base.memory import free_memory
+from ..base.threads import available_threads
 from ..stages.farreaching import Blocks
 from .tile_grid import Box, union
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
-from ..base.las import LEGACY_LIMIT
 from ..pipeline.las_output import REPLACED, check_writers
 from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import begins_run
 from ..base.files import whole_files
+from ..base.grid import begins_run
 from ..pipeline.parts import header_of, las_chunks
 from ..terrain.cells import refuse_scattered
 from .inputs import CloudIndex, IndexedSource, InputSource, digest_of, fetch_ept

@@ -12,11 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..base import lascheck
+from ..base import las_check
 from ..base.errors import DependencyError, StageError
 from ..base.files import sweep
 from ..base.jit import kept_kernels
-from ..base.messages import Progress, print_messages
+from ..base.messages import print_messages
+from ..base.progress import Progress
 from ..base.version import build
 from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.read import Override, PipelineSource
@@ -272,7 +273,7 @@ class _Run:
                 survey.unreadable[path] = job.reason
                 continue
             index = survey.indexes[path] = CloudIndex.of(job.record, job.mark)
-            if index.count and (odd := lascheck.beyond_box(path, index.box)):
+            if index.count and (odd := las_check.beyond_box(path, index.box)):
                 survey.messages.append(odd)
         survey.place()
 

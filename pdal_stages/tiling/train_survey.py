@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs, work_folder
-from ..base.messages import Report
+from ..base.report import Report
 from ..classifier.clouds import TiledCloud, TrainingCloud
 from ..classifier.model import Model
 from ..classifier.summary import FILE_NUMBER

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import las
+from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import StageError
 from ..base.files import whole_files
-from ..base.las import LEGACY_LIMIT
-from ..base.lascheck import check_complete
+from ..base.las_check import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.parts import header_of, las_chunks

@@ -25,9 +25,9 @@ import laspy
 import numpy as np
 
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.base import las, lascheck
+from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.extrabytes import extra_dimensions
+from pdal_stages.base.extra_bytes import extra_dimensions
 from pdal_stages.classifier import modelfile
 from pdal_stages.classifier.algorithms import algorithm
 from pdal_stages.classifier.model import assemble
@@ -141,7 +141,7 @@ def _clouds() -> list[bytes]:
 def cloud(data: bytes) -> str:
     """A LAS or LAZ file: what passes the look at its header is read, whole or with an error."""
     path = put("cloud.laz", data)
-    lascheck.check_readable(path)
+    las_check.check_readable(path)
     las.projection(path)
     extra_dimensions(path)
     found = inputs.las_extent(str(path))

@@ -1,16 +1,4 @@
-"""Cells of an absolute grid: means over them and those around them, one point for each, how many points they hold.
-
-Means are of probabilities and of return flags: values are counted in 65535ths and added as whole numbers over a point's own
-cell and the cells around it, then divided by the number of points there. So a mean has the same bits for any order of
-points, number of threads, and in any tile that holds those cells; and a point costs as much in a dense cloud as in a sparse
-one.
-
-One point for each voxel bounds the cost of a point, and evens out how clouds are sampled. A sphere of 5 m holds 100,000
-points of a drone's cloud, and 50 nearest neighbors there are a hand's breadth: features take long and mean something else
-than in the clouds a model was trained on. So each voxel is represented by one of its points, and the others take its
-result. Which one it is follows from the points' own coordinates and values: the same in any order and in any tile that
-holds whole voxels.
-"""
+"""One point for each voxel."""
 
 from __future__ import annotations
 
@@ -21,53 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import begins_run, hash_of
 from ..base.errors import OptionError
+from ..base.hashing import hash_of
 from ..base.jit import njit
-from .index import cell_keys
+from .point_grid import cell_keys
 
-#: A share of 1.
-WHOLE = 65535
-#: Smallest and largest side of voxels, and of the cells whose points are counted for the density, in meters.
-SMALLEST, LARGEST, CELL = 1e-4, 5.0, 2.0
-
-
-def cell_means(
-    coordinates: npt.NDArray[np.float64],
-    shares: npt.NDArray[np.uint16],
-    side: float,
-    votes: bool = False,
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """(cell of each point, means (cells, columns) over each cell and those around it).
-
-    Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in meters. `shares` (n, columns)
-    are in 65535ths; with `votes` the largest column of each point counts alone, as a whole.
-    """
-    keys, offsets = cell_keys(coordinates, side)
-    order = np.argsort(keys)
-    keys = keys[order]
-    start = np.append(np.flatnonzero(begins_run(keys)), len(keys))
-    occupied = keys[start[:-1]]
-    cell = np.empty(len(keys), np.int32)
-    del keys
-    sums = np.zeros((len(occupied), shares.shape[1] + 1), np.int64)
-    add_cells(order, start, shares, votes, cell, sums)
-    means = np.empty((len(occupied), shares.shape[1]), np.float32)
-    average_around(occupied, sums, offsets, means)
-    return cell, means
-
-
-def density(xyz: npt.NDArray[np.float64]) -> float:
-    """Points per square meter: the median over the occupied cells of :data:`CELL` meters, 0 for an empty cloud.
-
-    Strays, holes and the cloud's outline do not matter, and the order of the points does not.
-    """
-    if not len(xyz):
-        return 0.0
-    keys, _ = cell_keys(xyz[:, :2], CELL)
-    keys.sort()
-    starts = np.flatnonzero(begins_run(keys))
-    return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
+#: Smallest and largest side of voxels, meters.
+SMALLEST, LARGEST = 1e-4, 5.0
 
 
 def check_side(side: float) -> float:
@@ -155,54 +103,6 @@ def _one_each(
     by = np.arange(len(xyz), dtype=np.int32 if len(xyz) < 2**31 else np.int64)
     single = choose_one_each(order, keys[order], hash_of([*xyz.T, *values], 0), by)
     return None if single else by
-
-
-# ---- kernels --------------------------------------------------------------------------------------------
-
-
-@njit
-def add_cells(order, start, shares, votes, cell, sums):
-    """Fill `cell` with each point's, and `sums` with each cell's shares (or votes) and, last, its points."""
-    classes = shares.shape[1]
-    for k in range(len(start) - 1):
-        for j in range(start[k], start[k + 1]):
-            i = order[j]
-            cell[i] = k
-            if votes:
-                best = 0
-                for c in range(1, classes):
-                    if shares[i, c] > shares[i, best]:
-                        best = c
-                sums[k, best] += WHOLE
-            else:
-                for c in range(classes):
-                    sums[k, c] += np.int64(shares[i, c])
-        sums[k, classes] = start[k + 1] - start[k]
-
-
-@njit
-def average_around(keys, sums, offsets, means):
-    """Fill `means`: over each cell and those around it, sums of shares / (WHOLE x points)."""
-    classes = sums.shape[1] - 1
-    rows = len(offsets)
-    cursor = np.zeros(rows, np.int64)
-    total = np.empty(classes + 1, np.int64)
-    n = len(keys)
-    for k in range(n):
-        total[:] = 0
-        for r in range(rows):
-            middle = keys[k] + offsets[r]
-            at = cursor[r]
-            while at < n and keys[at] < middle - 1:
-                at += 1
-            cursor[r] = at
-            while at < n and keys[at] <= middle + 1:
-                for c in range(classes + 1):
-                    total[c] += sums[at, c]
-                at += 1
-        whole = float(total[classes]) * WHOLE
-        for c in range(classes):
-            means[k, c] = float(total[c]) / whole
 
 
 @njit

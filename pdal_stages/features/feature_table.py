@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..base.errors import suggest
-from ..base.messages import Report
-from .bins import ShapeBins
+from ..base.report import Report
+from .shape_bins import ShapeBins
 
 
 @dataclass

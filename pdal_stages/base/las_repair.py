@@ -13,7 +13,7 @@ from itertools import islice
 from typing import BinaryIO
 
 from .errors import StageError
-from .extrabytes import fields_of
+from .extra_bytes import fields_of
 from .las import (
     POINT_BYTES,
     POINTWISE,
@@ -78,7 +78,7 @@ def corrected(path: str | os.PathLike, extra: bool = True) -> BinaryIO | None:
     Parameters
     ----------
     path : path
-        The file, which :func:`.lascheck.check_readable` found to be whole.
+        The file, which :func:`.las_check.check_readable` found to be whole.
     extra : bool
         Whether extra bytes are corrected: PDAL reads those of LAS 1.0 to 1.3 only where it is asked to.
 

@@ -11,12 +11,12 @@ import math
 import numpy as np
 
 from ..base.jit import device, njit
-from .bins import ShapeBins
-from .index import CellGrid
 from .moments import ROWS, SX, SY, SZ, N, distance2, finish, height_key, sums_within
 from .plan import FeaturePlan, columns_of
+from .point_grid import CellGrid
 from .registry import MOMENT_FEATURES
-from .shapes import Axes, shapes_of, write_shapes
+from .shape_bins import ShapeBins
+from .shape_distributions import Axes, shapes_of, write_shapes
 
 #: Candidates are filled up to a multiple of so many, by points so far away, meters: a vector loop leaves none over.
 LANES, FAR = 8, 1e150

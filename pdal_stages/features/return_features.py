@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from .cells import WHOLE, cell_means
+from .cell_means import WHOLE, cell_means
 from .neighborhoods import SIDES
 
 #: What they are made of.

@@ -47,8 +47,8 @@ class ShapeBins:
 
         A threshold is one of the values, so values that often repeat (areas of 0 on a line) make equal
         thresholds and empty bins, and nothing else does. `values` are the pulls (m, 5, 255) of m sample neighborhoods by
-        neighborhood token, in the comparable form of :func:`shapes.shape_values`. NaN (neighborhoods without points) is
-        left out; where nothing is left, the thresholds are 0.
+        neighborhood token, in the comparable form of :func:`shape_distributions.shape_values`. NaN
+        (neighborhoods without points) is left out; where nothing is left, the thresholds are 0.
         """
         result = {}
         for token, sample in values.items():

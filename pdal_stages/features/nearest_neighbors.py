@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import device
-from .index import STACK, bounding_box, enough2, gather, halve
+from .kdtree import STACK, bounding_box, enough2, gather, halve
 
 #: Queries that share one set of candidates.
 GROUP = 8

@@ -31,11 +31,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import GOLDEN, finalise
+from ..base.hashing import GOLDEN, finalise
 from ..base.jit import device, njit
-from .bins import ShapeBins
 from .plan import Columns, columns_of
 from .registry import SHAPE_FEATURES
+from .shape_bins import ShapeBins
 
 #: x, y and z of points, (m,) float64 each.
 Axes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -301,7 +301,7 @@ def shape_counts(record, n, gx, gy, gz, seed, thresholds, work, out):
     seed : uint64
         See :func:`point_seeds`.
     thresholds : ndarray of float32, shape (5, 9)
-        See :meth:`bins.ShapeBins.comparable`.
+        See :meth:`shape_bins.ShapeBins.comparable`.
     work : Work
     out : ndarray of float32, shape (50,)
     """

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from .errors import StageError
-from .extrabytes import description, fields_of
+from .extra_bytes import description, fields_of
 from .files import disk_is_full
 from .las import (
     POINT_BYTES,
