@@ -17,7 +17,7 @@ import laspy
 import numpy as np
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.algorithms import preparation_module
+from pdal_stages.classifier.interface import preparation_module
 from pdal_stages.classifier.model import load_model
 
 #: File, what its labels become, codes that are dropped.

@@ -32,8 +32,8 @@ import numpy as np
 
 from pdal_stages import load_model
 from pdal_stages.base.version import __version__
-from pdal_stages.classifier import context as contexts
-from pdal_stages.classifier.forest import Forest
+from pdal_stages.classifier import context_features as contexts
+from pdal_stages.classifier.random_forest import Forest
 from pdal_stages.features import engine as feature_engine
 from pdal_stages.synthetic import make_town, write_town
 from pdal_stages.terrain import detached_noise, filtered_ground

@@ -20,8 +20,8 @@ _WHERE = {
     "FeatureTable": "features",
     "Pipeline": "pipeline.run",
     "StageError": "base.errors",
-    "TrainingCloud": "classifier.clouds",
-    "TrainingOptions": "classifier.trainoptions",
+    "TrainingCloud": "classifier.training_clouds",
+    "TrainingOptions": "classifier.training_options",
     "Writer": "pipeline.native",
     "compute_features": "features",
     "detached_noise": "terrain",
@@ -46,10 +46,10 @@ __all__ = [*_WHERE, "__version__"]
 if TYPE_CHECKING:
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
-    from .classifier.clouds import TrainingCloud
     from .classifier.model import Model, load_model
     from .classifier.training import train
-    from .classifier.trainoptions import TrainingOptions
+    from .classifier.training_clouds import TrainingCloud
+    from .classifier.training_options import TrainingOptions
     from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
     from .objects.cells import Cells

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pdal_stages.alsnet.algorithm import AlsNet
+from pdal_stages.alsnet.classifier import AlsNet
 from pdal_stages.alsnet.configuration import Configuration, Level
-from pdal_stages.alsnet.weights import fresh
+from pdal_stages.alsnet.network import fresh
 
 TINY = Configuration(
     "test",

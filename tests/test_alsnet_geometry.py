@@ -6,9 +6,9 @@ from alsnet_scenes import TINY, coverage, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.alsnet.circles import Circles, halo_m, spacing_for
+from pdal_stages.alsnet.batches import Circles, halo_m, spacing_for
 from pdal_stages.alsnet.configuration import parse_configuration
-from pdal_stages.alsnet.geometry import (
+from pdal_stages.alsnet.sampling_and_grouping import (
     ball_query,
     build,
     farthest_points,

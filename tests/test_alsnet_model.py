@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages import load_model
-from pdal_stages.alsnet.algorithm import AlsNet, make_pyramid, scaled
-from pdal_stages.alsnet.circles import Circles
-from pdal_stages.alsnet.geometry import build, scramble
+from pdal_stages.alsnet.batches import Circles
+from pdal_stages.alsnet.classifier import AlsNet, make_pyramid, scaled
+from pdal_stages.alsnet.sampling_and_grouping import build, scramble
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import modelfile
-from pdal_stages.classifier.algorithms import PredictRequest
+from pdal_stages.classifier import model_file
+from pdal_stages.classifier.interface import PredictRequest
 
 INPUTS = ("Z", "HeightAboveGround", "Intensity")
 
@@ -200,7 +200,7 @@ def rewritten(path, weights=None, **parameters):
     arrays = {name: array for name, array in arrays.items() if array is not None}
     manifest = model.manifest()
     manifest["passes"][0]["parameters"] = {**net.to_file([])["parameters"], **parameters}
-    modelfile.write(path, manifest, [arrays])
+    model_file.write(path, manifest, [arrays])
     return path
 
 
@@ -259,7 +259,7 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
     from pdal_stages.base.errors import DependencyError
 
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "pdal_stages.alsnet.network", raising=False)
+    monkeypatch.delitem(sys.modules, "pdal_stages.alsnet.torch_network", raising=False)
     xyz, labels, dimensions = scene(300, 8.0)
     monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
     with pytest.raises(

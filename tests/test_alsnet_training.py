@@ -15,7 +15,10 @@ from hypothesis import strategies as st
 
 import pdal_stages
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.alsnet.batches import (
+from pdal_stages.alsnet.batches import Circles
+from pdal_stages.alsnet.configuration import Configuration, Level
+from pdal_stages.alsnet.sampling_and_grouping import build
+from pdal_stages.alsnet.training_batches import (
     JITTER,
     THIN,
     augmented,
@@ -26,12 +29,9 @@ from pdal_stages.alsnet.batches import (
     side_by_side,
     spread,
 )
-from pdal_stages.alsnet.circles import Circles
-from pdal_stages.alsnet.configuration import Configuration, Level
-from pdal_stages.alsnet.geometry import build
 from pdal_stages.base.errors import DependencyError, ModelError, OptionError
 from pdal_stages.base.files import CHECKPOINT, kind_of
-from pdal_stages.classifier.algorithms import PredictRequest
+from pdal_stages.classifier.interface import PredictRequest
 
 needs_torch = pytest.mark.skipif(
     importlib.util.find_spec("torch") is None,
@@ -143,7 +143,7 @@ def test_augmentation_turns_shakes_and_thins(seed, n):
 
 @needs_torch
 def test_torch_and_numpy_agree():
-    from pdal_stages.alsnet.network import Network, applied_on
+    from pdal_stages.alsnet.torch_network import Network, applied_on
 
     net = random_net(("Z", "Intensity"), 4)
     xyz, _, values = scene(256, 7.0)
@@ -287,10 +287,10 @@ def test_transfer_from_something_else_is_refused(tmp_path):
 
 @needs_torch
 def test_a_class_only_in_the_ground_held_out_is_an_error(monkeypatch):
-    from pdal_stages.alsnet import batches
+    from pdal_stages.alsnet import training_batches
 
     xyz, labels, values = scene()
-    monkeypatch.setattr(batches, "hold_out", lambda xyz, position, *_: position == 2)
+    monkeypatch.setattr(training_batches, "hold_out", lambda xyz, position, *_: position == 2)
     with pytest.raises(OptionError, match=r"class 6 .* outside the ground held out"):
         fit([TrainingCloud(xyz, labels, values)], validation=0.5)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.classes import ClassMap
-from pdal_stages.classifier.trainoptions import TrainingOptions
+from pdal_stages.classifier.class_map import ClassMap
+from pdal_stages.classifier.training_options import TrainingOptions
 
 
 def test_default_takes_every_label_that_names_a_kind_of_object():

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier import passes
-from pdal_stages.classifier.algorithms import PredictRequest
-from pdal_stages.classifier.context import OWN, WHOLE, Context, around, count_shares
-from pdal_stages.classifier.passes import PassRun, WeightedPass
+from pdal_stages.classifier import auto_context
+from pdal_stages.classifier.auto_context import PassRun, WeightedPass
+from pdal_stages.classifier.context_features import OWN, WHOLE, Context, around, count_shares
+from pdal_stages.classifier.interface import PredictRequest
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
@@ -86,7 +86,7 @@ def test_band_by_band_is_the_same(seed, kind, size):
     request = PredictRequest(xyz, {}, wanted, 2)
     got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(passes, "BAND", size)
+        patch.setattr(auto_context, "BAND", size)
         run = PassRun(
             [WeightedPass(Said(blocks=blocks), 3), WeightedPass(Said(context), 3)], request
         )

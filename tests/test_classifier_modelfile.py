@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from sklearn.ensemble import RandomForestClassifier
 
 from pdal_stages.base.errors import ModelError, StageError
-from pdal_stages.classifier import modelfile
-from pdal_stages.classifier.algorithms import ArrayRule, algorithm
-from pdal_stages.classifier.forest import Forest
-from pdal_stages.classifier.modelfile import from_bytes, to_bytes
+from pdal_stages.classifier import model_file
+from pdal_stages.classifier.interface import ArrayRule, algorithm
+from pdal_stages.classifier.model_file import from_bytes, to_bytes
+from pdal_stages.classifier.random_forest import Forest
 
 FEATURES = 6
 
@@ -81,7 +81,7 @@ def rules(name):
 @pytest.fixture
 def good(tmp_path):
     path = tmp_path / "good.model"
-    modelfile.write(path, manifest(), [forest()[0].arrays()])
+    model_file.write(path, manifest(), [forest()[0].arrays()])
     return path
 
 
@@ -105,7 +105,7 @@ def refuse(path, text=".", seconds=10.0, megabytes=100):
     started = time.process_time()
     try:
         with pytest.raises(ModelError, match=text) as caught:
-            modelfile.read(path, rules)
+            model_file.read(path, rules)
         assert time.process_time() - started < seconds
         assert tracemalloc.get_traced_memory()[1] < megabytes * 1e6
     finally:
@@ -120,8 +120,8 @@ def refuse(path, text=".", seconds=10.0, megabytes=100):
 def test_round_trip_equals_sklearn(tmp_path):
     made, reference, x = forest()
     path = tmp_path / "m.model"
-    modelfile.write(path, manifest(), [made.arrays()])
-    read, (arrays,) = modelfile.read(path, rules)
+    model_file.write(path, manifest(), [made.arrays()])
+    read, (arrays,) = model_file.read(path, rules)
     assert {k: v for k, v in read.items() if k not in ("format", "version", "arrays")} == manifest()
     again = Forest.from_arrays(arrays, FEATURES, 3)
     assert np.array_equal(again.predict_proba(x), reference.predict_proba(x))
@@ -130,7 +130,7 @@ def test_round_trip_equals_sklearn(tmp_path):
 
 def test_same_model_same_bytes(tmp_path):
     for name in ("a", "b"):
-        modelfile.write(tmp_path / name, manifest(), [forest()[0].arrays()])
+        model_file.write(tmp_path / name, manifest(), [forest()[0].arrays()])
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -138,20 +138,20 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, good, monkeyp
     before = good.read_bytes()
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(StageError, match="disk full"):
-        modelfile.write(good, manifest(), [forest(1)[0].arrays()])
+        model_file.write(good, manifest(), [forest(1)[0].arrays()])
     assert good.read_bytes() == before
     assert os.listdir(tmp_path) == ["good.model"]
 
 
 def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(StageError, match="folder of the model file does not exist"):
-        modelfile.write(tmp_path / "no" / "m.model", manifest(), [forest()[0].arrays()])
+        model_file.write(tmp_path / "no" / "m.model", manifest(), [forest()[0].arrays()])
 
 
 def test_no_pickle_on_the_way():
     """Neither pickle nor anything that unpickles is named where a file is read."""
-    folder = Path(modelfile.__file__).parent
-    for name in ("modelfile", "forest", "model", "algorithms"):
+    folder = Path(model_file.__file__).parent
+    for name in ("model_file", "random_forest", "model", "interface"):
         text = (folder / f"{name}.py").read_text()
         for word in (
             "import pickle",
@@ -215,14 +215,14 @@ def test_cut_short_anywhere(good):
 def test_a_flipped_byte_is_noticed_or_harmless(tmp_path_factory, at, flip, times):
     """Whatever byte is changed: an error, or exactly the model that was stored."""
     path = tmp_path_factory.mktemp("flip") / "m.model"
-    modelfile.write(path, manifest(), [forest(trees=1)[0].arrays()])
-    want = modelfile.read(path, rules)
+    model_file.write(path, manifest(), [forest(trees=1)[0].arrays()])
+    want = model_file.read(path, rules)
     data = bytearray(path.read_bytes())
     for k in range(times):
         data[(at * (k + 1)) % len(data)] ^= flip
     path.write_bytes(bytes(data))
     try:
-        read, arrays = modelfile.read(path, rules)
+        read, arrays = model_file.read(path, rules)
     except ModelError:
         return
     assert read == want[0]
@@ -303,7 +303,7 @@ def test_manifests_that_are_no_manifest(good):
             "manifest",
         ),
         (b"1" * 100_000, "JSON|something else"),
-        (b" " * (modelfile.MANIFEST_LIMIT + 1), "too large"),
+        (b" " * (model_file.MANIFEST_LIMIT + 1), "too large"),
     ):
         refuse(pack(good, {**stored, "manifest.json": data}), text)
 

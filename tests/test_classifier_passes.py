@@ -9,8 +9,8 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import foresttraining, modelfile, passes
-from pdal_stages.classifier.trainoptions import CONTEXT_OF_BASE, DEFAULT_CONTEXT
+from pdal_stages.classifier import auto_context, model_file, train_forest
+from pdal_stages.classifier.training_options import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 
 FEW = {
@@ -46,7 +46,7 @@ def other():
 @pytest.fixture(autouse=True)
 def small_bands(monkeypatch):
     """Scenes of a few thousand points have several bands."""
-    monkeypatch.setattr(passes, "BAND", 500)
+    monkeypatch.setattr(auto_context, "BAND", 500)
 
 
 def same(a, b, rows=slice(None), other=slice(None)):
@@ -72,7 +72,7 @@ def test_equals_passes_by_hand(two, other):
     """Features, first forest, context by loops, second forest."""
     from test_classifier_context import reference
 
-    from pdal_stages.classifier.context import count_shares
+    from pdal_stages.classifier.context_features import count_shares
 
     xyz, _, dimensions = other
     first, second = two.passes
@@ -181,13 +181,13 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
     manifest = json.loads(json.dumps(two.manifest()))
     edit(manifest)
     with pytest.raises(ModelError):
-        modelfile.write(tmp_path / "m", manifest, [one.arrays() for one in two.passes])
+        model_file.write(tmp_path / "m", manifest, [one.arrays() for one in two.passes])
         load_model(tmp_path / "m")
 
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.classifier.passes import WeightedPass, predict
+    from pdal_stages.classifier.auto_context import WeightedPass, predict
 
     first = two.passes[0]
 
@@ -235,7 +235,7 @@ def test_of_many_samples_a_tree_draws_some(monkeypatch):
         return learned(**more).info["training"]["max_samples"]
 
     assert drawn() == 1.0  # 150 of each class
-    monkeypatch.setattr(foresttraining, "PER_TREE", 60)
+    monkeypatch.setattr(train_forest, "PER_TREE", 60)
     few = learned()
     assert few.info["training"]["max_samples"] == 0.4
     assert drawn(max_samples=0.9) == 0.9 and drawn(count=60) == 1.0

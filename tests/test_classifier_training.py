@@ -5,8 +5,8 @@ import pytest
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError
-from pdal_stages.classifier import foresttraining
-from pdal_stages.classifier.algorithms import Prediction
+from pdal_stages.classifier import train_forest
+from pdal_stages.classifier.interface import Prediction
 
 SMALL = {
     "neighborhoods": "c1,s2,kopt(5,20)",
@@ -249,7 +249,7 @@ def test_errors_say_what_was_found(monkeypatch):
             TrainingOptions(**SMALL),
             progress=False,
         )
-    monkeypatch.setattr(foresttraining, "free_memory", lambda: 1000)
+    monkeypatch.setattr(train_forest, "free_memory", lambda: 1000)
     with pytest.raises(OptionError, match="do not fit into the free memory"):
         train([cloud], TrainingOptions(**SMALL), progress=False)
 
@@ -308,10 +308,10 @@ def test_prior_weight(other):
 def test_manifests_that_do_not_fit_themselves(trained, tmp_path, edit, other):
     import copy
 
-    from pdal_stages.classifier import modelfile
+    from pdal_stages.classifier import model_file
 
     manifest = copy.deepcopy(trained.manifest())
     edit(manifest)
     with pytest.raises(ModelError):  # some are refused where they are written
-        modelfile.write(tmp_path / "m", manifest, [trained.algorithm.arrays()])
+        model_file.write(tmp_path / "m", manifest, [trained.algorithm.arrays()])
         load_model(tmp_path / "m")

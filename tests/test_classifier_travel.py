@@ -8,8 +8,8 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.clouds import prepared
 from pdal_stages.classifier.sampling import draw_samples, share_out
+from pdal_stages.classifier.training_clouds import prepared
 from pdal_stages.features.cell_means import density
 
 FEW = {**SMALL, "feature_set": "covariance", "neighborhoods": "s1", "trees": 6}

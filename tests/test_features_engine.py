@@ -429,7 +429,7 @@ def test_importing_and_loading_a_model_are_light():
         """
         import sys, pdal_stages.features, pdal_stages.pipeline.classify_request
         from pdal_stages import load_model
-        from pdal_stages.classifier.modelfile import find
+        from pdal_stages.classifier.model_file import find
         load_model(find("standard"))
         heavy = "numba", "scipy.ndimage", "scipy.spatial", "scipy.sparse", "sklearn", "joblib"
         print([name for name in heavy if name in sys.modules])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.algorithms import gather, optional, required, with_returns
+from pdal_stages.classifier.interface import gather, optional, required, with_returns
 from pdal_stages.features import FeaturePlan, return_features
 
 

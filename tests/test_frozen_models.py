@@ -14,8 +14,8 @@ import pytest
 import pdal_stages
 from pdal_stages import load_model
 from pdal_stages.base.errors import ModelError
-from pdal_stages.classifier import modelfile
-from pdal_stages.classifier.modelfile import shipped
+from pdal_stages.classifier import model_file
+from pdal_stages.classifier.model_file import shipped
 from pdal_stages.cli import main
 
 DATA = Path(__file__).parent / "data"
@@ -110,7 +110,7 @@ def test_columns_in_another_order_are_read_by_their_names(cloud, tmp_path):
         entry["feature_names"][:count] = entry["feature_names"][:count][::-1]
         splits = (of_pass["feature"] >= 0) & (of_pass["feature"] < count)
         of_pass["feature"][splits] = count - 1 - of_pass["feature"][splits]
-    modelfile.write(tmp_path / "reverse.model", manifest, arrays)
+    model_file.write(tmp_path / "reverse.model", manifest, arrays)
     found = load_model(tmp_path / "reverse.model").predict(cloud[0]).classification
     assert np.array_equal(found, model.predict(cloud[0]).classification)
 
@@ -120,7 +120,7 @@ def test_a_feature_of_another_release_is_refused_by_its_name(tmp_path):
     manifest = model.manifest()
     manifest["passes"][0]["feature_names"][0] = "Colour_c1"
     arrays = [one.arrays() for one in model.passes]
-    modelfile.write(tmp_path / "new.model", manifest, arrays)
+    model_file.write(tmp_path / "new.model", manifest, arrays)
     with pytest.raises(ModelError, match=r"this release does not have.*Colour_c1"):
         load_model(tmp_path / "new.model")
 
@@ -149,7 +149,7 @@ def test_shipped_models_are_of_the_algorithms_of_this_release():
 
 def test_a_shipped_model_that_is_damaged_is_not_suggested_in_its_own_place(tmp_path, monkeypatch):
     (tmp_path / "standard.model").write_bytes(b"cut short")
-    monkeypatch.setattr(modelfile, "shipped", lambda: {"standard": tmp_path / "standard.model"})
+    monkeypatch.setattr(model_file, "shipped", lambda: {"standard": tmp_path / "standard.model"})
     with pytest.raises(ModelError, match="cut short or damaged") as caught:
         load_model("standard")
     assert "Did you mean" not in str(caught.value)

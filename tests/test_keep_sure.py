@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier.modelfile import find
-from pdal_stages.classifier.sureness import BINS, Sureness, of_the_base, said, sureness_of
+from pdal_stages.classifier.calibration import BINS, Sureness, of_the_base, said, sureness_of
+from pdal_stages.classifier.model_file import find
 from pdal_stages.cli import main
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 

@@ -19,7 +19,7 @@ from alsnet_scenes import model_of, random_net
 
 import pdal_stages as ps
 from pdal_stages.classifier.model import load_model
-from pdal_stages.classifier.modelfile import find
+from pdal_stages.classifier.model_file import find
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
 

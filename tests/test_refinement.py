@@ -16,12 +16,12 @@ from test_classifier_training import scene
 import pdal_stages as ps
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError, StageError
-from pdal_stages.classifier import foresttraining, modelfile
-from pdal_stages.classifier.algorithms import PredictRequest
-from pdal_stages.classifier.clouds import label_classes
-from pdal_stages.classifier.context import count_shares
-from pdal_stages.classifier.featureforest import EVEN, Blend, trust, weighed
-from pdal_stages.classifier.passes import predict
+from pdal_stages.classifier import model_file, train_forest
+from pdal_stages.classifier.auto_context import predict
+from pdal_stages.classifier.context_features import count_shares
+from pdal_stages.classifier.feature_forest import EVEN, Blend, trust, weighed
+from pdal_stages.classifier.interface import PredictRequest
+from pdal_stages.classifier.training_clouds import label_classes
 from pdal_stages.features import FeatureEngine
 from pdal_stages.features.cell_means import WHOLE
 
@@ -282,7 +282,7 @@ def test_a_manifest_that_contradicts_itself(base, tmp_path, change):
     manifest = json.loads(json.dumps(model.manifest()))
     change(manifest["passes"])
     with pytest.raises(ModelError):
-        modelfile.write(tmp_path / "m", manifest, [one.arrays() for one in model.passes])
+        model_file.write(tmp_path / "m", manifest, [one.arrays() for one in model.passes])
         load_model(tmp_path / "m")
 
 
@@ -335,7 +335,7 @@ def test_two_passes_equal_the_passes_by_hand(base):
 def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monkeypatch):
     from test_classifier_context import reference
 
-    kept, inner = [], foresttraining._ForestTraining._around
+    kept, inner = [], train_forest._ForestTraining._around
 
     def keep(self, number, held_out=(), folds=None):
         found = inner(self, number, held_out, folds)
@@ -343,7 +343,7 @@ def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monke
             kept.append((self, folds, held_out, found))
         return found
 
-    monkeypatch.setattr(foresttraining._ForestTraining, "_around", keep)
+    monkeypatch.setattr(train_forest._ForestTraining, "_around", keep)
     model = on_top(base, passes=2, voxel=0, n=300)
     ((passes, folds, (forests,), context),) = kept
     (cloud,) = passes.clouds

@@ -8,7 +8,7 @@ from block_scene import QUICK_TRAINING
 
 import pdal_stages as ps
 from pdal_stages.base.errors import DimensionError
-from pdal_stages.classifier import foresttraining
+from pdal_stages.classifier import train_forest
 from pdal_stages.cli import main
 
 QUICK = {"feature_set": "Linearity,HeightRange", "trees": 8, "passes": 1, "dimensions": ""}
@@ -57,9 +57,9 @@ def test_training_by_pipeline_prints_its_score(tmp_path, write_las, run_job):
 def test_each_file_is_held_out_whole(tmp_path, write_las, monkeypatch):
     """The fold of every sample is that of its file, whatever lies beside it."""
     seen = []
-    split = foresttraining.split
+    split = train_forest.split
     monkeypatch.setattr(
-        foresttraining,
+        train_forest,
         "split",
         lambda xy, fold, *more: seen.append((xy, fold)) or split(xy, fold, *more),
     )

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.clouds import TiledCloud
-from pdal_stages.classifier.foresttraining import SHORT
+from pdal_stages.classifier.train_forest import SHORT
 from pdal_stages.classifier.training import reach
+from pdal_stages.classifier.training_clouds import TiledCloud
 
 QUICK = {"count": 120, "trees": 4, "threads": 1, "voxel": 0.25, "dimensions": ("Intensity",)}
 

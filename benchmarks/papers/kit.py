@@ -19,7 +19,7 @@ from clouds import Cloud
 import pdal_stages
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.base.progress import Progress
-from pdal_stages.classifier.forest import Forest
+from pdal_stages.classifier.random_forest import Forest
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins
 
 #: Parts of a result that --json leaves out.

@@ -20,14 +20,14 @@ from recipe import OPTIONS, training_clouds
 from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud
-from pdal_stages.classifier.algorithms import PredictRequest
-from pdal_stages.classifier.clouds import label_classes
-from pdal_stages.classifier.context import Context, count_shares
-from pdal_stages.classifier.featureforest import CloudFeatures, FeatureForest, Features
-from pdal_stages.classifier.forest import Forest, grow_forest
-from pdal_stages.classifier.foresttraining import FOLD_TREES, feature_plan
+from pdal_stages.classifier.context_features import Context, count_shares
+from pdal_stages.classifier.feature_forest import CloudFeatures, FeatureForest, Features
+from pdal_stages.classifier.interface import PredictRequest
 from pdal_stages.classifier.model import load_model
+from pdal_stages.classifier.random_forest import Forest, grow_forest
 from pdal_stages.classifier.sampling import draw_samples
+from pdal_stages.classifier.train_forest import FOLD_TREES, feature_plan
+from pdal_stages.classifier.training_clouds import label_classes
 
 #: Trees of a forest of a model that judges: fewer than the shipped one's, for speed.
 TREES = 16

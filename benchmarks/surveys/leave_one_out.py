@@ -33,7 +33,7 @@ from surveys import (
 
 from pdal_stages import TrainingCloud
 from pdal_stages.accuracy import Accuracy
-from pdal_stages.classifier.sureness import Sureness
+from pdal_stages.classifier.calibration import Sureness
 from pdal_stages.reports.views import png, triptych
 
 #: Points per square meter that the surveys are thinned to.

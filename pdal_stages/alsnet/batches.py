@@ -1,112 +1,157 @@
-"""Which batches are trained on and how they are changed, and which ground is held out. No PyTorch here."""
+"""Circular batches [WM19]: the points nearest to grid points, so spaced that every point is in several.
+
+The grid is anchored to absolute coordinates and its spacing is fixed when a model is trained, so a tile sees the
+same circles as the whole cloud. What a circle holds follows from the coordinates, never from the points' order.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..classifier.sampling import Folds
-from .circles import REACH, Circles
+from ..base.errors import OptionError
+
+#: Circles each point is in, on average, in a cloud of even density.
+COVERAGE = 4.0
+#: Farthest point a circle takes, in spacings. A circle of full size in even density has 1.13.
+REACH = 1.5
+#: How often a cell may be halved.
+DEEPEST = 24
 
 
-def side_by_side(
-    clouds: Sequence[npt.NDArray[np.float64]], spacing: float
-) -> npt.NDArray[np.float64]:
-    """All clouds as one, moved along x by whole spacings until no batch can hold points of two."""
-    out: list[npt.NDArray[np.float64]] = []
-    right = None
-    for xyz in clouds:
-        if len(xyz):
-            steps = 0.0 if right is None else np.ceil((right - xyz[:, 0].min()) / spacing)
-            xyz = xyz + np.array([steps * spacing, 0.0, 0.0])
-            right = float(xyz[:, 0].max()) + 8.0 * REACH * spacing
-        out.append(xyz)
-    return np.concatenate(out)
+def spacing_for(points: int, per_square_meter: float) -> float:
+    """Spacing in meters at which circles of `points` points cover each point :data:`COVERAGE` times.
 
-
-def spread(histogram: npt.NDArray[Any]) -> float:
-    """Standard deviation of a batch's class shares, per cent: large where one class is nearly all [WM19].
-
-    Infinite for a batch without labels.
+    A circle covers points / density square meters and each grid point stands for spacing^2 of them.
     """
-    total = histogram.sum()
-    return float(np.std(histogram / total) * 100.0) if total else float("inf")
+    return max(round(math.sqrt(points / (COVERAGE * per_square_meter)), 2), 0.05)
 
 
-def choose(
-    circles: Circles, labels: npt.NDArray[Any], n_classes: int, threshold: float
-) -> list[int]:
-    """Batches whose classes are mixed; see ``NetworkOptions.histogram_threshold``.
+def halo_m(spacing: float) -> float:
+    """Meters around a tile that its results depend on.
 
-    Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels (n,) are class
-    positions; -1 is not looked at.
+    A point's circles have their grid points within ``REACH`` spacings of it and take points as far again; which
+    grid points there are depends on the cell they were halved from, whose center is up to half a cell's diagonal
+    away, and on what lies within reach of that.
     """
-    mine = (labels[circles.members(number)] for number in range(len(circles)))
-    histograms = [np.bincount(part[part >= 0], minlength=n_classes) for part in mine]
-    spreads = [spread(histogram) for histogram in histograms]
-    chosen = {number for number, value in enumerate(spreads) if value < threshold}
-    for position in range(n_classes):
-        having = [number for number, histogram in enumerate(histograms) if histogram[position]]
-        if having and not chosen.intersection(having):
-            chosen.add(min(having, key=lambda number: spreads[number]))
-    return sorted(chosen)
+    return (2.0 * REACH + math.sqrt(0.5)) * spacing
 
 
-def hold_out(
-    xyz: npt.NDArray[np.float64], labels: npt.NDArray[Any], share: float, block_size: float
-) -> npt.NDArray[np.bool_]:
-    """Which labeled points (not -1) lie in the blocks held out for validation."""
-    out, use = np.zeros(len(xyz), bool), np.flatnonzero(labels >= 0)
-    if share == 0.0:
-        return out
-    folds = Folds.of_blocks(
-        xyz[use, :2], labels[use], np.ones(len(use)), max(2, round(1.0 / share)), block_size
-    )
-    out[use] = folds.points(xyz[use, :2]) == 0
-    return out
+class Circles:
+    """The circular batches of a cloud.
+
+    A cell of the grid is quartered, and its grid point replaced by four, while it holds more than half a batch, or
+    while its own circle does not hold all of its points: so each point is in at least one circle, always.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+        Coordinates in meters.
+    points : int
+        Points of a batch; a circle in sparse surroundings has fewer.
+    spacing : float
+        Of the grid, meters.
+    inputs : (n, c) array, optional
+        Other values of the points, to tell points at the same place apart.
+
+    Attributes
+    ----------
+    centers : (m, 2) float64
+        Grid points, in an order that follows from the coordinates.
+    sizes : (m,) int64
+        Points a circle may hold: `points`, but for more than `points` at one and the same place.
+    """
+
+    def __init__(
+        self,
+        xyz: npt.NDArray[np.float64],
+        points: int,
+        spacing: float,
+        inputs: npt.NDArray[Any] | None = None,
+    ) -> None:
+        from scipy.spatial import cKDTree
+
+        if not spacing > 0.0:
+            raise OptionError("the spacing of batches must be more than 0 m", found=spacing)
+        self.points, self.spacing, self.reach = int(points), float(spacing), REACH * float(spacing)
+        more = () if inputs is None else inputs.T
+        self._row = np.lexsort([*more, xyz[:, 2], xyz[:, 1], xyz[:, 0]])  # the canonical order
+        self._xy = np.ascontiguousarray(xyz[self._row, :2])
+        self._tree = cKDTree(self._xy)
+        self.centers, self.sizes = self._place()
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    def around(self, x: float, y: float, size: int | None = None) -> npt.NDArray[np.int64]:
+        """Rows of the points nearest to a place in plan, at most `size` and none beyond ``reach``.
+
+        In the canonical order. Of points equally far the first in that order are taken.
+        """
+        size = self.points if size is None else size
+        radius = self.reach * (1.0 + 1e-9)  # a few beyond too
+        at = np.array(self._tree.query_ball_point((x, y), radius, return_sorted=True), np.int64)
+        d2 = ((self._xy[at] - (x, y)) ** 2).sum(axis=1)
+        at, d2 = at[d2 <= self.reach**2], d2[d2 <= self.reach**2]
+        if len(at) > size:
+            limit = np.partition(d2, size - 1)[size - 1]
+            mine = d2 < limit
+            mine[np.flatnonzero(d2 == limit)[: size - np.count_nonzero(mine)]] = True
+            at = at[mine]
+        return self._row[at]
+
+    def members(self, number: int) -> npt.NDArray[np.int64]:
+        """Rows of the points of a circle, in the canonical order."""
+        x, y = self.centers[number]
+        return self.around(float(x), float(y), int(self.sizes[number]))
+
+    def needed(self, rows: npt.NDArray[np.int64] | None) -> npt.NDArray[np.int64]:
+        """Numbers of the circles that can hold any of these rows; all for None."""
+        from scipy.spatial import cKDTree
+
+        if rows is None or not len(rows) or not len(self):
+            return np.arange(len(self) if rows is None else 0)
+        wanted = np.zeros(len(self._xy), bool)
+        wanted[rows] = True
+        distance, _ = cKDTree(self._xy[wanted[self._row]]).query(self.centers)
+        return np.flatnonzero(distance <= self.reach * (1.0 + 1e-9))
+
+    def _place(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+        """Centers and sizes."""
+        found: list[tuple[float, float, int]] = []
+        waiting = [(0, *part) for part in _parts(np.arange(len(self._xy)), self._xy, self.spacing)][
+            ::-1
+        ]
+        while waiting:
+            level, cell, at = waiting.pop()
+            side = self.spacing / 2.0**level
+            x, y = (cell + 0.5) * side
+            if size := self._fits(at, x, y, level):
+                found.append((x, y, size))
+            else:
+                waiting += [(level + 1, *part) for part in _parts(at, self._xy, side / 2.0)][::-1]
+        table = np.array(found, dtype=np.float64).reshape(-1, 3)
+        return table[:, :2].copy(), table[:, 2].astype(np.int64)
+
+    def _fits(self, at: npt.NDArray[np.int64], x: float, y: float, level: int) -> int:
+        """The size of the cell's circle, or 0 where the cell must be quartered."""
+        if level < DEEPEST and len(at) > max(self.points // 2, 1):
+            return 0
+        far2 = float(((self._xy[at] - (x, y)) ** 2).sum(axis=1).max())
+        radius = math.sqrt(far2) * (1.0 + 1e-9)
+        within = int(self._tree.query_ball_point((x, y), radius, return_length=True))
+        if within <= self.points:
+            return self.points
+        return 0 if level < DEEPEST else within
 
 
-def covering(circles: Circles, wanted: npt.NDArray[np.bool_]) -> list[int]:
-    """Circles that hold every wanted point at least once, those with most of them first."""
-    left, out = wanted.copy(), []
-    numbers = circles.needed(np.flatnonzero(wanted)).tolist()
-    for number in sorted(
-        numbers, key=lambda number: -np.count_nonzero(wanted[circles.members(number)])
-    ):
-        members = circles.members(number)
-        if left[members].any():
-            left[members] = False
-            out.append(number)
-    return sorted(out)
-
-
-def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]:
-    """Weight of each class in the loss; their mean over the points is 1."""
-    share = count / count.sum()
-    if kind == "none":
-        return np.ones(len(count))
-    weight = 1.0 / np.sqrt(share) if kind == "sqrt" else 1.0 / share
-    return weight / (weight * share).sum()
-
-
-#: Augmentation: most that a batch's center moves, in spacings; standard deviation of noise on coordinates, meters, cut at
-#: three times that; most points a batch loses, and fewest that are left.
-SHIFT, JITTER, THIN, LEAST = 0.5, 0.01, 0.4, 16
-
-
-def augmented(
-    xyz: npt.NDArray[np.float64], random: np.random.Generator
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """A batch turned about z, shaken and thinned: from coordinates (n, 3) around its center to (m, 3), and the rows kept."""
-    share = 1.0 - random.uniform(0.0, THIN)
-    kept = np.sort(
-        random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))]
-    )
-    angle = random.uniform(0.0, 2.0 * math.pi)
-    c, s = math.cos(angle), math.sin(angle)
-    out = xyz[kept] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return out + np.clip(random.normal(0.0, JITTER, out.shape), -3.0 * JITTER, 3.0 * JITTER), kept
+def _parts(at: npt.NDArray[np.int64], xy: npt.NDArray[np.float64], side: float):
+    """The occupied cells of some points: (ix and iy, places), ordered by iy, then ix."""
+    cell = np.floor(xy[at] / side)
+    order = np.lexsort(cell.T)
+    cell, at = cell[order], at[order]
+    starts = np.flatnonzero((cell[1:] != cell[:-1]).any(axis=1)) + 1
+    return list(zip(cell[[0, *starts]], np.split(at, starts), strict=True)) if len(at) else []

@@ -1,121 +1,139 @@
-"""The network in PyTorch, for training it, and for applying it on a GPU."""
+"""A network's weights as named arrays: made, checked, and applied with NumPy alone; only training needs PyTorch."""
 
 from __future__ import annotations
 
-import os
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import DependencyError, optional_import
+from ..base.errors import ModelError
 from .configuration import Configuration
-from .geometry import Pyramid, Step
-from .weights import EPSILON, Weights, forward
+from .sampling_and_grouping import Pyramid
 
-# OpenMP's threads spin while they wait, a third of all CPU time beside threads that prepare batches;
-# on a busy machine training took many times as long. Read when PyTorch loads its OpenMP.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-torch: Any = optional_import("torch", "deep", "training an alsNet, or applying one on a GPU")
-nn: Any = torch.nn
+Weights = dict[str, npt.NDArray[np.float32]]
 
-#: Share of a batch's statistics in the running ones.
-MOMENTUM = 0.05
+#: Added to the variance in batch normalization.
+EPSILON = 1e-5
 
 
-class Network(nn.Module):
-    """The layers of a configuration, each linear, normalized and cut at 0, by the names of their arrays."""
+def fresh(configuration: Configuration, inputs: int, classes: int, seed: int) -> Weights:
+    """Untrained weights: He et al. 2015 for the linear layers, identity for the normalizations."""
+    random = np.random.default_rng([seed, 0xA15])
+    out: Weights = {}
+    for name, (rows, columns) in configuration.shapes(inputs, classes).items():
+        array = np.zeros((rows, columns), np.float32)
+        width = columns - (1 if name == "scores" else 4)
+        gain = 1.0 if name == "scores" else 2.0
+        array[:, :width] = random.normal(0.0, math.sqrt(gain / width), (rows, width))
+        if name != "scores":
+            array[:, width] = 1.0  # scale
+            array[:, width + 3] = 1.0  # running variance
+        out[name] = array
+    return out
 
-    def __init__(self, configuration: Configuration, inputs: int, classes: int) -> None:
-        super().__init__()
-        self.configuration = configuration
-        self.layers, shapes = nn.ModuleDict(), configuration.shapes(inputs, classes)
-        for name, (after, columns) in shapes.items():
-            if name == "scores":
-                self.layers[name] = nn.Linear(columns - 1, after)
-                continue
-            linear = nn.Linear(columns - 4, after, bias=False)
-            norm = nn.BatchNorm1d(after, eps=EPSILON, momentum=MOMENTUM)
-            self.layers[name] = nn.Sequential(linear, norm, nn.ReLU())
-        self.dropout = nn.Dropout(configuration.dropout)
 
-    def forward(self, pyramid: Pyramid):
-        """Scores before the softmax, (n, classes), of a pyramid of tensors."""
-        below = forward(
-            self.configuration,
-            pyramid,
-            lambda name, values: self.layers[name](values),
-            lambda values, rows: values.index_select(0, rows),
-            lambda parts: torch.cat(parts, dim=1),
-            lambda values: values.amax(dim=1),
+def check(
+    weights: Mapping[str, npt.NDArray[Any]], configuration: Configuration, inputs: int, classes: int
+) -> None:
+    """Refuse, as a ModelError, arrays that are missing, unknown, of other shapes, not finite, or of negative variance."""
+    shapes = configuration.shapes(inputs, classes)
+    if odd := sorted(set(weights) ^ set(shapes)):
+        raise ModelError(
+            "the network's arrays are not those of its configuration", found=repr(odd[0])[:60]
         )
-        return self.layers["scores"](self.dropout(below))
-
-    def _parts(self):
-        """Of every array its name and the tensors side by side in it."""
-        for name, layer in self.layers.items():
-            if name == "scores":
-                yield name, (layer.weight, layer.bias[:, None])
-            else:
-                linear, norm, _ = layer
-                more = (norm.weight, norm.bias, norm.running_mean, norm.running_var)
-                yield name, (linear.weight, *(part[:, None] for part in more))
-
-    def load(self, weights: Mapping[str, npt.NDArray[np.float32]]) -> Network:
-        """Take over checked arrays."""
-        with torch.no_grad():
-            for name, parts in self._parts():
-                array = torch.from_numpy(np.array(weights[name], dtype=np.float32))
-                for part, values in zip(
-                    parts, array.split([p.shape[1] for p in parts], dim=1), strict=True
-                ):
-                    part.copy_(values)
-        return self
-
-    def dump(self) -> Weights:
-        """The weights as arrays, in the order of ``Configuration.shapes``."""
-        return {
-            name: torch.cat(parts, dim=1).detach().cpu().numpy() for name, parts in self._parts()
-        }
+    for name, shape in shapes.items():
+        array = weights[name]
+        if array.shape != shape:
+            raise ModelError(
+                f"the network's array '{name}' must be {shape}", found=f"shape {array.shape}"
+            )
+        if not np.isfinite(array).all() or (name != "scores" and array[:, -1].min() < 0.0):
+            raise ModelError(
+                f"the network's array '{name}' must be finite, with variances of 0 or more"
+            )
 
 
-def applied_on(
-    device: str, weights: Weights, configuration: Configuration, inputs: int, classes: int
-) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
-    """Return what gives the class probabilities (n, classes) of a batch, computed on a device of PyTorch.
+def forward(
+    configuration: Configuration,
+    pyramid: Any,
+    layer: Callable,
+    take: Callable,
+    join: Callable,
+    highest: Callable,
+) -> Any:
+    """What enters the last layer, (n, width): PointNet++ with the levels of a configuration [WM19; Qi et al. 2017].
 
-    They equal those of ``weights.Folded`` up to rounding.
+    `pyramid` holds arrays of NumPy or tensors of PyTorch; the functions are those of the one or the other: a named
+    layer, rows by number, columns side by side, the maximum over the middle axis.
     """
-    network = Network(configuration, inputs, classes).load(weights).to(device).eval()
 
-    def probabilities(pyramid: Pyramid) -> npt.NDArray[np.float64]:
-        with torch.no_grad():
-            scores = network(tensors(pyramid, device))
-            return torch.softmax(scores.double(), dim=1).cpu().numpy()
+    def shared(prefix: str, values: Any, widths: tuple[int, ...]) -> Any:
+        for step in range(1, len(widths) + 1):
+            values = layer(f"{prefix}_{step}", values)
+        return values
 
-    return probabilities
+    levels, features = configuration.levels, [pyramid.inputs]
+    for number, (level, step) in enumerate(zip(levels, pyramid.steps, strict=True), 1):
+        m, samples = step.groups.shape
+        rows = join([step.offsets.reshape(-1, 3), take(features[-1], step.groups.reshape(-1))])
+        described = shared(f"sa{number}", rows, level.mlp)
+        features.append(highest(described.reshape(m, samples, -1)))
+    below = features[-1]
+    for number in range(len(levels), 0, -1):
+        step = pyramid.steps[number - 1]
+        carried = sum(take(below, step.near[:, k]) * step.weights[:, k : k + 1] for k in range(3))
+        below = shared(f"fp{number}", join([carried, features[number - 1]]), levels[number - 1].up)
+    return shared("head", below, configuration.head)
 
 
-def chosen_device(device: str) -> str:
-    """Return ``cuda`` or ``cpu`` for a device option; DependencyError for cuda where there is none."""
-    cuda = torch.cuda.is_available()
-    if device == "cuda" and not cuda:
-        raise DependencyError(
-            "'device' is cuda, but PyTorch sees no CUDA device",
-            cure="Install a CUDA build of PyTorch and the driver, or use device auto",
-        )
-    return "cuda" if cuda and device != "cpu" else "cpu"
+class Folded:
+    """A network for applying: weights that :func:`check` accepts, batch normalization folded into the linear layers."""
 
+    def __init__(
+        self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration
+    ) -> None:
+        self.configuration = configuration
+        self._layers: dict[str, tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]] = {}
+        for name, array in weights.items():
+            if name == "scores":
+                self._layers[name] = (np.ascontiguousarray(array[:, :-1].T), array[:, -1].copy())
+                continue
+            scale, shift, mean, variance = array[:, -4:].astype(np.float64).T
+            factor = scale / np.sqrt(variance + EPSILON)
+            matrix = (array[:, :-4] * factor[:, None]).astype(np.float32)
+            self._layers[name] = (
+                np.ascontiguousarray(matrix.T),
+                (shift - mean * factor).astype(np.float32),
+            )
 
-def tensors(pyramid: Pyramid, device: str = "cpu") -> Pyramid:
-    """A pyramid of tensors."""
+    def _layer(self, name: str, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        matrix, bias = self._layers[name]
+        values = values @ matrix
+        values += bias
+        return np.maximum(values, 0.0, out=values)
 
-    def move(array):
-        return torch.from_numpy(np.ascontiguousarray(array)).to(device)
-
-    steps = (
-        Step(*(move(getattr(s, name)) for name in ("groups", "offsets", "near", "weights")))
-        for s in pyramid.steps
-    )
-    return Pyramid(move(pyramid.inputs), tuple(steps))
+    def __call__(self, pyramid: Pyramid) -> npt.NDArray[np.float64]:
+        """Class probabilities of a batch's points, (n, classes) float64."""
+        with np.errstate(all="ignore"):  # scores that are not finite are an error in the end
+            below = forward(
+                self.configuration,
+                pyramid,
+                self._layer,
+                lambda values, rows: values[rows],
+                lambda parts: np.concatenate(parts, axis=1),
+                lambda values: values.max(axis=1),
+            )
+            matrix, bias = self._layers["scores"]
+            scores = (below @ matrix + bias).astype(np.float64)
+            scores -= scores.max(axis=1, keepdims=True)
+            np.exp(scores, out=scores)
+            scores /= scores.sum(axis=1, keepdims=True)
+        if not np.isfinite(scores).all():
+            raise ModelError(
+                "the network gave probabilities that are not numbers",
+                cure="Its weights or the points' dimensions are out of all proportion; train the model again",
+            )
+        return scores

@@ -20,19 +20,19 @@ from ..base.files import CHECKPOINT, Output, write_whole
 from ..base.hashing import hash_of
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.algorithms import gather, with_returns
-from ..classifier.classes import ClassMap
-from ..classifier.clouds import TrainingCloud, label_classes
+from ..classifier.class_map import ClassMap
+from ..classifier.interface import gather, with_returns
 from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
-from ..classifier.trainoptions import TrainingOptions
+from ..classifier.training_clouds import TrainingCloud, label_classes
+from ..classifier.training_options import TrainingOptions
 from ..features.cell_means import density
-from . import batches
-from .algorithm import AlsNet, make_pyramid, scaled
-from .circles import Circles, spacing_for
+from . import training_batches
+from .batches import Circles, spacing_for
+from .classifier import AlsNet, make_pyramid, scaled
 from .configuration import NetworkOptions
-from .geometry import stack
-from .weights import Weights, check, fresh
+from .network import Weights, check, fresh
+from .sampling_and_grouping import stack
 
 #: Of a checkpoint: a file of PyTorch's own, read with ``weights_only`` (nothing in it is executed), and its SHA-256.
 FORMAT = "pdal-stages alsnet checkpoint 4"
@@ -64,7 +64,7 @@ def inputs(options: TrainingOptions) -> tuple[str, ...]:
 
 def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     """See :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
-    from .network import torch  # before any work: says what to install where it is missing
+    from .torch_network import torch  # before any work: says what to install where it is missing
 
     session = _Session(clouds, options)
     known, position, before = session.labeled, session.position, torch.get_num_threads()
@@ -89,7 +89,7 @@ class _Session:
     """One training: its data, the network, the optimizer, what has been reached."""
 
     def __init__(self, clouds: Sequence[TrainingCloud], training: TrainingOptions) -> None:
-        from .network import Network, chosen_device, torch
+        from .torch_network import Network, chosen_device, torch
 
         self.torch, self.options, self.seed = torch, training.alsnet, training.seed
         self.threads, self.inputs = resolve_threads(training.threads), inputs(training)
@@ -122,10 +122,10 @@ class _Session:
         self.spacing = options.spacing or spacing_for(
             points, float(np.median([density(xyz) for xyz in self.clouds]))
         )
-        self.xyz = batches.side_by_side(self.clouds, self.spacing)
+        self.xyz = training_batches.side_by_side(self.clouds, self.spacing)
         self.columns = scaled(self.xyz, values, names, self.mean, self.scale)
         self.circles = Circles(self.xyz, points, self.spacing, self.columns)
-        held = batches.hold_out(
+        held = training_batches.hold_out(
             np.concatenate(self.clouds), position, options.validation, options.block_size
         )
         self.train_labels = np.where(held, -1, position).astype(np.int64)
@@ -138,8 +138,10 @@ class _Session:
                 cure="Make block_size smaller, set validation to 0, or give more training data",
             )
         threshold = options.histogram_threshold
-        self.chosen = batches.choose(self.circles, self.train_labels, self.n_classes, threshold)
-        self.held_batches = batches.covering(self.circles, self.held_labels >= 0)
+        self.chosen = training_batches.choose(
+            self.circles, self.train_labels, self.n_classes, threshold
+        )
+        self.held_batches = training_batches.covering(self.circles, self.held_labels >= 0)
         start = fresh(options.configuration, len(names), self.n_classes, self.seed)
         if source is not None:
             start = _transfer(source, start, classes)
@@ -147,7 +149,7 @@ class _Session:
             Network(options.configuration, len(names), self.n_classes).load(start).to(self.device)
         )
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=options.learning_rate)
-        weight = batches.class_weights(count, options.class_weights)
+        weight = training_batches.class_weights(count, options.class_weights)
         self.weight = torch.tensor(weight, dtype=torch.float32, device=self.device)
         self.curve: list[dict[str, Any]] = []
         self.best: Weights = self.network.dump()
@@ -233,11 +235,11 @@ class _Session:
         random = np.random.default_rng([self.seed, epoch, 2, number])
         center, members, change = self.circles.centers[number], self.circles.members(number), None
         if self.options.augment:
-            moved = center + random.uniform(-1.0, 1.0, 2) * batches.SHIFT * self.spacing
+            moved = center + random.uniform(-1.0, 1.0, 2) * training_batches.SHIFT * self.spacing
             around = self.circles.around(float(moved[0]), float(moved[1]))
             if len(around):  # not moved off the cloud's edge
                 center, members = moved, around
-            change = lambda xyz: batches.augmented(xyz, random)  # noqa: E731
+            change = lambda xyz: training_batches.augmented(xyz, random)  # noqa: E731
         order, pyramid = self._pyramid(members, center, change)
         return pyramid, self.train_labels[members[order]]
 
@@ -248,7 +250,7 @@ class _Session:
         )
 
     def _step(self, pyramid, labels: npt.NDArray[np.int64]) -> float:
-        from .network import tensors
+        from .torch_network import tensors
 
         torch = self.torch
         scores = self.network(tensors(pyramid, self.device))
@@ -270,7 +272,7 @@ class _Session:
 
     def _validate(self, bar: Progress) -> dict[str, Any]:
         """Scores on the ground held out."""
-        from .network import tensors
+        from .torch_network import tensors
 
         self.network.eval()
         sums = np.zeros((len(self.xyz), self.n_classes), np.float32)

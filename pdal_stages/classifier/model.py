@@ -20,8 +20,10 @@ from ..features.cell_means import density
 from ..features.point_grid import build_grid, check_xyz
 from ..features.registry import ALGORITHM_VERSION
 from ..features.voxels import check_side, represent
-from . import modelfile, summary
-from .algorithms import (
+from . import model_description, model_file
+from .auto_context import WeightedPass, plan_of, predict
+from .feature_forest import weighed
+from .interface import (
     InputPlan,
     Prediction,
     PredictionOptions,
@@ -32,8 +34,6 @@ from .algorithms import (
     preparation_module,
     required,
 )
-from .featureforest import weighed
-from .passes import WeightedPass, plan_of, predict
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1
@@ -142,7 +142,9 @@ class Model:
         place in ``passes``.
         """
         values = self.info["passes"][number]["importances"]
-        return summary.importances(values, self.passes[number].columns(self.codes_of[number]), by)
+        return model_description.importances(
+            values, self.passes[number].columns(self.codes_of[number]), by
+        )
 
     def describe(self) -> dict[str, Any]:
         """Everything about the model as plain data; ``str(model)`` is the same as text."""
@@ -152,7 +154,7 @@ class Model:
             "halo_m": self.halo_m,
             "outdated": self.outdated,
         }
-        return summary.describe(
+        return model_description.describe(
             {**self.manifest(), **more},
             [one.columns(codes) for one, codes in zip(self.passes, self.codes_of, strict=True)],
         )
@@ -161,7 +163,7 @@ class Model:
         return f"<Model {self.algorithm.name} of classes {self.codes.tolist()}>"
 
     def __str__(self) -> str:
-        return summary.text(self.describe())
+        return model_description.text(self.describe())
 
     def manifest(self) -> dict[str, Any]:
         """What the model file says beside its arrays."""
@@ -175,7 +177,7 @@ class Model:
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the model file: whole, or not at all."""
-        modelfile.write(path, self.manifest(), [one.arrays() for one in self.passes])
+        model_file.write(path, self.manifest(), [one.arrays() for one in self.passes])
 
     def predict(
         self,
@@ -375,7 +377,7 @@ class Model:
             lonely = f"; {100 * few / count:.3g} % have fewer than three neighbors" if few else ""
             report.warnings.append(
                 f"the cloud has {found:.3g} points/m2, the model was trained on "
-                f"{summary.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
+                f"{model_description.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
             )
 
 
@@ -443,16 +445,16 @@ def load_model(path: str | os.PathLike) -> Model:
         The file is missing, damaged, of a newer version, not what it says, or asks for what no model may ask for.
     """
     name = os.fspath(path)
-    file = modelfile.find(name)
+    file = model_file.find(name)
     try:
-        model = assemble(*modelfile.read(file, lambda name: algorithm(name).rules))
+        model = assemble(*model_file.read(file, lambda name: algorithm(name).rules))
         if asked := model.info.get("preparation"):
             model.info["preparation"] = preparation_module().check(asked)
         return model
     except ModelError as error:
-        others = [one for one in modelfile.shipped() if one != name]
+        others = [one for one in model_file.shipped() if one != name]
         near = "" if os.path.lexists(name) else suggest(name, others)
-        error.cure = f"{near}{error.cure or modelfile.CURE}"
+        error.cure = f"{near}{error.cure or model_file.CURE}"
         raise error.at(file) from error.__cause__
     except OptionError as error:  # a feature of another release, say
         raise ModelError(
@@ -462,7 +464,7 @@ def load_model(path: str | os.PathLike) -> Model:
 
 def loaded_model(path: str) -> Model:
     """The same, read once per process as long as the file stays the same."""
-    path = modelfile.find(path)
+    path = model_file.find(path)
     try:
         stat = os.stat(path)
     except (OSError, ValueError):  # the latter for a name that holds a null
@@ -475,7 +477,7 @@ def _loaded(path: str, *stamp: int) -> Model:
     return load_model(path)
 
 
-def assemble(manifest: dict[str, Any], arrays: modelfile.Arrays) -> Model:
+def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
     """The model that a file's manifest and arrays describe; what they say is checked against each other."""
     classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
     codes = [code for code, _ in classes]

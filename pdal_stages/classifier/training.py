@@ -13,17 +13,17 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..features.point_grid import check_xyz
-from .algorithms import (
+from .context_features import Context
+from .interface import (
     DEFAULT_DIMENSIONS,
     OPTIONAL_DIMENSIONS,
     preparation_module,
     required,
     trainer,
 )
-from .clouds import TrainingCloud, prepared, spooled
-from .context import Context
 from .model import Model
-from .trainoptions import TrainingOptions, feature_plan
+from .training_clouds import TrainingCloud, prepared, spooled
+from .training_options import TrainingOptions, feature_plan
 
 
 def train(

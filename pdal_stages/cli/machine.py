@@ -150,7 +150,7 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     """
     from ..base.asprs import NAMES, class_color
     from ..base.version import __version__
-    from ..classifier.modelfile import shipped
+    from ..classifier.model_file import shipped
     from ..stages.base import stage_types
 
     answer = {
@@ -247,9 +247,9 @@ def _warmup(options: argparse.Namespace) -> None:
     """Run the kernels of the demo, the default heights, training, classification and objects on a few points."""
     import numpy as np
 
-    from ..classifier.clouds import TrainingCloud
     from ..classifier.training import train
-    from ..classifier.trainoptions import TrainingOptions
+    from ..classifier.training_clouds import TrainingCloud
+    from ..classifier.training_options import TrainingOptions
     from ..objects.crowns import crown_cells
     from ..objects.roofs import roof_planes
     from ..structures.decks import find_decks

@@ -92,7 +92,7 @@ def add_commands(parser: Parser) -> None:
 def _models(options: argparse.Namespace) -> None:
     from ..base.asprs import class_name
     from ..classifier.model import load_model
-    from ..classifier.modelfile import shipped
+    from ..classifier.model_file import shipped
 
     for name, path in shipped().items():
         model = load_model(path)
@@ -185,9 +185,9 @@ def _compare_objects(options: argparse.Namespace) -> None:
 
 def _model(options: argparse.Namespace) -> None:
     from ..base.errors import OptionError
+    from ..classifier.calibration import sureness_of
     from ..classifier.model import load_model
-    from ..classifier.modelfile import find
-    from ..classifier.sureness import sureness_of
+    from ..classifier.model_file import find
 
     model = load_model(options.file)
     with contextlib.suppress(OptionError):  # it was never scored

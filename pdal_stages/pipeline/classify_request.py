@@ -11,7 +11,7 @@ from ..base.asprs import GROUND, OVERLAP
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.extra_bytes import extra_dimensions
 from ..classifier.model import loaded_model
-from ..classifier.modelfile import STANDARD
+from ..classifier.model_file import STANDARD
 from ..stages import preparation
 from ..stages.base import stage_from, stage_types
 from ..stages.points import SELECTED

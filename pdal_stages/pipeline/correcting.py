@@ -15,7 +15,7 @@ from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
 from ..base.grid import places_among
 from ..base.las import named_copc
-from ..classifier.algorithms import CHECKED
+from ..classifier.interface import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
 from .las_output import finish

@@ -12,7 +12,7 @@ from typing import Any
 from ..base.errors import PipelineError, StageError, optional_import, suggest
 from ..base.las import named_copc, named_las, refuse_pipe
 from ..base.octree_check import check_copc, check_ept
-from ..classifier.modelfile import find
+from ..classifier.model_file import find
 from ..stages.base import Stage
 from . import pdal as pdal_env
 from .read import Override, apply_overrides

@@ -21,7 +21,7 @@ from ..base.las import read_header
 from ..base.messages import counted, duration, one_line, print_messages
 from ..base.version import __version__
 from ..classifier.model import loaded_model
-from ..classifier.modelfile import STANDARD, find
+from ..classifier.model_file import STANDARD, find
 from ..objects.outlines import vector
 from ..reports.objectlayers import Layer, check_target, qml, write_layers
 from ..reports.page import render

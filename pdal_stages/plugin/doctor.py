@@ -17,7 +17,7 @@ from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..base.version import __version__
 from ..classifier.model import loaded_model
-from ..classifier.modelfile import STANDARD
+from ..classifier.model_file import STANDARD
 from ..pipeline import pdal as pdal_env
 from ..pipeline import runtime
 from . import building

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
 from ..base.report import Report
-from ..classifier import summary
-from ..classifier.algorithms import (
+from ..classifier import model_description
+from ..classifier.calibration import of_the_base
+from ..classifier.class_map import ClassMap
+from ..classifier.interface import (
     ALGORITHMS,
     CHECKED,
     DEFAULT_DIMENSIONS,
@@ -24,15 +26,13 @@ from ..classifier.algorithms import (
     required,
     trainer,
 )
-from ..classifier.classes import ClassMap
-from ..classifier.clouds import TrainingCloud
-from ..classifier.foresttraining import SHORT
 from ..classifier.model import Model, loaded_model
-from ..classifier.modelfile import digest_of, find
+from ..classifier.model_file import digest_of, find
 from ..classifier.recipes import RECIPES, describe_recipes, with_recipe
-from ..classifier.sureness import of_the_base
+from ..classifier.train_forest import SHORT
 from ..classifier.training import train
-from ..classifier.trainoptions import TrainingOptions
+from ..classifier.training_clouds import TrainingCloud
+from ..classifier.training_options import TrainingOptions
 from .base import Stage, files_read
 from .checked import SURE, CheckedChoice, CheckedPoints
 from .options import option
@@ -296,10 +296,10 @@ class ClassifierModel(Stage):
         crossed = model.info["accuracy"]["cross_validation"] or {}
         if "instead" in crossed:
             report.notes.append(
-                f"blocks are held out, not {summary.groups_word(self.groups)}: {crossed['instead']}"
+                f"blocks are held out, not {model_description.groups_word(self.groups)}: {crossed['instead']}"
             )
-        if summary.held_out(model.info):
-            report.figures["score"] = summary.score(model.info)
+        if model_description.held_out(model.info):
+            report.figures["score"] = model_description.score(model.info)
             report.notes.append(report.figures["score"])
 
     def choice(self, parts: Iterable[Mapping[str, Any]]) -> CheckedChoice:

@@ -14,9 +14,9 @@ from ..base.asprs import HIGH as HIGH_VEGETATION
 from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit
+from ..classifier.calibration import Limit, Sureness, said, sureness_of
 from ..classifier.model import UNCLASSIFIED, Model, loaded_model
-from ..classifier.modelfile import find
-from ..classifier.sureness import Limit, Sureness, said, sureness_of
+from ..classifier.model_file import find
 from .base import Stage, stage_type
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts

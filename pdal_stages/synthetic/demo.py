@@ -11,7 +11,7 @@ from typing import Any
 
 from ..base.errors import StageError
 from ..base.files import write_json
-from ..classifier.modelfile import STANDARD
+from ..classifier.model_file import STANDARD
 from ..stages.preparation import PREPARATION
 
 #: Classes of the town that the demo tells apart; small ones are left to the reader.

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
-from ..classifier.modelfile import shipped
+from ..classifier.model_file import shipped
 from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of
 from ..pipeline.read import Override
 from ..pipeline.references import MOVING

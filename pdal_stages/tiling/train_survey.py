@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs, work_folder
 from ..base.report import Report
-from ..classifier.clouds import TiledCloud, TrainingCloud
 from ..classifier.model import Model
-from ..classifier.summary import FILE_NUMBER
+from ..classifier.model_description import FILE_NUMBER
 from ..classifier.training import reach, train
-from ..classifier.trainoptions import TrainingOptions
+from ..classifier.training_clouds import TiledCloud, TrainingCloud
+from ..classifier.training_options import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden, reader_of, stage_files

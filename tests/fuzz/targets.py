@@ -28,8 +28,8 @@ from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.extra_bytes import extra_dimensions
-from pdal_stages.classifier import modelfile
-from pdal_stages.classifier.algorithms import algorithm
+from pdal_stages.classifier import model_file
+from pdal_stages.classifier.interface import algorithm
 from pdal_stages.classifier.model import assemble
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
@@ -268,7 +268,7 @@ def packed(members: dict[str, bytes], manifest: bytes | None = None) -> bytes:
                 if entry.get("file") in members:
                     entry["sha256"] = hashlib.sha256(members[entry["file"]]).hexdigest()
             manifest = json.dumps(head).encode()
-        members = {**members, modelfile.MANIFEST: manifest}
+        members = {**members, model_file.MANIFEST: manifest}
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():
@@ -285,20 +285,20 @@ def _model_file(data: bytes) -> bytes:
         return data[1:]
     members = dict(good_model())
     if data[0] == 1:
-        return packed(members | {modelfile.MANIFEST: data[1:]})
+        return packed(members | {model_file.MANIFEST: data[1:]})
     if data[0] == 2:
         return packed(members, data[1:])
-    names = sorted(name for name in members if name != modelfile.MANIFEST)
+    names = sorted(name for name in members if name != model_file.MANIFEST)
     name = names[(data[0] - 3) % len(names)]
     start = 10 + int.from_bytes(members[name][8:10], "little")
     values = bytearray(members[name][start:])
     values[: len(data) - 1] = data[1 : len(values) + 1]
     members[name] = members[name][:start] + bytes(values)
-    return packed(members, members[modelfile.MANIFEST])
+    return packed(members, members[model_file.MANIFEST])
 
 
 def _models() -> list[bytes]:
-    manifest = good_model()[modelfile.MANIFEST]
+    manifest = good_model()[model_file.MANIFEST]
     parts = [bytes([k]) + b"\0" * 8 for k in range(3, 12)]
     return [b"\0" + packed(good_model()), b"\1" + manifest, b"\2" + manifest, *parts]
 
@@ -306,7 +306,7 @@ def _models() -> list[bytes]:
 @target(_models)
 def model(data: bytes) -> str:
     """Read a model file and, where it is accepted, classify with it."""
-    manifest, arrays = modelfile.read(
+    manifest, arrays = model_file.read(
         put("fuzz.model", _model_file(data)), lambda name: algorithm(name).rules
     )
     made = assemble(manifest, arrays)
@@ -334,7 +334,7 @@ def _network_model() -> dict[str, bytes]:
     return members_of(folder() / "network.model")
 
 
-@target(lambda: [_network_model()[modelfile.MANIFEST]])
+@target(lambda: [_network_model()[model_file.MANIFEST]])
 def network(data: bytes) -> str:
     """The manifest of a model with a network; what is accepted classifies a small cloud."""
     made: Any = load_model(put("hostile.model", packed(_network_model(), data)))

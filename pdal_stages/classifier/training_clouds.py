@@ -24,9 +24,9 @@ from ..base.version import __version__
 from ..features.cell_means import density
 from ..features.point_grid import check_xyz
 from ..features.voxels import represent
-from .algorithms import known
-from .classes import MAX_LABEL, ClassMap
-from .trainoptions import TrainingOptions
+from .class_map import MAX_LABEL, ClassMap
+from .interface import known
+from .training_options import TrainingOptions
 
 #: A thinned copy is made where it would have less than this share of the points.
 WORTH = 0.75

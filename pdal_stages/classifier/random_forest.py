@@ -18,7 +18,7 @@ from ..base.errors import ModelError
 from ..base.jit import njit
 from ..base.progress import Progress
 from ..base.threads import map_blocks
-from .algorithms import ArrayRule
+from .interface import ArrayRule
 
 #: Levels below the root a tree may have.
 MAX_DEPTH = 10_000

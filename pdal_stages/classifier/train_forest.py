@@ -19,16 +19,16 @@ from ..features import FeaturePlan
 from ..features.engine import fit_clouds
 from ..features.registry import SHAPE_FEATURES
 from ..features.return_features import SOURCES
-from .algorithms import OPTIONAL_DIMENSIONS, PredictRequest, gather, required
-from .clouds import TrainingCloud, label_classes
-from .context import OWN, Context
-from .featureforest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
-from .forest import Forest, grow_forest
+from .auto_context import FoldForests, WeightedPass, sample_context
+from .calibration import Sureness
+from .context_features import OWN, Context
+from .feature_forest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
+from .interface import OPTIONAL_DIMENSIONS, PredictRequest, gather, required
 from .model import Model
-from .passes import FoldForests, WeightedPass, sample_context
+from .random_forest import Forest, grow_forest
 from .sampling import BLOCK, Folds, draw_samples, figures, split
-from .sureness import Sureness
-from .trainoptions import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
+from .training_clouds import TrainingCloud, label_classes
+from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25

@@ -18,9 +18,9 @@ from ..base.grid import begins_run
 from ..base.threads import map_blocks
 from ..features import FeaturePlan
 from ..features.point_grid import cell_numbers
-from .algorithms import InputPlan, PredictRequest
-from .context import Context, around, count_shares
-from .featureforest import CloudFeatures, FeatureForest, weighed
+from .context_features import Context, around, count_shares
+from .feature_forest import CloudFeatures, FeatureForest, weighed
+from .interface import InputPlan, PredictRequest
 
 #: Points of a band at most, but for a band of one strip.
 BAND = 75_000

@@ -43,10 +43,10 @@ _MAKERS = {
 #: Each kind by its word in manifests and options: its class, and what trains it, imported when asked for.
 ALGORITHMS = {
     "random_forest": (
-        "pdal_stages.classifier.featureforest:FeatureForest",
-        "pdal_stages.classifier.foresttraining",
+        "pdal_stages.classifier.feature_forest:FeatureForest",
+        "pdal_stages.classifier.train_forest",
     ),
-    "alsnet": ("pdal_stages.alsnet.algorithm:AlsNet", "pdal_stages.alsnet.training"),
+    "alsnet": ("pdal_stages.alsnet.classifier:AlsNet", "pdal_stages.alsnet.training"),
 }
 #: A forest on top of other passes, which only training on a base makes.
 REFINED = "refined_forest"

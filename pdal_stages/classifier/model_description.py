@@ -8,8 +8,8 @@ from typing import Any
 from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
 from ..features.neighborhoods import parse_neighborhoods
-from .algorithms import REFINED, Column
-from .sureness import Sureness
+from .calibration import Sureness
+from .interface import REFINED, Column
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError, StageError
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.algorithms import (
+from ..classifier.interface import (
     ArrayRule,
     Column,
     InputPlan,
@@ -21,10 +21,10 @@ from ..classifier.algorithms import (
     gather,
     with_returns,
 )
-from .circles import Circles, halo_m
+from .batches import Circles, halo_m
 from .configuration import Configuration, parse_configuration
-from .geometry import Pyramid, build, scramble
-from .weights import Folded, Weights, check
+from .network import Folded, Weights, check
+from .sampling_and_grouping import Pyramid, build, scramble
 
 #: A network whose batch would need more megabytes is not loaded; the published ones need a few thousand.
 MOST_MB = 32_768
@@ -158,7 +158,7 @@ class AlsNet:
         """Return what gives a batch's probabilities: NumPy, or PyTorch where a GPU is asked for."""
         if device == "cpu":
             return self.folded
-        from .network import applied_on, chosen_device
+        from .torch_network import applied_on, chosen_device
 
         if chosen_device(device) == "cpu":
             return self.folded

@@ -17,9 +17,9 @@ from ..base.settings import Settings, setting
 from ..base.threads import resolve_threads
 from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
-from .algorithms import ALGORITHMS, trainer
-from .classes import MAX_LABEL
-from .context import OWN, Context
+from .class_map import MAX_LABEL
+from .context_features import OWN, Context
+from .interface import ALGORITHMS, trainer
 from .recipes import with_recipe
 
 #: Most passes a model can have.

@@ -16,9 +16,9 @@ import numpy.typing as npt
 from ..base.errors import ModelError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.registry import BY_NAME
-from .algorithms import REFINED, ArrayRule, Column, PredictRequest, gather, with_returns
-from .context import OWN, Context
-from .forest import Forest
+from .context_features import OWN, Context
+from .interface import REFINED, ArrayRule, Column, PredictRequest, gather, with_returns
+from .random_forest import Forest
 
 #: As many labeled points of its rarest class count as much as the base.
 EVEN = 30

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from ..base.checks import strict_json
 from ..base.errors import ModelError, StageError
 from ..base.files import whole_files
-from .algorithms import ArrayRule
+from .interface import ArrayRule
 
 #: Arrays of each pass by their names.
 Arrays = list[dict[str, npt.NDArray[Any]]]
