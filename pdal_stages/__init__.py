@@ -14,7 +14,7 @@ from .base.version import __version__
 _WHERE = {
     "Accuracy": "accuracy",
     "Cells": "objects.cells",
-    "Filter": "pipeline.native",
+    "Filter": "pipeline.python_pdal",
     "Model": "classifier.model",
     "ObjectSettings": "objects.found",
     "FeatureTable": "features",
@@ -22,7 +22,7 @@ _WHERE = {
     "StageError": "base.errors",
     "TrainingCloud": "classifier.training_clouds",
     "TrainingOptions": "classifier.training_options",
-    "Writer": "pipeline.native",
+    "Writer": "pipeline.python_pdal",
     "compute_features": "features",
     "detached_noise": "terrain",
     "find_objects": "objects.find",
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from .objects.cells import Cells
     from .objects.find import find_objects
     from .objects.found import ObjectSettings
-    from .pipeline.native import Filter, Writer
+    from .pipeline.python_pdal import Filter, Writer
     from .pipeline.run import Pipeline, run_pipeline
     from .reports.accuracypage import write_accuracy_report
     from .reports.objectlayers import object_frames, object_layers

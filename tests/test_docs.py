@@ -19,7 +19,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import ModelError
 from pdal_stages.pipeline.expansion import expand
-from pdal_stages.pipeline.read import parse_pipeline
+from pdal_stages.pipeline.json_source import parse_pipeline
 from pdal_stages.stages.base import Stage, stage_types
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -23,7 +23,7 @@ from processes import ended
 
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.read import apply_overrides, parse_overrides
+from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.plugin import answers, building, declarations
 from pdal_stages.stages.base import stage_types
 

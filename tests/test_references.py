@@ -13,7 +13,7 @@ from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.units import Units, horizontal_part, units_of_wkt
 from pdal_stages.cli import main
-from pdal_stages.pipeline.references import reference_of_file
+from pdal_stages.pipeline.spatial_reference import reference_of_file
 from pdal_stages.stages.hag_minima import HagMinima
 from pdal_stages.synthetic import write_town
 

@@ -23,11 +23,11 @@ from .watcher import watched
 
 #: Modules and their commands. Only the module of the command is imported, or all for ``commands``.
 _COMMANDS = {
-    "tiles": ("classify",),
-    "files": ("objects", "review", "corrections"),
+    "classify": ("classify",),
+    "extras": ("objects", "review", "corrections"),
     "models": ("models", "train", "adapt", "accuracy", "model"),
     "pipelines": ("pipeline", "expand", "validate"),
-    "machine": ("drivers", "options", "doctor", "plugin", "demo", "warmup"),
+    "installation": ("drivers", "options", "doctor", "plugin", "demo", "warmup"),
 }
 OVERRIDES = "Stages take options as in PDAL: --stage.TAG.option=V, --filters.name.option=V"
 INPUTS = "Files, folders, patterns, tile indexes, EPT sources"
@@ -109,7 +109,7 @@ def _protected(arguments: Sequence[str]) -> list[str]:
 def parsed(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     """The command, its arguments, and options of stages among them; exits where usage is wrong."""
     # Imported here, so that a missing package is reported in one sentence.
-    from ..pipeline.read import parse_overrides
+    from ..pipeline.overrides import parse_overrides
 
     overrides, rest = parse_overrides(arguments)
     parser = Parser(

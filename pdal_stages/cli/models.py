@@ -10,7 +10,7 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs
 from ..base.messages import print_messages
-from . import INPUTS, Parser, takes_options, tiles
+from . import INPUTS, Parser, classify, takes_options
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
 _OF_TRAINING = (
@@ -40,7 +40,7 @@ def add_commands(parser: Parser) -> None:
     )
     takes("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
 
-    tiles.add_sizes(parser.commands["train"])
+    classify.add_sizes(parser.commands["train"])
     what = "Fit a model to a survey without labels"
     takes = parser.command("adapt", _adapt, what, logged=True)
     takes("inputs", nargs="+", metavar="input", help=INPUTS)
@@ -58,7 +58,7 @@ def add_commands(parser: Parser) -> None:
         metavar="SHARE",
         help="Least Reliability to learn from (0.7)",
     )
-    tiles.add_sizes(parser.commands["adapt"])
+    classify.add_sizes(parser.commands["adapt"])
 
     what = "Compare classes with a reference, points or objects"
     takes = parser.command("accuracy", _accuracy, what, overrides=True, logged=True)
@@ -113,11 +113,11 @@ def _train(options: argparse.Namespace) -> None:
         options.model,
         options.overrides,
         extra,
-        tiles.options_of(options),
+        classify.options_of(options),
         surveys,
         named=options.inputs,
     )
-    with tiles.interruptible():
+    with classify.interruptible():
         said = task.run()
     # Nothing is said of one written into a pipe or device
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""
@@ -131,8 +131,8 @@ def _adapt(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
     from ..tiling.self_training import adapt
 
-    how = tiles.options_of(options)
-    with tiles.interruptible():
+    how = classify.options_of(options)
+    with classify.interruptible():
         print_messages(*adapt(options.inputs, options.model, options.teacher, options.sure, how))
     if Path(options.model).is_file():
         print(load_model(options.model))

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs, write_json, write_whole
 from ..base.messages import print_messages
-from . import Parser, tiles
+from . import Parser, classify
 
 if TYPE_CHECKING:
-    from ..pipeline.read import PipelineSource
+    from ..pipeline.json_source import PipelineSource
     from ..pipeline.run import Pipeline
 
 #: Lines of PDAL's log that are shown without -v.
@@ -35,7 +35,7 @@ def add_commands(parser: Parser) -> None:
     takes("--nostream", action="store_true", help="Accepted as in PDAL; our stages never stream")
     levels = "PDAL's log: 1 warnings (default), 2 what it does, 3 everything"
     takes("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
-    tiles.add_arguments(parser.commands["pipeline"])
+    classify.add_arguments(parser.commands["pipeline"])
 
     help = "Print a pipeline as plain PDAL JSON, for stock 'pdal pipeline'"
     takes = parser.command("expand", _expand, help, overrides=True)
@@ -58,7 +58,7 @@ def _input(takes: Callable) -> None:
 def _source(options: argparse.Namespace) -> Path | PipelineSource:
     """A file's path, or what was read from standard input."""
     if options.stdin:
-        from ..pipeline.read import decode, parse_pipeline
+        from ..pipeline.json_source import decode, parse_pipeline
 
         raw = getattr(sys.stdin, "buffer", None)
         text = decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()
@@ -78,7 +78,7 @@ def _built(options: argparse.Namespace) -> Pipeline:
 
 
 def _pipeline(options: argparse.Namespace) -> int:
-    if tiles.wants_tiles(options):
+    if classify.wants_tiles(options):
         return _in_tiles(options)
     if options.validate:
         return _validate(options)
@@ -87,7 +87,7 @@ def _pipeline(options: argparse.Namespace) -> int:
     pipeline.check_outputs(*more, *([Output(metadata, "metadata", JSON)] if metadata else []))
     before = list(pipeline.expanded.warnings)
     print_messages(*before)
-    tiles.end_at_once(options)
+    classify.end_at_once(options)
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(options.verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
     lines = pipeline.log_lines
@@ -103,11 +103,11 @@ def _pipeline(options: argparse.Namespace) -> int:
 
 def _in_tiles(options: argparse.Namespace) -> int:
     from ..pipeline.run import Pipeline
-    from ..pipeline.stagefiles import writers_outputs
+    from ..pipeline.stage_files import writers_outputs
     from ..tiling.plan import make_plan
     from ..tiling.tiled_run import run_tiled
 
-    chosen, extra = tiles.options_of(options), tiles.extra_files(options)
+    chosen, extra = classify.options_of(options), classify.extra_files(options)
     pipeline = Pipeline(_source(options), options.overrides, whole=False)
     if options.validate:
         make_plan(pipeline, chosen.buffer)
@@ -118,9 +118,9 @@ def _in_tiles(options: argparse.Namespace) -> int:
     )  # '#' stands for names here, not for numbers
     named = [one for one in outputs if "#" not in one.path and Path(one.path).parent.is_dir()]
     check_outputs([*named, *extra], pipeline.inputs())
-    run, interrupted = tiles.ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
-    tiles.print_dry(run) if options.dry_run else tiles.print_run(run)
-    return tiles.end_run(options, run, "run it again with --resume" if interrupted else "")
+    run, interrupted = classify.ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
+    classify.print_dry(run) if options.dry_run else classify.print_run(run)
+    return classify.end_run(options, run, "run it again with --resume" if interrupted else "")
 
 
 def _expand(options: argparse.Namespace) -> None:

@@ -19,7 +19,7 @@ from ..stages.base import stage_from
 from ..stages.points import Points
 from .classify_request import ClassifyRequest
 from .inputs_outputs import in_folders, input_files, reader_of, stage_files
-from .read import Override, apply_overrides
+from .overrides import Override, apply_overrides
 from .run import Pipeline
 from .runtime import points_of_views
 

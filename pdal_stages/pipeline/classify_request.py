@@ -17,9 +17,9 @@ from ..stages.base import stage_from, stage_types
 from ..stages.points import SELECTED
 from .inputs_outputs import is_las, overridden, reader_of, writer_of
 from .las_output import extra_dims_option
-from .read import Override
+from .overrides import Override
 from .run import Pipeline
-from .stagefiles import LAS_WRITERS
+from .stage_files import LAS_WRITERS
 
 #: The stage whose ground bridge decks lead on to.
 _GROUND = preparation.GROUND_FILTER

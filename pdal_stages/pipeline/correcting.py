@@ -18,9 +18,9 @@ from ..base.las import named_copc
 from ..classifier.interface import CHECKED
 from ..objects.outlines import reading, vector
 from ..objects.overlay import Overlay, points_inside, polygons_of
+from .las_chunks import can_read_chunks, laspy_header, read_chunks
 from .las_output import finish
-from .parts import header_of, las_chunks, reads_in_parts
-from .references import reference_of_file
+from .spatial_reference import reference_of_file
 
 #: If more than this share of the points has no partner, the files hold different points.
 _MOST_LOST = 0.1
@@ -47,7 +47,7 @@ def write_corrections(
             cure="Give the corrected file as the second argument, or --area patches.gpkg",
         )
     for name in filter(None, (before, after)):
-        if not reads_in_parts(name):
+        if not can_read_chunks(name):
             raise StageError("corrections are read from LAS and LAZ files", found=name)
     if named_copc(output):
         raise OptionError(
@@ -103,9 +103,9 @@ def _read(path: str) -> Any:
     """A whole file as laspy holds it; a COPC file as plain LAZ."""
     import laspy
 
-    header = header_of(path)
+    header = laspy_header(path)
     out = laspy.LasData(header)
-    if points := [one.array for one in las_chunks(path)]:
+    if points := [one.array for one in read_chunks(path)]:
         joined = np.concatenate(points)
         out.points = laspy.ScaleAwarePointRecord(
             joined, header.point_format, header.scales, header.offsets

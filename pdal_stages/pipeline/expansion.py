@@ -21,10 +21,10 @@ from ..stages import preparation
 from ..stages.base import PDAL_OWN, Stage, stage_from, stage_type, stage_types
 from ..stages.points import MAKERS
 from . import pdal as pdal_env
+from .json_source import PipelineSource
 from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
-from .read import PipelineSource
 from .runtime import TRAMPOLINE, ExpandedStage, made, python_filter
-from .stagefiles import is_reader, reader_files
+from .stage_files import is_reader, reader_files
 
 #: Stages after which several views are what the user asked for.
 SPLITS = {

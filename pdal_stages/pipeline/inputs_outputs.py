@@ -15,8 +15,8 @@ from ..base.octree_check import check_copc, check_ept
 from ..classifier.model_file import find
 from ..stages.base import Stage
 from . import pdal as pdal_env
-from .read import Override, apply_overrides
-from .stagefiles import reader_files
+from .overrides import Override, apply_overrides
+from .stage_files import reader_files
 
 #: File name of the description of an EPT source.
 EPT = "ept.json"

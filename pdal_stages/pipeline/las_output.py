@@ -19,7 +19,7 @@ from ..base.las_repair import restore_texts
 from ..stages.base import stage_types
 from . import pdal as pdal_env
 from .runtime import ExpandedStage, python_filter
-from .stagefiles import is_reader, is_writer, reader_files, writes_las
+from .stage_files import is_reader, is_writer, reader_files, writes_las
 
 _AS_LAS_14 = '"minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)'
 

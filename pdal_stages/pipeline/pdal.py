@@ -25,7 +25,7 @@ from ..base.extra_bytes import overwritten
 from ..base.las import geotiff_code, read_header, source_id
 from ..base.las_check import DAMAGED, check_readable
 from ..base.las_repair import LARGEST_HEAD, corrected
-from .stagefiles import reader_files, readers_files, writers_outputs
+from .stage_files import reader_files, readers_files, writers_outputs
 
 INSTALL = (
     "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "

@@ -27,8 +27,8 @@ from ..reports.objectlayers import Layer, check_target, qml, write_layers
 from ..reports.page import render
 from ..stages.points import Points
 from .inputs_outputs import input_files
-from .parts import arrays_in_parts, reads_in_parts
-from .references import check_one_reference, reference_of_file
+from .las_chunks import can_read_chunks, read_columns
+from .spatial_reference import check_one_reference, reference_of_file
 from .workers import each_file
 
 #: Dimensions that are read where they are there.
@@ -177,7 +177,7 @@ def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
 
     Each part has ``xyz`` (n, 3) in meters, ``codes`` (n,), and those of the dimensions :data:`WANTED` that exist.
     """
-    for arrays, flags in arrays_in_parts(path, WANTED):
+    for arrays, flags in read_columns(path, WANTED):
         points = Points(arrays, wkt=wkt, legacy_flags=flags)
         codes = points.class_codes
         kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
@@ -189,7 +189,7 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
     """Points and square meters of the files, as their headers say."""
     points, area = 0, 0.0
     for path in files:
-        header = read_header(path) if reads_in_parts(path) else None
+        header = read_header(path) if can_read_chunks(path) else None
         if header is not None and header.count:
             west, south, east, north = header.box
             points += header.count

@@ -22,9 +22,10 @@ from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand, merge_filters
 from .inputs_outputs import check_octrees, locations, stage_files
-from .read import Override, PipelineSource, apply_overrides, read_pipeline
-from .references import check_readers
-from .stagefiles import (
+from .json_source import PipelineSource, read_pipeline
+from .overrides import Override, apply_overrides
+from .spatial_reference import check_readers
+from .stage_files import (
     is_reader,
     is_writer,
     named_files,
@@ -53,7 +54,7 @@ class Pipeline:
     source : str, Path, list, dict or PipelineSource
         A file name, JSON text, the stages themselves, or what :func:`parse_pipeline` made of text.
     overrides : iterable of Override, optional
-        Options set from outside (see :mod:`pdal_stages.pipeline.read`).
+        Options set from outside (see :mod:`pdal_stages.pipeline.json_source`).
     whole : bool
         False: only to be run in tiles.
 

@@ -21,8 +21,8 @@ from ..base.units import Units
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import ept_address, is_ept, is_las, locations
 from ..pipeline.las_output import replaced
-from ..pipeline.references import Reference, check_one_reference, reference_of
-from ..pipeline.stagefiles import LAS_READERS, named_files
+from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
+from ..pipeline.stage_files import LAS_READERS, named_files
 from .checkpoint import fingerprint
 from .options import Density, Extent, TilingOptions, block_bytes, settled
 from .plan import TilePlan, outputs_for

@@ -21,9 +21,9 @@ from ..objects.cells import Cells, refuse_unclassified
 from ..objects.find import find_objects
 from ..objects.found import Objects, ObjectSettings
 from ..pipeline.inputs_outputs import input_files, stage_files
-from ..pipeline.parts import arrays_in_parts, reads_in_parts
-from ..pipeline.read import Override
-from ..pipeline.references import check_one_reference, reference_of_file
+from ..pipeline.las_chunks import can_read_chunks, read_columns
+from ..pipeline.overrides import Override
+from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.objectlayers import write_objects
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 #: Stages whose options the commands accept for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
-#: Dimensions that are read of LAZ 1.4 (see :func:`las_chunks`).
+#: Dimensions that are read of LAZ 1.4 (see :func:`.las_chunks.read_chunks`).
 _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 #: Cells are not enlarged beyond this automatically: neighboring houses would merge.
 LARGEST = 4.0
@@ -41,7 +41,7 @@ LARGEST = 4.0
 
 def refuse_tiles(task: ClassifyTask) -> None:
     """Refuse, before any work, what ``classify --objects`` cannot do."""
-    if task.options.per == "tile" or not all(map(reads_in_parts, task.files)):
+    if task.options.per == "tile" or not all(map(can_read_chunks, task.files)):
         raise OptionError(
             "classify --objects needs an output for each LAS or LAZ input",
             cure="Classify first, then: pdal-stages objects OUTPUT town.gpkg",
@@ -133,7 +133,7 @@ def _cells_of(path: str, stage: ObjectsWriter, wkt: str) -> tuple[Cells, NDArray
     """The cells of a file, and its number of points by class code."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
-    for arrays, flags in arrays_in_parts(path, ("Reliability",), _ONLY):
+    for arrays, flags in read_columns(path, ("Reliability",), _ONLY):
         points = stage.points(arrays, wkt=wkt, legacy_flags=flags)
         seen += np.bincount(points.class_codes, minlength=256)
         cells = Cells.join([cells, stage.records(points)])

@@ -12,10 +12,10 @@ from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.model_file import shipped
 from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of
-from ..pipeline.read import Override
-from ..pipeline.references import MOVING
+from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
-from ..pipeline.stagefiles import writes_las
+from ..pipeline.spatial_reference import MOVING
+from ..pipeline.stage_files import writes_las
 from ..stages.base import Stage
 from ..stages.farreaching import Blocks, FarReaching
 from .tile_grid import Box, TileGrid

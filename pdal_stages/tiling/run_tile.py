@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
 from ..pipeline.las_output import REPLACED, check_writers
-from ..pipeline.references import NO_REFERENCE
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
+from ..pipeline.spatial_reference import NO_REFERENCE
 from ..stages.base import stage_types
 from ..stages.farreaching import FarReaching
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts

@@ -20,7 +20,7 @@ from ..classifier.model import load_model
 from ..classifier.model_file import digest_of, find
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las
-from ..pipeline.parts import las_chunks
+from ..pipeline.las_chunks import read_chunks
 from .classify import ClassifyTask
 from .options import TilingOptions
 from .train_survey import TrainTask
@@ -132,7 +132,7 @@ def sure_points(files: Sequence[str], sure: float, codes: Sequence[int]) -> dict
     """Of each class, the points of classified files whose ``Reliability`` is at least `sure`."""
     total = np.zeros(256, np.int64)
     for name in files:
-        for points in las_chunks(name):
+        for points in read_chunks(name):
             good = np.asarray(points["Reliability"]) >= sure
             total += np.bincount(np.asarray(points.classification)[good], minlength=256)
     return {code: int(total[code]) for code in codes}

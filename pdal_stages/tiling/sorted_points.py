@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..base.files import whole_files
 from ..base.grid import begins_run
-from ..pipeline.parts import header_of, las_chunks
+from ..pipeline.las_chunks import laspy_header, read_chunks
 from ..terrain.cells import refuse_scattered
 from .inputs import CloudIndex, IndexedSource, InputSource, digest_of, fetch_ept
 from .tile_grid import Box, TileGrid, check_number
@@ -66,14 +66,14 @@ def _copy_type(header: laspy.LasHeader) -> np.dtype:
 
 def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     """Read a file once, write its points into a sorted copy, and return their index (:class:`CloudIndex`)."""
-    header = header_of(path)
+    header = laspy_header(path)
     dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     found = [np.empty((0, 4), np.int64)]
     total = checksum = 0
     changed_ns, digest = os.stat(path).st_ctime_ns, digest_of(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
-        for points in las_chunks(path, most=_PART):
+        for points in read_chunks(path, most=_PART):
             records = points.array
             x, y = coordinates(records, header)
             low = np.minimum(low, (x.min(), y.min()))
@@ -135,7 +135,7 @@ def points_near(
     path: str, index: CloudIndex, grid: TileGrid, box: Box
 ) -> tuple[NDArray[np.int64], NDArray]:
     """Numbers, ascending, and records of the points of a file that lie in a box, edges included."""
-    header = header_of(path)
+    header = laspy_header(path)
     (i0, j0), (i1, j1) = (
         TileGrid(grid.size / _CELLS).index(np.array(corner)).tolist()
         for corner in (box[:2], box[2:])
@@ -198,7 +198,7 @@ def cut_all(
             path = os.path.join(folder, f"fetched{number}.las")
             if not fetch_ept(source, box, path):
                 continue
-            records = np.concatenate([points.array for points in las_chunks(path)])
+            records = np.concatenate([points.array for points in read_chunks(path)])
             numbers = np.arange(len(records))
         elif index is not None:
             numbers, records = points_near(path, index, grid, box)
@@ -206,7 +206,7 @@ def cut_all(
             continue
         if not len(records):
             continue
-        header = header_of(path)
+        header = laspy_header(path)
         x, y = coordinates(records, header)
         places = np.column_stack([grid.index(x), grid.index(y)])
         away = np.maximum(np.maximum(own[0] - x, x - own[2]), np.maximum(own[1] - y, y - own[3]))

@@ -19,8 +19,9 @@ from ..base.jit import kept_kernels
 from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
+from ..pipeline.json_source import PipelineSource
 from ..pipeline.las_output import files_with_flags_to_split
-from ..pipeline.read import Override, PipelineSource
+from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .checkpoint import Store, fingerprint

@@ -24,10 +24,10 @@ from ..classifier.training_options import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import is_ept, is_las, overridden, reader_of, stage_files
-from ..pipeline.read import Override
-from ..pipeline.references import check_readers
+from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views
+from ..pipeline.spatial_reference import check_readers
 from ..stages.base import stage_from
 from ..stages.checked import CheckedChoice, CheckedPoints
 from ..stages.classifiermodel import ClassifierModel

@@ -21,9 +21,9 @@ from ..base.files import whole_files
 from ..base.las_check import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.parts import header_of, las_chunks
+from ..pipeline.las_chunks import laspy_header, read_chunks
 from ..pipeline.runtime import Callbacks
-from ..pipeline.stagefiles import LAS_WRITERS
+from ..pipeline.stage_files import LAS_WRITERS
 from ..stages.points import class_counts
 from .checkpoint import load_arrays, written
 from .inputs import InputSource
@@ -330,8 +330,8 @@ def _in_parts(
         piece, part = (os.path.join(folder, name) for name in ("part.las", "out.las"))
         for start in range(0, points, MOST_AT_ONCE):
             end = min(points, start + MOST_AT_ONCE)
-            chunks = las_chunks(source.path, start, end, BLOCK)
-            write_records(piece, header_of(source.path), (points.array for points in chunks))
+            chunks = read_chunks(source.path, start, end, BLOCK)
+            write_records(piece, laspy_header(source.path), (points.array for points in chunks))
             new = read_results(results, source, points, start, end)
             reader = {**source.reader, "filename": piece}
             run_tail([reader], [new], tail, [part], scratch, [source.path])

@@ -33,7 +33,8 @@ from pdal_stages.classifier.interface import algorithm
 from pdal_stages.classifier.model import assemble
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
-from pdal_stages.pipeline.read import apply_overrides, decode, parse_overrides, parse_pipeline
+from pdal_stages.pipeline.json_source import decode, parse_pipeline
+from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
 from pdal_stages.tiling import inputs
 from pdal_stages.tiling import write_outputs as outputs
 from pdal_stages.tiling.checkpoint import Store

@@ -13,7 +13,7 @@ from robustness_kit import HAG, job
 from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
-from pdal_stages.pipeline.read import parse_pipeline
+from pdal_stages.pipeline.json_source import parse_pipeline
 
 STAGE = b'{"type": "filters.hag_minima"}'
 

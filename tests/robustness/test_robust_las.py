@@ -11,7 +11,7 @@ from robustness_kit import HAG, job, las, scene
 from test_robust_clouds import METERS
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.pipeline.references import reference_of, reference_of_file
+from pdal_stages.pipeline.spatial_reference import reference_of, reference_of_file
 
 pytestmark = pytest.mark.pdal
 

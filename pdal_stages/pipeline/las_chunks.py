@@ -19,17 +19,17 @@ PART = 1_000_000
 _LASPY = {"ReturnNumber": "return_number", "NumberOfReturns": "number_of_returns"}
 
 
-def reads_in_parts(path: str) -> bool:
+def can_read_chunks(path: str) -> bool:
     """Whether parts of a file can be read: LAS, LAZ and COPC files."""
     return named_las(path) and read_header(path) is not None
 
 
-def arrays_in_parts(
+def read_columns(
     path: str, wanted: Sequence[str], only: Sequence[str] = ()
 ) -> Iterator[tuple[dict[str, NDArray], bool]]:
     """Coordinates, classes, withheld flags and the `wanted` dimensions that exist; and whether classes hold flags.
 
-    LAS and LAZ files are read in parts (`only`: see :func:`las_chunks`), others at once by PDAL.
+    LAS and LAZ files are read in parts (`only`: see :func:`read_chunks`), others at once by PDAL.
     """
     named = {
         "X": "x",
@@ -38,20 +38,20 @@ def arrays_in_parts(
         "Classification": "classification",
         "Withheld": "withheld",
     }
-    if not reads_in_parts(path):
+    if not can_read_chunks(path):
         ran = pdal_env.execute([reader_of(path, "input")])
         for array in ran.arrays:
             names = [name for name in (*named, *wanted) if name in array.dtype.names]
             flags = pdal_env.flags_inside_classification(array.dtype.names, ran.metadata)
             yield {name: np.asarray(array[name]) for name in names}, flags
         return
-    for chunk in las_chunks(path, only=only):
+    for chunk in read_chunks(path, only=only):
         there = set(chunk.point_format.dimension_names)
         more = {name: known for name in wanted if (known := _LASPY.get(name, name)) in there}
         yield {name: np.asarray(chunk[known]) for name, known in (named | more).items()}, False
 
 
-def las_chunks(
+def read_chunks(
     path: str, start: int = 0, end: int | None = None, most: int = PART, only: Sequence[str] = ()
 ) -> Iterator[Any]:
     """The points of a LAS or LAZ file from one number to another, `most` at a time, as laspy reads them.
@@ -69,7 +69,7 @@ def las_chunks(
         more["decompression_selection"] = wanted
     at, what = start, "the input cannot be read"
     try:
-        with opened(path, **more) as reader:
+        with open_las(path, **more) as reader:
             end, what = (
                 int(reader.header.point_count) if end is None else end,
                 "the input is damaged",
@@ -92,7 +92,7 @@ def las_chunks(
         raise StageError("the input is cut short", where=path, found=f"{at:,} of {end:,} points")
 
 
-def opened(path: str, **more: Any) -> Any:
+def open_las(path: str, **more: Any) -> Any:
     """Open a LAS or LAZ file with laspy, corrected where PDAL reads a corrected copy of it.
 
     Points that were compressed one by one are not decompressed in parallel.
@@ -107,12 +107,12 @@ def opened(path: str, **more: Any) -> Any:
     return laspy.open(corrected(path) or path, **more)
 
 
-def header_of(path: str) -> Any:
+def laspy_header(path: str) -> Any:
     """The header of a file with its records, except those of COPC, which do not fit points in another order."""
     import laspy
 
     try:
-        with opened(path) as reader:
+        with open_las(path) as reader:
             header = reader.header
         header.point_format.dtype()  # of extra bytes that no array can hold
         if header.version.minor == 0:  # which laspy does not write, and PDAL writes as LAS 1.2

@@ -12,7 +12,7 @@ from ..base.las import header_there, named_las, projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from . import pdal as pdal_env
 from .runtime import wkt_of
-from .stagefiles import reader_files
+from .stage_files import reader_files
 
 #: Stages that may bring points into one reference.
 MOVING = (
