@@ -25,8 +25,8 @@ from surveys import SURVEYS
 
 from pdal_stages import cli
 from pdal_stages.objects.overlay import points_inside
-from pdal_stages.pipeline.spatial_reference import reference_of_file
 from pdal_stages.pipeline.reviewing import review_files, review_layers
+from pdal_stages.pipeline.spatial_reference import reference_of_file
 from pdal_stages.reports.objectlayers import Layer, write_layers
 
 ROUNDS, PATCHES = 3, 5
