@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..base.grid import begins_run
+from ..base.grid import begins_run, cell_numbers
 from ..base.threads import map_blocks
 from ..features import FeaturePlan
-from ..features.point_grid import cell_numbers
 from .context_features import Context, around, count_shares
 from .feature_forest import CloudFeatures, FeatureForest, weighed
 from .interface import InputPlan, PredictRequest

@@ -18,11 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
-from ..base.grid import places_among
+from ..base.grid import compact_keys, places_among
 from ..base.threads import map_blocks
 from ..features.cell_means import WHOLE, cell_means
 from ..features.neighborhoods import SIDES
-from ..features.point_grid import cell_keys
 
 #: Word of a token, which the side of a cell in meters follows: axes of the cells (3 x 3 x 3 around the point's, or 3 x 3
 #: columns of any height), and whether it reads the share of votes for each class in place of mean probabilities.
@@ -141,7 +140,7 @@ def around(
     """
     if rows is None or not len(rows) or not context.scales:
         return rows
-    keys, offsets = cell_keys(xyz[:, :2], context.strip)
+    keys, offsets = compact_keys(xyz[:, :2], context.strip)
     wanted = np.unique(keys[rows])
     near = np.unique(np.add.outer(np.add.outer(wanted, offsets), np.array([-1, 0, 1])))
     found = np.flatnonzero(places_among(near, keys)[1])

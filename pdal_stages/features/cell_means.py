@@ -17,9 +17,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..base.grid import begins_run
+from ..base.grid import begins_run, compact_keys
 from ..base.jit import njit
-from .point_grid import cell_keys
 
 #: A share of 1.
 WHOLE = 65535
@@ -38,7 +37,7 @@ def cell_means(
     Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in meters. `shares` (n, columns)
     are in 65535ths; with `votes` the largest column of each point counts alone, as a whole.
     """
-    keys, offsets = cell_keys(coordinates, side)
+    keys, offsets = compact_keys(coordinates, side)
     order = np.argsort(keys)
     keys = keys[order]
     start = np.append(np.flatnonzero(begins_run(keys)), len(keys))
@@ -59,7 +58,7 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
     """
     if not len(xyz):
         return 0.0
-    keys, _ = cell_keys(xyz[:, :2], CELL)
+    keys, _ = compact_keys(xyz[:, :2], CELL)
     keys.sort()
     starts = np.flatnonzero(begins_run(keys))
     return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2

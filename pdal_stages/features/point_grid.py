@@ -17,20 +17,14 @@ are monotone in the coordinates: which points are gathered never depends on roun
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..base.errors import StageError
-from ..base.grid import begins_run
+from ..base.grid import begins_run, cell_numbers, compact_keys
 
 #: Coordinates beyond this many meters are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
-
-#: Points whose cells are numbered in one go: they stay in a core's cache.
-_TOGETHER = 1 << 16
-#: Axes from the slowest to the fastest.
-_ORDER = {2: (1, 0), 3: (1, 0, 2)}
 
 #: Values behind the last coordinate that kernels may read.
 SPARE = 8
@@ -133,61 +127,13 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
     return array if array.dtype == np.float64 else array.astype(np.float64)
 
 
-def cell_numbers(values: np.ndarray, cell: float) -> np.ndarray:
-    """``floor(values / cell)`` as int64; exact because `cell` is a power of two."""
-    return np.floor(values * (1.0 / cell)).astype(np.int64)
-
-
-def cell_keys(coordinates: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """A number for each point's cell, such that cells beside each other along the last axis follow each other.
-
-    And offsets (3 or 9,): added to a number, they give the middle cells of the rows of three around it.
-    """
-    axes, n = _ORDER[coordinates.shape[1]], len(coordinates)
-    spans = np.array(
-        [[coordinates[:, k].min(), coordinates[:, k].max()] if n else [0.0, 0.0] for k in axes]
-    )
-    first, last = cell_numbers(spans, side).T
-    # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
-    lengths = [int(length) + 2 for length in last - first]
-    numbers = None
-    if float(np.prod(np.array(lengths, float))) >= 2.0**62:
-        numbers = [_without_gaps(cell_numbers(coordinates[:, k], side)) for k in axes]
-        lengths = [int(number.max(initial=0)) + 2 for number in numbers]
-    keys = np.empty(n, np.int64)
-    for start in range(0, n, _TOGETHER):
-        part = slice(start, start + _TOGETHER)
-        key: Any = 0
-        for place, (k, length) in enumerate(zip(axes, lengths, strict=True)):
-            number = (
-                cell_numbers(coordinates[part, k], side) - first[place]
-                if numbers is None
-                else numbers[place][part]
-            )
-            key = key * length + number
-        keys[part] = key
-    steps = [1]
-    for length in lengths[1:]:
-        steps = [step * length for step in steps] + [1]
-    offsets = np.zeros(1, np.int64)
-    for step in steps[:-1]:
-        offsets = np.add.outer(offsets, np.array([-step, 0, step])).reshape(-1)
-    return keys, np.sort(offsets)
-
-
-def _without_gaps(number: np.ndarray) -> np.ndarray:
-    """Strays far apart: empty stretches become one empty cell."""
-    there, at = np.unique(number, return_inverse=True)
-    return np.concatenate(([0], np.cumsum(np.minimum(np.diff(there), 2))))[at]
-
-
 def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
     """Sort a checked (n, 3) float64 cloud into a :class:`CellGrid`.
 
     Memory while it runs: about 52 bytes a point; the result holds 28 (36 from 2^31 points on).
     """
     n = len(xyz)
-    key, _ = cell_keys(xyz[:, :2], cell)
+    key, _ = compact_keys(xyz[:, :2], cell)
     order = _sorted(xyz, key, cell)
     starts = np.flatnonzero(begins_run(key[order]))
     del key

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
+from ..base.grid import compact_keys
 from ..base.hashing import hash_of
 from ..base.jit import njit
-from .point_grid import cell_keys
 
 #: Smallest and largest side of voxels, meters.
 SMALLEST, LARGEST = 1e-4, 5.0
@@ -95,7 +95,7 @@ def _one_each(
     there: npt.NDArray[np.int64] | None,
 ) -> npt.NDArray[Any] | None:
     """(n,) the point that stands for each, its own row for those not there; None where no voxel holds two."""
-    keys, _ = cell_keys(xyz, side)
+    keys, _ = compact_keys(xyz, side)
     if there is None:
         order = np.argsort(keys)
     else:
