@@ -16,7 +16,7 @@ import laspy
 import numpy as np
 
 from pdal_stages.cli import main as command
-from pdal_stages.reports.views import CLASS_COLORS, paint, shading, surface, write_png
+from pdal_stages.reports.pictures import CLASS_COLORS, paint, shading, surface, write_png
 
 TARGET = Path(__file__).resolve().parent / "pictures" / "raw-and-classified.png"
 GAP = 24  # pixels between the halves

@@ -16,7 +16,7 @@ _WHERE = {
     "Cells": "objects.cells",
     "Filter": "pipeline.python_pdal",
     "Model": "classifier.model",
-    "ObjectSettings": "objects.found",
+    "ObjectSettings": "objects.results",
     "FeatureTable": "features",
     "Pipeline": "pipeline.run",
     "StageError": "base.errors",
@@ -25,20 +25,20 @@ _WHERE = {
     "Writer": "pipeline.python_pdal",
     "compute_features": "features",
     "detached_noise": "terrain",
-    "find_objects": "objects.find",
+    "find_objects": "objects.detect",
     "filtered_ground": "terrain",
     "hag_minima": "terrain",
     "load_model": "classifier.model",
     "make_town": "synthetic",
-    "object_frames": "reports.objectlayers",
-    "object_layers": "reports.objectlayers",
+    "object_frames": "reports.object_layers",
+    "object_layers": "reports.object_layers",
     "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline.run",
     "run_stage": "pipeline.runtime",
     "run_tiled": "tiling.tiled_run",
     "TilingOptions": "tiling.options",
     "train": "classifier.training",
-    "write_accuracy_report": "reports.accuracypage",
+    "write_accuracy_report": "reports.accuracy_page",
 }
 
 __all__ = [*_WHERE, "__version__"]
@@ -53,12 +53,12 @@ if TYPE_CHECKING:
     from .features import FeatureTable, compute_features
     from .features.neighborhoods import parse_neighborhoods
     from .objects.cells import Cells
-    from .objects.find import find_objects
-    from .objects.found import ObjectSettings
+    from .objects.detect import find_objects
+    from .objects.results import ObjectSettings
     from .pipeline.python_pdal import Filter, Writer
     from .pipeline.run import Pipeline, run_pipeline
-    from .reports.accuracypage import write_accuracy_report
-    from .reports.objectlayers import object_frames, object_layers
+    from .reports.accuracy_page import write_accuracy_report
+    from .reports.object_layers import object_frames, object_layers
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima
     from .tiling.options import TilingOptions

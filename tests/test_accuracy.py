@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sklearn import metrics
 
-from pdal_stages.accuracy.confidence import BINS, Grading
+from pdal_stages.accuracy.calibration import BINS, Grading
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.base.errors import StageError
 

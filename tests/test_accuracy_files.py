@@ -11,8 +11,8 @@ from test_training_scores import QUICK_WORDS, scene
 from pdal_stages.base.errors import StageError
 from pdal_stages.cli import main
 from pdal_stages.pipeline.accuracy_files import paired
-from pdal_stages.reports import accuracypage
-from pdal_stages.reports.accuracypage import Place, places
+from pdal_stages.reports import accuracy_page
+from pdal_stages.reports.accuracy_page import Place, places
 
 
 def place(name, x, n=50):
@@ -45,7 +45,7 @@ def test_each_file_has_its_line_and_each_place_its_map(tmp_path, write_las, capf
         str(figures),
     ]
     with monkeypatch.context() as patched:
-        patched.setattr(accuracypage, "write_whole", lambda *_: 1 / 0)
+        patched.setattr(accuracy_page, "write_whole", lambda *_: 1 / 0)
         assert main(["accuracy", *words]) == 1 and not figures.exists()  # both or none
     capfd.readouterr()
     assert main(["accuracy", *words]) == 0

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las import records_of
-from pdal_stages.pipeline.correcting import near_any, partners, write_corrections
+from pdal_stages.review.corrections import near_any, partners, write_corrections
 from pdal_stages.synthetic import write_town
 
 

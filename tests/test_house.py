@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent / "pdal_stages"
 FLOORS = (
     "base", "features terrain accuracy", "structures classifier", "alsnet objects", "reports", "stages", "pipeline",
-    "synthetic tiling plugin", "cli",
+    "synthetic tiling plugin review", "cli",
 )  # fmt: skip
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
 

@@ -14,8 +14,8 @@ from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.base.errors import StageError
 from pdal_stages.objects.cells import CLASSES, Kind, cell_keys, kind_of_code, object_id
 from pdal_stages.objects.crowns import crown_cells
+from pdal_stages.objects.raster_view import fill_gaps
 from pdal_stages.objects.roofs import connected
-from pdal_stages.objects.view import fill_gaps
 from pdal_stages.synthetic import TownOptions
 
 

@@ -12,8 +12,8 @@ from PIL import Image
 
 from pdal_stages.base.asprs import class_color
 from pdal_stages.base.errors import StageError
-from pdal_stages.reports import views
-from pdal_stages.reports.views import (
+from pdal_stages.reports import pictures
+from pdal_stages.reports.pictures import (
     BACKGROUND,
     CLASS_COLORS,
     RIGHT,
@@ -35,7 +35,7 @@ def has_color(image: np.ndarray, color) -> bool:
 @pytest.fixture()
 def even_light(monkeypatch):
     """No shading: colors come out as they are."""
-    monkeypatch.setattr(views, "shading", lambda s: np.ones(s.z.shape))
+    monkeypatch.setattr(pictures, "shading", lambda s: np.ones(s.z.shape))
 
 
 def top_view(x, y, z, classes, width):

@@ -34,7 +34,7 @@ from surveys import (
 from pdal_stages import TrainingCloud
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier.calibration import Sureness
-from pdal_stages.reports.views import png, triptych
+from pdal_stages.reports.pictures import png, triptych
 
 #: Points per square meter that the surveys are thinned to.
 THINNED = (1.0,)

@@ -21,7 +21,7 @@ from clouds import model_without, slug, true_classes
 from surveys import SURVEYS
 
 from pdal_stages import cli
-from pdal_stages.accuracy.expected import ReviewCells, find_patches, side_for
+from pdal_stages.review.expected_errors import ReviewCells, find_patches, side_for
 
 #: The part of the area that is looked at first.
 FIRST = 0.1

@@ -3,7 +3,7 @@
 from _common import halves, save, town
 
 import pdal_stages as ps
-from pdal_stages.reports.views import triptych
+from pdal_stages.reports.pictures import triptych
 
 points = town()
 west, east = halves(points)

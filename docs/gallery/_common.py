@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdal_stages.reports.views import CLASS_COLORS, paint, ramp, shading, surface, write_png
+from pdal_stages.reports.pictures import CLASS_COLORS, paint, ramp, shading, surface, write_png
 from pdal_stages.synthetic import Town, make_town
 
 #: Tests set a smaller town and another folder.

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from ..base.asprs import UNINFORMATIVE, class_name
 from ..base.errors import StageError
-from .confidence import Grading
+from .calibration import Grading
 from .labels import (
     CHUNK,
     Merge,

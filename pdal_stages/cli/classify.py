@@ -304,7 +304,7 @@ def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
     told = run.to_dict()
     for name in filter(None, [options.metadata, *options.report]):
         if name in options.report and Path(name).suffix.lower() != ".json":
-            from ..reports.runpage import run_page
+            from ..reports.run_page import run_page
 
             write_whole(name, run_page(told).encode(), "report")
         else:

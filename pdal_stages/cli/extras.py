@@ -85,7 +85,7 @@ def _objects(options: argparse.Namespace) -> None:
 
 
 def _review(options: argparse.Namespace) -> None:
-    from ..pipeline.reviewing import lines, write_review
+    from ..review.review_output import lines, write_review
 
     html = re.sub(r"\.\w+$", ".html", options.output) if options.html is None else options.html
     how = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
@@ -95,7 +95,7 @@ def _review(options: argparse.Namespace) -> None:
 
 
 def _corrections(options: argparse.Namespace) -> None:
-    from ..pipeline.correcting import write_corrections
+    from ..review.corrections import write_corrections
 
     told = write_corrections(
         options.before, options.out, options.after or "", options.area, options.around

@@ -17,7 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from .outlines import reading, vector
+from ..base.vector import reading, vector
 
 #: Buildings are told apart by area, m2, and trees by height, m.
 AREAS = (0.0, 25.0, 100.0, 500.0, np.inf)

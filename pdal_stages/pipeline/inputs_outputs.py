@@ -74,7 +74,7 @@ def _inside(folder: Path) -> list[str]:
 
 def locations(path: str, column: str = "location") -> list[str]:
     """The files a tile index names, made by ``pdal tindex create``; relative ones from its folder, then from here."""
-    from ..objects.outlines import reading
+    from ..base.vector import reading
 
     refuse_pipe(path)
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")

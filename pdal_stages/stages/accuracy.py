@@ -213,7 +213,7 @@ class AccuracyStage(Stage):
         accuracy: Accuracy,
         rule: Mapping[str, Any],
     ) -> None:
-        from ..reports.accuracypage import Place, places, write_accuracy_report
+        from ..reports.accuracy_page import Place, places, write_accuracy_report
 
         systems = ", ".join(
             dict.fromkeys(name_of_wkt(points.wkt) or "none given" for _, points in parts)

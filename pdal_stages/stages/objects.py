@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.errors import StageError
 from ..base.grid import places_among
+from ..objects.attributes import CHECK, REASONS
 from ..objects.cells import CLASSES, ENOUGH, Cells, Kind, kind_of_code, refuse_unclassified
-from ..objects.find import find_objects
-from ..objects.found import Objects, ObjectSettings
-from ..objects.measure import CHECK, REASONS
-from ..objects.view import MARGIN
+from ..objects.detect import find_objects
+from ..objects.raster_view import MARGIN
+from ..objects.results import Objects, ObjectSettings
 from .base import Stage
 from .options import code_option, ignore_option, option
 from .points import Points

@@ -5,8 +5,8 @@ from __future__ import annotations
 from numpy.typing import NDArray
 
 from ..base.files import Output
-from ..objects.find import find_objects
-from ..objects.outlines import with_vector
+from ..base.vector import with_vector
+from ..objects.detect import find_objects
 from .base import Stage
 from .objects import ObjectOptions
 from .options import option
@@ -39,13 +39,13 @@ class ObjectsWriter(ObjectOptions, Stage):
     widens = False
 
     def check(self) -> None:
-        from ..reports.objectlayers import check_target
+        from ..reports.object_layers import check_target
 
         super().check()
         with_vector(check_target, self.filename)
 
     def outputs(self) -> list[Output]:
-        from ..reports.objectlayers import target_files
+        from ..reports.object_layers import target_files
 
         return [Output(str(file), "objects") for file in target_files(self.filename)]
 
@@ -53,7 +53,7 @@ class ObjectsWriter(ObjectOptions, Stage):
         return ["Classification"]
 
     def run(self, points: Points) -> dict[str, NDArray]:
-        from ..reports.objectlayers import write_objects
+        from ..reports.object_layers import write_objects
 
         found, refused = find_objects(self.cells(points), self.settings).without(self.refuse)
         if self.refuse:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..objects.outlines import with_vector
-from ..objects.overlay import Overlay, inside_of
+from ..base.polygons import Overlay, inside_of
+from ..base.vector import with_vector
 from .base import ClassStage
 from .options import ignore_option, keep_option, option
 from .points import TOUCH_NONE, Points, class_counts

@@ -36,7 +36,7 @@ def run_demo(
     import numpy as np
 
     from ..pipeline.run import Pipeline
-    from ..reports.views import triptych, write_png
+    from ..reports.pictures import triptych, write_png
     from . import make_town, write_town
 
     folder = Path(folder)

@@ -18,14 +18,14 @@ from ..base.messages import print_messages
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
-from ..objects.find import find_objects
-from ..objects.found import Objects, ObjectSettings
+from ..objects.detect import find_objects
+from ..objects.results import Objects, ObjectSettings
 from ..pipeline.inputs_outputs import input_files, stage_files
 from ..pipeline.las_chunks import can_read_chunks, read_columns
 from ..pipeline.overrides import Override
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
-from ..reports.objectlayers import write_objects
+from ..reports.object_layers import write_objects
 from ..stages.objectswriter import STRAIGHT, ObjectsWriter
 
 if TYPE_CHECKING:

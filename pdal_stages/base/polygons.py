@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import OptionError, StageError
-from .outlines import reading, vector
+from .errors import OptionError, StageError
+from .vector import reading, vector
 
 #: Between a file and a layer of it, as QGIS writes them.
 _LAYER = "|layername="

@@ -16,11 +16,12 @@ from ..base.asprs import class_color
 from ..base.errors import DependencyError, StageError
 from ..base.files import check_writable, whole_files
 from ..base.units import Units, horizontal_part
+from ..base.vector import is_odd, vector
+from ..objects.attributes import CHECK
 from ..objects.cells import CLASSES, Cells, Kind, refuse_unclassified
-from ..objects.find import find_objects
-from ..objects.found import Objects, ObjectSettings, Table
-from ..objects.measure import CHECK
-from ..objects.outlines import crown_outlines, is_odd, raw_outlines, straight_outlines, vector
+from ..objects.detect import find_objects
+from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines
+from ..objects.results import Objects, ObjectSettings, Table
 
 #: Ending of a file's name -> GDAL's driver, and whether one file holds many layers.
 DRIVERS = {

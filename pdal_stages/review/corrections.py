@@ -15,12 +15,12 @@ from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
 from ..base.grid import places_among
 from ..base.las import named_copc
+from ..base.polygons import Overlay, points_inside, polygons_of
+from ..base.vector import reading, vector
 from ..classifier.interface import CHECKED
-from ..objects.outlines import reading, vector
-from ..objects.overlay import Overlay, points_inside, polygons_of
-from .las_chunks import can_read_chunks, laspy_header, read_chunks
-from .las_output import finish
-from .spatial_reference import reference_of_file
+from ..pipeline.las_chunks import can_read_chunks, laspy_header, read_chunks
+from ..pipeline.las_output import finish
+from ..pipeline.spatial_reference import reference_of_file
 
 #: If more than this share of the points has no partner, the files hold different points.
 _MOST_LOST = 0.1

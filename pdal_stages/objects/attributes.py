@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from .cells import MM
-from .found import ObjectSettings
+from .results import ObjectSettings
 from .roofs import roof_planes
 
 SURE, CHECK = "sure", "check"

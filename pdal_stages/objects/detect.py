@@ -16,11 +16,11 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.progress import Progress
-from . import crowns, measure, roofs
+from . import attributes, crowns, roofs
+from .attributes import Body
 from .cells import Cells, Kind, cell_keys, object_id, unpack
-from .found import Objects, ObjectSettings, Table
-from .measure import Body
-from .view import AROUND, MARGIN, CellView, Window
+from .raster_view import AROUND, MARGIN, CellView, Window
+from .results import Objects, ObjectSettings, Table
 
 #: Meters more that are looked at first: most buildings that reach into a block end there, so few blocks are looked at twice.
 AHEAD = 64.0
@@ -125,7 +125,7 @@ def _surfaces(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
     beside = np.where(number < 0, none, number)
     beside = scipy.ndimage.minimum_filter(beside, 3, mode="constant", cval=none)
     theirs = np.where((number < 0) & (beside < none), beside, number)
-    measured = measure.building if kind == Kind.BUILDING else measure.deck
+    measured = attributes.building if kind == Kind.BUILDING else attributes.deck
     return _objects(view, number, theirs, z, core, kind, measured)
 
 
@@ -144,7 +144,7 @@ def _spans(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
     high = view.high(kind)
     joined, _ = scipy.ndimage.label(mask)
     number = _without_small(np.where(np.isnan(high), -1, joined - 1), 4)
-    return _objects(view, number, number, high, core, kind, measure.span)
+    return _objects(view, number, number, high, core, kind, attributes.span)
 
 
 def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
@@ -168,7 +168,7 @@ def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
         if not core.holds(tr, tc) or len(r) * size**2 < chosen.tree_area:
             continue
         body = near.body(kind, r, c, z)
-        record = measure.tree(body, tr, tc, chosen)
+        record = attributes.tree(body, tr, tc, chosen)
         if record["height"] >= chosen.tree_height:
             yield _One(
                 int(object_id(kind, tr, tc)), record, body, cell_keys(kind, body.row, body.column)

@@ -18,7 +18,7 @@ from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
 from .page import render
-from .views import IGNORED, RIGHT, WRONG, embedded, nice_step, paint, shading, surface, verdict
+from .pictures import IGNORED, RIGHT, WRONG, embedded, nice_step, paint, shading, surface, verdict
 
 #: Files within so many meters share a map; most places that are drawn.
 TOGETHER, DRAWN = 1000.0, 12

@@ -11,9 +11,9 @@ import scipy
 from numpy.typing import NDArray
 
 from . import crowns, roofs
+from .attributes import Body
 from .cells import GROUND_CELLS, MM, Cells, Kind, unpack
-from .found import ObjectSettings
-from .measure import Body
+from .results import ObjectSettings
 
 #: How far the ground is looked for, meters: half the width of the largest building.
 GROUND_REACH = 120.0
