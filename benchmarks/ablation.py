@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent / "surveys"))
 from clouds import mislabeled, published
 from surveys import GROUND, SURVEYS, VEGETATION
 
-from pdal_stages.terrain import filtered_ground, groundcells
+from pdal_stages.terrain import filtered_ground, smrf
 
 #: A cloud: its kind, (n, 3) coordinates in meters, (n,) 2 ground, 5 and 6 objects, 0 not scored.
 Cloud = tuple[str, np.ndarray, np.ndarray]
@@ -132,10 +132,10 @@ def option(**values: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def without(name: str, value: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the filter with another value of a name in `terrain.groundcells`."""
+    """Return the filter with another value of a name in `terrain.smrf`."""
 
     def found(xyz: np.ndarray) -> np.ndarray:
-        with changed(groundcells, name, value):
+        with changed(smrf, name, value):
             return filtered_ground(xyz)["Ground"] == 1
 
     return found

@@ -22,7 +22,7 @@ from pdal_stages.structures.decks import find_decks
 from pdal_stages.structures.towers import find_towers
 from pdal_stages.structures.wires import find_wires
 from pdal_stages.synthetic import make_town
-from pdal_stages.terrain.morphological import filtered_ground
+from pdal_stages.terrain.heights import filtered_ground
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bridge_scenes import SCENES, scan

@@ -100,8 +100,8 @@ def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
     ground = filtered_ground(xyz, threads=1)["Ground"] > 0
     whole = found(xyz, ground=ground)
     assert whole.sum() > 10_000
-    monkeypatch.setattr("pdal_stages.terrain.cells.LARGEST", 100)
-    monkeypatch.setattr("pdal_stages.terrain.cells.SIDE", 128)
+    monkeypatch.setattr("pdal_stages.terrain.pieces.LARGEST_RASTER", 100)
+    monkeypatch.setattr("pdal_stages.terrain.pieces.SQUARE_SIDE", 128)
     assert np.array_equal(found(xyz, ground=ground), whole)
 
 

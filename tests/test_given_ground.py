@@ -12,9 +12,9 @@ from pdal_stages.classifier.model import load_model
 from pdal_stages.cli import main
 from pdal_stages.pipeline.expansion import settle_upstream
 from pdal_stages.stages.base import stage_from
-from pdal_stages.terrain.givenground import reach_of_given
-from pdal_stages.terrain.groundcells import FilterOptions
-from pdal_stages.terrain.morphological import filtered_ground
+from pdal_stages.terrain.classified_ground import reach_of_given
+from pdal_stages.terrain.heights import filtered_ground
+from pdal_stages.terrain.smrf import FilterOptions
 
 DATA = Path(__file__).parent / "data"
 OPTIONS = FilterOptions(openings=(5, 17))

@@ -5,21 +5,21 @@ from __future__ import annotations
 import laspy
 import numpy as np
 import pytest
-from test_terrain_morphological import town
+from test_ground_filter import town
 
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.terrain import filtered_ground
-from pdal_stages.terrain.cells import SIDE as BLOCK_SIDE
 from pdal_stages.terrain.cells import lowest_of_cells
-from pdal_stages.terrain.groundblocks import (
+from pdal_stages.terrain.ground_blocks import (
+    BLOCK_SIDE,
     GroundCells,
     around_blocks,
     by_block,
     cells_of_block,
     reach_of_block,
 )
-from pdal_stages.terrain.groundcells import FilterOptions
+from pdal_stages.terrain.smrf import FilterOptions
 from pdal_stages.tiling import run_tile as tile
 from pdal_stages.tiling import tiled_run as run
 

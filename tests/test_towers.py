@@ -15,7 +15,7 @@ from pdal_stages.structures import towers
 from pdal_stages.structures import wires as lines
 from pdal_stages.structures.towers import find_towers
 from pdal_stages.structures.wires import find_wires
-from pdal_stages.terrain.morphological import filtered_ground
+from pdal_stages.terrain.heights import filtered_ground
 
 
 @functools.cache

@@ -16,7 +16,7 @@ import pdal_stages.synthetic
 from pdal_stages.stages.wires import Wires
 from pdal_stages.structures import wires
 from pdal_stages.structures.wires import find_wires
-from pdal_stages.terrain.morphological import filtered_ground
+from pdal_stages.terrain.heights import filtered_ground
 
 
 def edge(kind, density, seed=0):

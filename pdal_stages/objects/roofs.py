@@ -7,7 +7,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.jit import njit
-from ..terrain.cells import number_sets
+from ..terrain.components import number_sets
 
 #: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
 PLANE, NEAR = 0.12, 0.2

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
-from ..terrain.detached import REACH, detached_noise
+from ..terrain.noise import REACH, detached_noise
 from .base import ClassStage
 from .options import code_option, ignore_option, option
 from .points import Points, class_counts

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from ..base.asprs import GROUND
 from ..base.errors import NoTerrainError
-from ..terrain.cells import SIDE
-from ..terrain.givenground import reach_of_given
-from ..terrain.groundblocks import (
+from ..terrain.classified_ground import reach_of_given
+from ..terrain.ground_blocks import (
+    BLOCK_SIDE,
     GroundCells,
     around_blocks,
     by_block,
     cells_of_block,
     reach_of_block,
 )
-from ..terrain.groundcells import FilterOptions
-from ..terrain.morphological import filtered_ground
+from ..terrain.heights import filtered_ground
 from ..terrain.openings import opening_names
+from ..terrain.smrf import FilterOptions
 from .base import HEIGHTS_OUTSIDE
 from .farreaching import Blocks, FarReaching, inside_block
 from .options import ignore_option, option
@@ -137,7 +137,7 @@ class HagMorphological(FarReaching):
             return None
         cell = self.cell
         reach = (reach_of_block(self._filter) + 2) * cell
-        return Blocks(SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
+        return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
 
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """First, what blocks need of the points ``around`` them, and those (n, 3) inside each (:func:`inside_block`)."""

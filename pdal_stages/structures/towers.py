@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from ..terrain.cells import CellWindow, cell_numbers, keys_of, patches
+from ..terrain.cells import CellWindow, cell_numbers, keys_of
+from ..terrain.pieces import patches
 
 #: Side of the cells, meters.
 CELL_M = 1.0

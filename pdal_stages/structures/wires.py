@@ -18,14 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import device, njit
-from ..terrain.cells import (
-    CellWindow,
-    cell_numbers,
-    levels,
-    longest_sides,
-    number_sets,
-    patches,
-)
+from ..terrain.cells import CellWindow, cell_numbers, levels
+from ..terrain.components import longest_sides, number_sets
+from ..terrain.pieces import patches
 
 #: Side of the cells, meters.
 CELL_M = 1.0

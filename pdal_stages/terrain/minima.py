@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
 from ..base.errors import NoTerrainError, OptionError
-from .cells import cell_numbers, columns, keys_of, places_among, usable
+from ..base.grid import places_among
+from .cells import cell_numbers, columns, keys_of, usable
 
 
 class MinimaTerrain:

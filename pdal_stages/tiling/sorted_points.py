@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..base.files import whole_files
 from ..base.grid import begins_run
 from ..pipeline.las_chunks import laspy_header, read_chunks
-from ..terrain.cells import refuse_scattered
+from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, IndexedSource, InputSource, digest_of, fetch_ept
 from .tile_grid import Box, TileGrid, check_number
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import FAST, device, njit
-from .cells import HOLE, linked_cells
+from .cells import HOLE
+from .components import linked_cells
 from .openings import highest_around
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_detached_noise import slow_below, slow_linked
+from test_noise import slow_below, slow_linked
 
 from pdal_stages.terrain import filtered_ground
-from pdal_stages.terrain.belowground import pits, pits_reach
 from pdal_stages.terrain.cells import HOLE
+from pdal_stages.terrain.low_outliers import pits, pits_reach
 
 # ---- a slow reference -----------------------------------------------------------------------------------
 

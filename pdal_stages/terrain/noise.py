@@ -10,7 +10,7 @@ extremes, so that no order of points and no tile matters:
    lowest and its highest point.
 2. A suspect is high noise if it lies above all that is near, by a gap. The thinner the cloud, the wider the gap and the
    way looked: a tree, or a mast, may be a single point there. What hangs in line with others, as wires do, stays.
-3. A suspect is low noise if it lies below the ground (:mod:`.belowground`).
+3. A suspect is low noise if it lies below the ground (:mod:`.low_outliers`).
 """
 
 from __future__ import annotations
@@ -25,19 +25,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.asprs import NOISE
 from ..base.grid import begins_run
 from ..base.jit import device, njit
-from .belowground import RULES as LOW_RULES
-from .belowground import below_ground
-from .belowground import reach as below_reach
-from .cells import (
-    HIGHEST,
-    cell_numbers,
-    columns,
-    longest_sides,
-    number_sets,
-    patches,
-    sums_around,
-    usable,
-)
+from .cells import HIGHEST, cell_numbers, columns, sums_around, usable
+from .components import longest_sides, number_sets
+from .low_outliers import RULES as LOW_RULES
+from .low_outliers import below_ground
+from .low_outliers import reach as below_reach
+from .pieces import patches
 
 LOW, HIGH = NOISE
 #: Side of a voxel in meters.

@@ -13,11 +13,11 @@ from scipy import ndimage
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import cells, filtered_ground, groundcells
+from pdal_stages.terrain import filtered_ground, pieces, smrf
 from pdal_stages.terrain.cells import CellWindow
-from pdal_stages.terrain.groundcells import FilterOptions
 from pdal_stages.terrain.openings import objects_of, opening_radii
-from pdal_stages.terrain.planes import GroundRaster, planes_of_blocks
+from pdal_stages.terrain.smrf import FilterOptions
+from pdal_stages.terrain.surface import GroundRaster, planes_of_blocks
 
 SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
 
@@ -269,24 +269,24 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
     )
     mask = rng.random(n) < 0.95
     options = {"openings": (5, 120), "slope_too": True, "window": 40.0, "mask": mask}
-    shapes, real = [], groundcells.pits
+    shapes, real = [], smrf.pits
 
     def looked_at(raster, *others):
         shapes.append(raster.size)
         return real(raster, *others)
 
-    monkeypatch.setattr(groundcells, "pits", looked_at)
-    monkeypatch.setattr(cells, "_FEW", 1 << 40)
-    monkeypatch.setattr(cells, "LARGEST", 1 << 40)
+    monkeypatch.setattr(smrf, "pits", looked_at)
+    monkeypatch.setattr(pieces, "SMALL_RASTER", 1 << 40)
+    monkeypatch.setattr(pieces, "LARGEST_RASTER", 1 << 40)
     figures, again = {}, {}
     whole = filtered_ground(x, y, z, figures=figures, threads=1, **options)
     assert len(shapes) == 1
     for few, largest, side in ((0, 1 << 40, 1024), (0, 20_000, 256)):
         shapes.clear()
-        monkeypatch.setattr(cells, "_FEW", few)
-        monkeypatch.setattr(cells, "_EMPTY", 1)
-        monkeypatch.setattr(cells, "LARGEST", largest)
-        monkeypatch.setattr(cells, "SIDE", side)
+        monkeypatch.setattr(pieces, "SMALL_RASTER", few)
+        monkeypatch.setattr(pieces, "MAX_CELLS_PER_POINT", 1)
+        monkeypatch.setattr(pieces, "LARGEST_RASTER", largest)
+        monkeypatch.setattr(pieces, "SQUARE_SIDE", side)
         same(filtered_ground(x, y, z, figures=again, threads=2, **options), whole)
         assert again == figures
         if spacing == 250:

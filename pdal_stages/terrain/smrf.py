@@ -1,6 +1,6 @@
 """Which cells of a minimum grid are ground: of all the points there are, or of a block of cells and what lies around it.
 
-All of a progressive morphological filter that looks far away is done here, on a raster; see :mod:`.morphological`. In tiles
+All of a progressive morphological filter that looks far away is done here, on a raster; see :mod:`.heights`. In tiles
 it is done once for each block of a grid of blocks, out of the lowest points of cells, and tiles put the blocks together.
 """
 
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.errors import OptionError
 from ..base.jit import njit
-from .belowground import pits, pits_reach
 from .cells import HOLE, CellWindow, cell_numbers, lowest_points
+from .low_outliers import pits, pits_reach
 from .openings import objects_of, opening_radius
-from .planes import GroundRaster, from_parents, planes_of_blocks
-from .planes import reach as planes_reach
+from .surface import GroundRaster, from_parents, planes_of_blocks
+from .surface import reach as planes_reach
 
 #: Side in meters of the coarsest blocks of the surface from which points are told to be ground or not.
 NEAR = 16.0
@@ -36,7 +36,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """Of :func:`.morphological.filtered_ground`; lengths in meters. Wrong ones raise an :class:`OptionError`."""
+    """Of :func:`.heights.filtered_ground`; lengths in meters. Wrong ones raise an :class:`OptionError`."""
 
     cell: float = 1.0
     slope: float = 0.15
@@ -119,7 +119,7 @@ class FilterOptions:
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
 _PARTS = 2.0**20
-#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`.planes.GroundRaster.place`.
+#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`.surface.GroundRaster.place`.
 CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
@@ -228,7 +228,7 @@ def minimum_grid(
 
 @njit
 def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar):
-    """Find the cells (n,), numbered row by row, that lie near the surface through the ground (see :mod:`.planes`)."""
+    """Find the cells (n,), numbered row by row, that lie near the surface through the ground (see :mod:`.surface`)."""
     w = place.shape[1]
     out = np.zeros(len(cells), np.bool_)
     for k in range(len(cells)):

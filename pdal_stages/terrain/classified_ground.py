@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .belowground import pits_reach
-from .cells import HOLE, CellWindow, patches
-from .groundcells import (
+from .cells import HOLE, CellWindow
+from .low_outliers import pits_reach
+from .openings import openings_of
+from .pieces import patches
+from .smrf import (
     FAR,
     NEAR,
     CellMeans,
@@ -20,9 +22,8 @@ from .groundcells import (
     means_of,
     minimum_grid,
 )
-from .openings import openings_of
-from .planes import GroundRaster
-from .planes import reach as planes_reach
+from .surface import GroundRaster
+from .surface import reach as planes_reach
 
 
 def reach_of_given(options: FilterOptions) -> int:

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import HIGHEST, HOLE, SIDE, CellWindow, cell_numbers, keys_of, lowest_of_cells, runs
-from .groundcells import (
+from .cells import HIGHEST, HOLE, CellWindow, cell_numbers, keys_of, lowest_of_cells, runs
+from .smrf import (
     NEAR,
     CellMeans,
     FilterOptions,
@@ -19,8 +19,11 @@ from .groundcells import (
     ground_raster,
     means_of,
 )
-from .planes import GroundRaster, around, heights_above, surface
-from .planes import reach as planes_reach
+from .surface import GroundRaster, around, heights_above, surface
+from .surface import reach as planes_reach
+
+#: Side of a block in cells.
+BLOCK_SIDE = 1024
 
 
 def reach_of_block(options: FilterOptions) -> int:
@@ -34,7 +37,7 @@ def _beside(options: FilterOptions) -> int:
 
 
 class GroundCells(NamedTuple):
-    """Cells of a :class:`.planes.GroundRaster`, one by one: all with a height, an opening, or ground points."""
+    """Cells of a :class:`.surface.GroundRaster`, one by one: all with a height, an opening, or ground points."""
 
     cells: NDArray[np.void]  #: (n,) records, see `_record`
 
@@ -82,7 +85,7 @@ class GroundCells(NamedTuple):
 
 
 def _record(openings: int) -> np.dtype:
-    """Of a cell: as in a :class:`.planes.GroundRaster`; whether it holds ground points, and their mean place."""
+    """Of a cell: as in a :class:`.surface.GroundRaster`; whether it holds ground points, and their mean place."""
     return np.dtype(
         [
             *((name, np.int32) for name in ("column", "row")),
@@ -101,9 +104,9 @@ def by_block(
     use: NDArray[np.bool_],
     cell: float,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Those of points that may be ground (m, 3) by the block of `SIDE` cells that holds them; meters."""
+    """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them; meters."""
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
-    column, row = (cell_numbers(axis[mine], cell) // SIDE for axis in (x, y))
+    column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
     parts = runs(keys_of(column, row))
     return {
         (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[mine[p]] for axis in (x, y, z)])
@@ -130,13 +133,13 @@ def cells_of_block(
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
 ) -> GroundCells:
-    """The cells of a block, column and row of a grid of blocks of `SIDE` cells.
+    """The cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
 
     `outer` is (n, 4) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the block, and few more.
     `points` are all that may be ground in the block, in parts (n, 3).
     """
     x, y, z, top = np.ascontiguousarray(outer.T)
-    own = CellWindow(block[0] * SIDE, block[1] * SIDE, SIDE, SIDE)
+    own = CellWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     cell, openings = options.cell, options.opening_radii
     # Openings reach into cells without points.
     spill = max([*openings, 0]) + 2

@@ -6,9 +6,9 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 
 * the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile with its halo gets the
   bits of the whole cloud, and so does any order of the points;
-* holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.planes`);
+* holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.surface`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
-* low outliers are told from ground under a canopy (:mod:`.belowground`).
+* low outliers are told from ground under a canopy (:mod:`.low_outliers`).
 
 Parameters have SMRF's defaults. What lies beyond the cloud's end or in a hole is unknown, and no evidence for an object.
 Roofs wider than the window stay ground: a classifier tells them by heights above openings of other widths.
@@ -26,10 +26,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.threads import map_blocks
-from .cells import HIGHEST, CellWindow, columns, patches, usable
-from .givenground import given_pieces
-from .groundblocks import GroundCells
-from .groundcells import (
+from .cells import HIGHEST, CellWindow, columns, usable
+from .classified_ground import given_pieces
+from .ground_blocks import GroundCells
+from .openings import above_opening, opening_names
+from .pieces import patches
+from .smrf import (
     FAR,
     NEAR,
     CellMeans,
@@ -39,8 +41,7 @@ from .groundcells import (
     ground_raster,
     means_of,
 )
-from .openings import above_opening, opening_names
-from .planes import GroundRaster, around, heights_above, surface
+from .surface import GroundRaster, around, heights_above, surface
 
 #: Points handed to a thread at a time.
 _SPAN = 1 << 17
@@ -90,7 +91,7 @@ def filtered_ground(
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
         ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
     cells : GroundCells, optional
-        Cells whose ground was found before (:func:`.groundblocks.cells_of_block`), all within the `reach_of_cells` of
+        Cells whose ground was found before (:func:`.ground_blocks.cells_of_block`), all within the `reach_of_cells` of
         :class:`.FilterOptions` of the points, which then need no others around them.
     given : array_like of bool, shape (n,), optional
         Points that are the ground: nothing is filtered, they alone form the surface. They are ``Ground``, and so are

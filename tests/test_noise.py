@@ -17,11 +17,11 @@ from scipy.sparse.csgraph import connected_components
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.stages.detachednoise import DetachedNoise
-from pdal_stages.terrain import belowground, detached
-from pdal_stages.terrain.detached import detached_noise
+from pdal_stages.terrain import low_outliers, noise
+from pdal_stages.terrain.noise import detached_noise
 
-SIDE = detached.SIDE
-RULES = detached.RULES
+SIDE = noise.SIDE
+RULES = noise.RULES
 
 
 def scene(seed=0, side=90, density=6.0, origin=(0.0, 0.0, 0.0)):
@@ -126,7 +126,7 @@ def slow_plane(low, j, i, radius, blocks, inner=-1):
         if inner < k[0] ** 2 + k[1] ** 2 <= (blocks // 2) ** 2:
             cells[k] = min(cells.get(k, cell), cell, key=lambda c: c[0])
     n = len(cells)
-    if n < belowground.RULES.min_columns:
+    if n < low_outliers.RULES.min_columns:
         return None
     z, u, v = np.array(list(cells.values())).T
     lowest, weight = z.min(), np.ones(n)
@@ -148,7 +148,7 @@ def slow_plane(low, j, i, radius, blocks, inner=-1):
 def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
     """From the definition, one voxel at a time, with dictionaries and searches over everything."""
     at = np.floor(xyz * (1.0 / SIDE)).astype(int)[:, [1, 0, 2]]
-    block = detached.BLOCK
+    block = noise.BLOCK
     whole = block << RULES.scales
     low = (at[:, :2].min(axis=0) - 1) // whole * whole
     at[:, :2] -= low
@@ -220,10 +220,10 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         r = min(max(RULES.aside, int(np.ceil(RULES.spacings_aside * apart / SIDE))), RULES.far)
         while True:
             near = top[(square <= r * r) & np.isfinite(top)]
-            if len(near) >= belowground.RULES.min_columns or r == RULES.far:
+            if len(near) >= low_outliers.RULES.min_columns or r == RULES.far:
                 break
             r = min(2 * r, RULES.far)
-        if len(near) < belowground.RULES.min_columns or lowest[k] - near.max() < least:
+        if len(near) < low_outliers.RULES.min_columns or lowest[k] - near.max() < least:
             continue
         others = []
         for (b, a), (z, suspect) in hung.items():
@@ -256,11 +256,11 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
 
 def slow_below(low, base, side, depth=1.0):
     """Below which height low places are below the ground: by planes and company."""
-    near = belowground.RULES.near
+    near = low_outliers.RULES.near
     limit, supported = np.full(low.shape, -np.inf), slow_supported(base)
     for at in np.argwhere(np.isfinite(low)):
         plane = slow_plane(base, *at, near, 2 * near + 1)
-        lowest = plane[0] - depth - belowground.RULES.scatters * plane[3] if plane else -np.inf
+        lowest = plane[0] - depth - low_outliers.RULES.scatters * plane[3] if plane else -np.inf
         if low[tuple(at)] < lowest and not slow_company(
             base, supported, at, low[tuple(at)], plane, side
         ):
@@ -272,11 +272,11 @@ def slow_supported(base):
     out = np.zeros(base.shape, bool)
     for b, a in np.argwhere(np.isfinite(base)):
         square = base[max(b - 2, 0) : b + 3, max(a - 2, 0) : a + 3]
-        level = (np.abs(square - base[b, a]) <= belowground.RULES.level_m).sum()
+        level = (np.abs(square - base[b, a]) <= low_outliers.RULES.level_m).sum()
         out[b, a] = (
             level
-            > belowground.RULES.min_support
-            + belowground.RULES.min_support_share * np.isfinite(square).sum()
+            > low_outliers.RULES.min_support
+            + low_outliers.RULES.min_support_share * np.isfinite(square).sum()
         )
     return out
 
@@ -299,9 +299,9 @@ def slow_company(base, supported, at, z, plane, side):
     away = side * np.hypot(j - at[0], i - at[1])
     half = 0.5 * (plane[0] - z)
     below = plane[0] + plane[1] * (i - at[1]) + plane[2] * (j - at[0]) - base
-    most = np.minimum(half, belowground.RULES.level_m + belowground.RULES.max_rise * away)
-    deep = (base <= z + most) & (below >= half) & (away <= belowground.RULES.far_m)
-    return (deep & supported).sum() >= belowground.RULES.min_company
+    most = np.minimum(half, low_outliers.RULES.level_m + low_outliers.RULES.max_rise * away)
+    deep = (base <= z + most) & (below >= half) & (away <= low_outliers.RULES.far_m)
+    return (deep & supported).sum() >= low_outliers.RULES.min_company
 
 
 @pytest.mark.parametrize(("seed", "density"), [(0, 6.0), (1, 0.4), (3, 70.0)])
@@ -363,7 +363,7 @@ def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
     found = detached_noise(xyz)
     for x0, y0 in ((0, 0), (201.3, 177.7), (333, 40)):
         beyond = np.max([[x0, y0] - xyz[:, :2], xyz[:, :2] - [x0 + 60, y0 + 60]], axis=(0, 2))
-        inside, near = beyond < 0, beyond < detached.REACH
+        inside, near = beyond < 0, beyond < noise.REACH
         assert near.sum() < len(xyz)
         part = detached_noise(xyz[near])
         assert np.array_equal(part[inside[near]], found[inside])
@@ -372,10 +372,10 @@ def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
 def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
     xyz, _ = scene(6, 200, 2.0)
     found = detached_noise(xyz)
-    from pdal_stages.terrain import cells
+    from pdal_stages.terrain import pieces
 
-    monkeypatch.setattr(cells, "LARGEST", 1000)
-    monkeypatch.setattr(cells, "SIDE", 64)
+    monkeypatch.setattr(pieces, "LARGEST_RASTER", 1000)
+    monkeypatch.setattr(pieces, "SQUARE_SIDE", 64)
     assert np.array_equal(detached_noise(xyz), found)
 
 

@@ -1,0 +1,106 @@
+"""Connected components: sets of points, voxels and cells that pairs join, and how long they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.jit import device, njit
+from .cells import HOLE
+
+
+@device
+def root_of(parent, member):
+    """The member that stands for a set, in sets that are joined one by one; the way to it gets shorter for who asks next."""
+    while parent[member] != member:
+        parent[member] = parent[parent[member]]
+        member = parent[member]
+    return member
+
+
+@njit
+def number_sets(one, other, number):
+    """Number alike the members (n,) of each set that the pairs join, in the order of first members; how many sets there are.
+
+    By hand: scipy.sparse.csgraph takes 0.4 s to be imported.
+    """
+    parent = np.arange(len(number))
+    for k in range(len(one)):
+        a, b = root_of(parent, one[k]), root_of(parent, other[k])
+        parent[max(a, b)] = min(a, b)
+    count = 0
+    for i in range(len(number)):
+        root = root_of(parent, i)
+        number[i] = count if root == i else number[root]
+        count += root == i
+    return count
+
+
+@njit
+def _linked(padded, offsets, steps, reach, number):
+    """Number the measured cells of each linked set alike; returns how many sets there are."""
+    h, w = number.shape
+    parent = np.arange(h * w)
+    for j in range(h):
+        for i in range(w):
+            here, mine = padded[j, i + reach], root_of(parent, j * w + i)
+            if here == HOLE:
+                continue
+            for k in range(len(steps)):
+                b, a = j + offsets[k, 0], i + offsets[k, 1]
+                if (
+                    abs(padded[b, a + reach] - here) <= steps[k] and parent[b * w + a] != mine
+                ):  # nor a hole
+                    other = root_of(parent, b * w + a)
+                    mine, other = min(mine, other), max(mine, other)
+                    parent[other] = mine
+    count = 0
+    for j in range(h):
+        for i in range(w):
+            if padded[j, i + reach] != HOLE:
+                root = root_of(parent, j * w + i)  # the first of its set
+                if root == j * w + i:
+                    number[j, i] = count
+                    count += 1
+                else:
+                    number[j, i] = number[root // w, root % w]
+    return count
+
+
+def linked_cells(
+    raster: NDArray[np.float32],
+    reach: float,
+    step: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and their :func:`longest_sides`.
+
+    Cells at most `reach` away from each other are linked across a `step` of meters, by the distance in cells.
+    """
+    side = int(reach)
+    j, i = np.mgrid[: side + 1, -side : side + 1]
+    away = np.hypot(j, i)
+    after = ((j > 0) | (i > 0)) & (away <= reach)
+    number = np.full(raster.shape, -1)
+    # With holes beside and below, so that no step has to look where the raster ends.
+    padded = np.pad(raster, ((0, side), (side, side)), constant_values=HOLE)
+    offsets = np.column_stack([j[after], i[after]])
+    count = _linked(padded, offsets, step(away[after]).astype(np.float32), side, number)
+    rows, columns = np.nonzero(number >= 0)
+    sets = number[rows, columns]
+    return number, np.bincount(sets, minlength=count), longest_sides(sets, (rows, columns), count)
+
+
+def longest_sides(
+    label: NDArray[np.int64], places: Sequence[NDArray[np.int64]], count: int
+) -> NDArray[np.int64]:
+    """Of each of `count` sets of places, the difference of its last and first along each axis: the largest one."""
+    sides = np.zeros((len(places), count), np.int64)
+    for side, at in zip(sides, places, strict=True):
+        first, last = np.full((2, count), at[0] if len(at) else 0)
+        first[label] = last[label] = at
+        np.minimum.at(first, label, at)
+        np.maximum.at(last, label, at)
+        side[:] = last - first
+    return sides.max(axis=0)

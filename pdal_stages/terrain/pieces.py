@@ -1,0 +1,88 @@
+"""Cut points into pieces whose rasters are small wherever points lie: groups far apart, and squares with surroundings."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import StageError
+from ..base.grid import places_among
+from ..base.las_check import DAMAGED
+from .cells import CellWindow, keys_of, runs
+from .components import number_sets
+
+#: Cells of the largest raster that is made in one piece.
+LARGEST_RASTER = 2100 * 2100
+#: Side in cells of the squares that larger rasters are cut into.
+SQUARE_SIDE = 1024
+#: Rasters up to this size are never searched for empty land, in cells.
+SMALL_RASTER = 1 << 16
+#: Nor are larger ones with at most this many cells more per point.
+MAX_CELLS_PER_POINT = 32
+#: Blocks of the coarse grid that finds groups, per `link`.
+BLOCKS_PER_LINK = 4
+
+
+def patches(
+    column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int
+) -> Iterator[tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]]:
+    """Yield (points, own): the points of a piece and those round it that matter, and which of them are its own.
+
+    Every point is some piece's own. Points more than `reach` cells away, along either axis, do not matter; nor do
+    points that no chain of others connects with steps of at most `link` cells. One piece, all points, where the whole
+    is small enough.
+    """
+    window = CellWindow.round(column, row)
+    if window.width * window.height <= min(
+        LARGEST_RASTER, SMALL_RASTER + MAX_CELLS_PER_POINT * len(column)
+    ):
+        yield slice(None), slice(None)
+        return
+    groups = _groups(column, row, link)
+    refuse_scattered([len(group) for group in groups])
+    for group in groups:
+        c, r = column[group], row[group]
+        window = CellWindow.round(c, r)
+        if window.width * window.height <= LARGEST_RASTER:
+            yield group, slice(None)
+            continue
+        for own in runs(keys_of(c // SQUARE_SIDE, r // SQUARE_SIDE)):
+            inside = CellWindow.round(c[own], r[own]).grown(reach).holds(c, r)
+            near, mine = np.flatnonzero(inside), np.zeros(len(c), bool)
+            mine[own] = True
+            for part in _groups(c[near], r[near], link):
+                if mine[near[part]].any():
+                    yield group[near[part]], mine[near[part]]
+
+
+def refuse_scattered(counts: Collection[int]) -> None:
+    """Refuse points that are alone in most of their places: each would take milliseconds, and none tells anything.
+
+    `counts` are the points of each place.
+    """
+    alone = sum(n == 1 for n in counts)
+    if alone > 4000 and 2 * alone > len(counts):
+        raise StageError(
+            "thousands of points lie alone, far from any other",
+            found=f"{alone:,} of {sum(counts):,} points",
+            cure=f"Look whether the file's scale and unit are right: pdal info --summary FILE. {DAMAGED}",
+        )
+
+
+def _groups(
+    column: NDArray[np.int64], row: NDArray[np.int64], link: int
+) -> list[NDArray[np.int64]]:
+    """Points that belong together: all within `link` cells of each other, and few that are a little farther apart."""
+    side = -(-link // BLOCKS_PER_LINK)
+    rings = -(-link // side)
+    blocks, of = np.unique(keys_of(column // side, row // side), return_inverse=True)
+    pairs = []
+    for b in range(rings + 1):
+        for a in range(-rings if b else 1, rings + 1):
+            at, there = places_among(blocks, blocks + (b << 32) + a)
+            pairs.append([np.flatnonzero(there), at[there]])
+    label = np.empty(len(blocks), np.int64)
+    number_sets(*np.concatenate(pairs, axis=1), label)
+    return runs(label[of])
