@@ -9,7 +9,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pdal_stages.stages.base import Stage, stage_types
+from pdal_stages.stages.base import Stage
+from pdal_stages.stages.registry import stage_types
 
 FOLDER = Path(__file__).resolve().parent / "stages"
 #: What is written by hand of each stage: what it does, an example; the dimensions, where that needs files.

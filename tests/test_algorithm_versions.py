@@ -7,7 +7,7 @@ import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.stages.base import stage_type, stage_types
+from pdal_stages.stages.registry import stage_type, stage_types
 
 DATA = Path(__file__).parent / "data"
 #: type -> version -> clip and dimension -> (PARTS,) means over points.

@@ -11,7 +11,7 @@ from alsnet_scenes import TINY, model_of, random_net, scene
 import pdal_stages as ps
 from pdal_stages import load_model
 from pdal_stages.base.errors import DimensionError, OptionError
-from pdal_stages.stages.base import stage_type
+from pdal_stages.stages.registry import stage_type
 
 WRITER = "writers.classifiermodel"
 

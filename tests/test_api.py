@@ -12,7 +12,7 @@ from block_scene import ground_and_block
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
-from pdal_stages.stages.multiscalefeatures import MultiscaleFeatures
+from pdal_stages.stages.multiscale_features import MultiscaleFeatures
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -13,7 +13,7 @@ from block_scene import ground_and_block
 from processes import ended
 
 from pdal_stages.cli import _COMMANDS, main, parsed
-from pdal_stages.stages.base import stage_types
+from pdal_stages.stages.registry import stage_types
 
 pytestmark = pytest.mark.pdal
 

@@ -20,7 +20,8 @@ import pdal_stages as ps
 from pdal_stages.base.errors import ModelError
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.json_source import parse_pipeline
-from pdal_stages.stages.base import Stage, stage_types
+from pdal_stages.stages.base import Stage
+from pdal_stages.stages.registry import stage_types
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

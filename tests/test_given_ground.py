@@ -11,7 +11,7 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.classifier.model import load_model
 from pdal_stages.cli import main
 from pdal_stages.pipeline.expansion import settle_upstream
-from pdal_stages.stages.base import stage_from
+from pdal_stages.stages.registry import stage_from
 from pdal_stages.terrain.classified_ground import reach_of_given
 from pdal_stages.terrain.heights import filtered_ground
 from pdal_stages.terrain.smrf import FilterOptions

@@ -15,7 +15,7 @@ from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.model_file import STANDARD, find, shipped
 from pdal_stages.cli import main
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.stages.preparation import made_of_coordinates, preparation_of
+from pdal_stages.stages.preprocessing import made_of_coordinates, preparation_of
 
 
 def test_every_shipped_model_loads_says_its_preparation_and_is_small(tmp_path):
@@ -32,7 +32,7 @@ def test_every_shipped_model_loads_says_its_preparation_and_is_small(tmp_path):
 
 
 def _creates(stage):
-    from pdal_stages.stages.base import stage_type
+    from pdal_stages.stages.registry import stage_type
 
     return stage_type(stage["type"])({k: v for k, v in stage.items() if k != "type"}).creates()
 

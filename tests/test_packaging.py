@@ -84,9 +84,9 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
     target = tmp_path / "env"
     zipfile.ZipFile(wheel).extractall(target)
     code = (
-        "import pdal_stages, pdal_stages.plugin.building as building\n"
+        "import pdal_stages, pdal_stages.plugin.install as install\n"
         "from pdal_stages.classifier.model import loaded_model\n"
-        "print(pdal_stages.__file__, building.SOURCE, len(loaded_model('standard').classes))"
+        "print(pdal_stages.__file__, install.SOURCE, len(loaded_model('standard').classes))"
     )
     package, sources, classes = python(code, env={"PYTHONPATH": str(target)}, cwd=tmp_path).split()
     assert package.startswith(str(target)) and sources.startswith(str(target)) and int(classes) >= 2

@@ -24,8 +24,8 @@ from processes import ended
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
-from pdal_stages.plugin import answers, building, declarations
-from pdal_stages.stages.base import stage_types
+from pdal_stages.plugin import calls, declarations, install
+from pdal_stages.stages.registry import stage_types
 
 pytestmark = pytest.mark.pdal
 PIPELINES = sorted((Path(__file__).resolve().parent.parent / "pipelines").glob("*.json"))
@@ -35,7 +35,7 @@ PIPELINES = sorted((Path(__file__).resolve().parent.parent / "pipelines").glob("
 def plugin(tmp_path_factory):
     """The folder of the plugin."""
     folder = tmp_path_factory.mktemp("plugin") / "not" / "there"
-    building.install(folder)
+    install.install(folder)
     return folder
 
 
@@ -43,7 +43,7 @@ def plugin(tmp_path_factory):
 def environment(plugin):
     """A process's environment in which PDAL finds the plugin."""
     folders = [str(plugin), *os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep)]
-    folders.append(str(building.plugin_folder()))
+    folders.append(str(install.plugin_folder()))
     return {**os.environ, "PDAL_DRIVER_PATH": os.pathsep.join(filter(None, folders))}
 
 
@@ -376,7 +376,7 @@ def test_a_plugin_of_another_version():
         "step": "prepare",
     }
     module = {"pdalargs": asked}
-    assert answers.answer(module, {}, {})
+    assert calls.answer(module, {}, {})
     (leaf,) = module["out_metadata"]["children"]
     assert leaf["name"] == "pdal_stages_error" and "9.9" in leaf["value"]
     assert "plugin --install" in leaf["value"]
@@ -479,42 +479,42 @@ def test_ctrl_c_ends_pdal_at_once(environment, pdal_program, ready_town, tmp_pat
 
 
 def test_install_check_uninstall(tmp_path, plugin, monkeypatch):
-    good, bad = building.check(plugin)
+    good, bad = install.check(plugin)
     assert not bad and any("stages in" in line for line in good)
     with monkeypatch.context() as built:
         built.setenv("CXX", "no-such-compiler")
-        assert building.check(plugin)[1] == []  # none is needed any more
+        assert install.check(plugin)[1] == []  # none is needed any more
     folder = tmp_path / "p"
     folder.mkdir()
-    assert "not in" in building.check(folder)[1][0]
-    names = building.libraries()
+    assert "not in" in install.check(folder)[1][0]
+    names = install.libraries()
     for name in [*names[1:], "libpdal_plugin_filter_other.so"]:
         (folder / name).write_text("")
-    assert f"missing {names[0]}" in building.check(folder)[1][0]
+    assert f"missing {names[0]}" in install.check(folder)[1][0]
     monkeypatch.setenv("PDAL_DRIVER_PATH", f"{tmp_path}{os.pathsep}{folder}")
-    assert building.usual_folder() == folder
-    building.uninstall()
+    assert install.usual_folder() == folder
+    install.uninstall()
     assert [path.name for path in folder.iterdir()] == ["libpdal_plugin_filter_other.so"]
-    assert building.uninstall(folder) == []
+    assert install.uninstall(folder) == []
 
 
 def test_what_is_missing_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    _, bad = building.check(tmp_path)
+    _, bad = install.check(tmp_path)
     assert "no C++ compiler" in bad[0] and "apt-get install g++" in bad[0]
     with pytest.raises(ps.StageError, match=r"no C\+\+ compiler"):
-        building.install(tmp_path)
+        install.install(tmp_path)
     assert not list(tmp_path.iterdir())
     monkeypatch.delenv("CXX")
-    monkeypatch.setattr(building, "_PYTHON_FILTER", "libpdal_plugin_filter_none.so")
+    monkeypatch.setattr(install, "_PYTHON_FILTER", "libpdal_plugin_filter_none.so")
     with pytest.raises(ps.StageError, match=r"filters\.python is missing"):
-        building.plugin_folder()
+        install.plugin_folder()
 
 
 def test_code_that_does_not_compile_leaves_nothing(tmp_path, monkeypatch):
     source, target = tmp_path / "stage.cpp", tmp_path / "target"
     source.write_text("int broken("), target.mkdir()
-    monkeypatch.setattr(building, "SOURCE", source)
+    monkeypatch.setattr(install, "SOURCE", source)
     with pytest.raises(ps.StageError, match="does not compile"):
-        building.install(target)
+        install.install(target)
     assert not list(target.iterdir())

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.stages.base import stage_types
-from pdal_stages.stages.preparation import MAKES_GROUND, NEEDS_GROUND, PDAL_OPTIONS, check, same
+from pdal_stages.stages.preprocessing import MAKES_GROUND, NEEDS_GROUND, PDAL_OPTIONS, check, same
+from pdal_stages.stages.registry import stage_types
 
 HAG = {"type": "filters.hag_morphological"}
 #: Kinds of options that hold a path, or more than a model may say.

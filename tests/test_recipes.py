@@ -14,7 +14,7 @@ from pdal_stages.classifier.train_forest import limit_to_percentiles
 from pdal_stages.classifier.training_options import feature_plan
 from pdal_stages.cli import main
 from pdal_stages.features import FeaturePlan
-from pdal_stages.stages.base import stage_from
+from pdal_stages.stages.registry import stage_from
 
 #: What the texts say, by recipe: [B16 3.1, 3.2.1, 4.2], [W18 3.1, 3.2, 4.3], [H17 2.2, 2.3, 3.1], [WM19 4.1].
 TEXTS = {

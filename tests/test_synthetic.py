@@ -15,7 +15,7 @@ from processes import printed
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.model import load_model
-from pdal_stages.stages.base import stage_type, stage_types
+from pdal_stages.stages.registry import stage_type, stage_types
 from pdal_stages.synthetic import Town, make_town, write_town
 from pdal_stages.synthetic.demo import pipelines
 from pdal_stages.synthetic.solids import (

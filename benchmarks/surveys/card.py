@@ -18,7 +18,7 @@ from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS
 from sources import SOURCES
 from surveys import GROUPS, SURVEYS
 
-from pdal_stages.stages.preparation import PREPARATION, as_json
+from pdal_stages.stages.preprocessing import PREPARATION, as_json
 
 ROOT = Path(__file__).resolve().parents[2]
 MODEL = ROOT / "pdal_stages" / "models" / "standard.model"

@@ -11,7 +11,7 @@ import numpy as np
 from surveys import GROUND, SURVEYS, TESTS, VEGETATION, LabeledSurvey
 
 from pdal_stages.base.hashing import hash_of
-from pdal_stages.stages.preparation import PREPARATION
+from pdal_stages.stages.preprocessing import PREPARATION
 from pdal_stages.terrain import filtered_ground
 
 #: Meters from the middle of a survey beyond which a point is a mistake.

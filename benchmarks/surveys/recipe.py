@@ -13,7 +13,7 @@ from surveys import SURVEYS
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.base.hashing import hash_of
 from pdal_stages.features.voxels import represent
-from pdal_stages.stages.preparation import PREPARATION
+from pdal_stages.stages.preprocessing import PREPARATION
 
 #: Points per square meter of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)

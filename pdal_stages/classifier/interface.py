@@ -243,4 +243,4 @@ def gather(
 
 def preparation_module() -> Any:
     """The module that knows the stages which make dimensions; it stands above this room, and is imported when asked for."""
-    return pkgutil.resolve_name("pdal_stages.stages.preparation")
+    return pkgutil.resolve_name("pdal_stages.stages.preprocessing")

@@ -260,7 +260,7 @@ _CHOICES_WIDTH = 40
 
 def takes_options(takes: Callable, stage: str, *names: str) -> None:
     """Add flags for options of a stage, with their declared help and defaults."""
-    from ..stages.base import stage_type
+    from ..stages.registry import stage_type
 
     kinds = {"integer": int, "number": float}
     for option in stage_type(stage).all_options():

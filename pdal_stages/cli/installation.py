@@ -74,7 +74,7 @@ def add_commands(parser: Parser) -> None:
 
 def _drivers(options: argparse.Namespace) -> None:
     from ..pipeline.pdal import ask_program
-    from ..stages.base import stage_types
+    from ..stages.registry import stage_types
 
     ours = {name: stage.summary for name, stage in stage_types().items()}
     if options.showjson:
@@ -98,7 +98,7 @@ def _drivers(options: argparse.Namespace) -> None:
 def _options(options: argparse.Namespace) -> None:
     """The options of one of our stages or of PDAL's, in PDAL's form."""
     from ..pipeline.pdal import ask_program
-    from ..stages.base import stage_type, stage_types
+    from ..stages.registry import stage_type, stage_types
 
     name = options.stage
     if name not in stage_types():
@@ -151,7 +151,7 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     from ..base.asprs import NAMES, class_color
     from ..base.version import __version__
     from ..classifier.model_file import shipped
-    from ..stages.base import stage_types
+    from ..stages.registry import stage_types
 
     answer = {
         "format": _FORMAT,
@@ -222,17 +222,17 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _plugin(options: argparse.Namespace) -> int:
-    from ..plugin import building
+    from ..plugin import install
 
     if options.check:
-        good, bad = building.check(options.folder)
+        good, bad = install.check(options.folder)
         print("\n".join([*good, *(f"missing: {line}" for line in bad)]))
         return int(bool(bad))
     if options.uninstall:
-        gone = building.uninstall(options.folder)
+        gone = install.uninstall(options.folder)
         print("\n".join(f"removed {path}" for path in gone) or "there is no plugin of ours")
         return 0
-    files = building.install(options.folder)
+    files = install.install(options.folder)
     print(f"{len(files)} stages in {files[0].parent}; see them with: pdal --drivers")
     return 0
 

@@ -15,8 +15,8 @@ from ..base.files import check_outputs
 from ..base.progress import Progress
 from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
-from ..stages.base import stage_from
 from ..stages.points import Points
+from ..stages.registry import stage_from
 from .classify_request import ClassifyRequest
 from .inputs_outputs import in_folders, input_files, reader_of, stage_files
 from .overrides import Override, apply_overrides

@@ -12,9 +12,9 @@ from ..base.errors import ModelError, OptionError, suggest
 from ..base.extra_bytes import extra_dimensions
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
-from ..stages import preparation
-from ..stages.base import stage_from, stage_types
+from ..stages import preprocessing
 from ..stages.points import SELECTED
+from ..stages.registry import stage_from, stage_types
 from .inputs_outputs import is_las, overridden, reader_of, writer_of
 from .las_output import extra_dims_option
 from .overrides import Override
@@ -22,7 +22,7 @@ from .run import Pipeline
 from .stage_files import LAS_WRITERS
 
 #: The stage whose ground bridge decks lead on to.
-_GROUND = preparation.GROUND_FILTER
+_GROUND = preprocessing.GROUND_FILTER
 
 #: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
@@ -121,7 +121,7 @@ class ClassifyRequest:
     def _prepared(self) -> list[dict[str, Any]]:
         """The stages before the classifier, as the model says or its dimensions need."""
         needed = self.loaded.required_dimensions
-        stages = self.loaded.info.get("preparation") or preparation.preparation_of(needed)
+        stages = self.loaded.info.get("preparation") or preprocessing.preparation_of(needed)
         if not self.given_ground:
             return stages
         if not any(stage["type"] == _GROUND for stage in stages):
@@ -130,7 +130,7 @@ class ClassifyRequest:
                 found=f"{self.model}: {', '.join(stage['type'] for stage in stages) or 'no heights'}",
                 cure="Leave it out, or take another model",
             )
-        return preparation.with_given_ground(stages)
+        return preprocessing.with_given_ground(stages)
 
     @property
     def _ground_is_given(self) -> bool:
@@ -168,7 +168,7 @@ class ClassifyRequest:
         """The dimensions that the stages make, except classes: name -> PDAL type."""
         made: dict[str, str] = {}
         for stage in self.stages:
-            if stage["type"] in preparation.OF_PDAL:
+            if stage["type"] in preprocessing.OF_PDAL:
                 made["HeightAboveGround"] = "double"
             elif stage["type"] in stage_types():
                 made |= stage_from(overridden(stage, self.overrides)).creates()

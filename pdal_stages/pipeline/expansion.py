@@ -17,9 +17,10 @@ from typing import Any
 from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.extra_bytes import extra_dimensions
 from ..base.las import read_header
-from ..stages import preparation
-from ..stages.base import PDAL_OWN, Stage, stage_from, stage_type, stage_types
+from ..stages import preprocessing
+from ..stages.base import Stage
 from ..stages.points import MAKERS
+from ..stages.registry import PDAL_OWN, stage_from, stage_type, stage_types
 from . import pdal as pdal_env
 from .json_source import PipelineSource
 from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
@@ -167,14 +168,14 @@ def settle_upstream(
     wanted = set(stage.reads()) - {
         "Classification"
     }  # which noise is marked in, too: it is no preparation
-    makers = [preparation.entry(given) for given, creates in before if wanted & set(creates)]
+    makers = [preprocessing.entry(given) for given, creates in before if wanted & set(creates)]
     stage.makes_again = any(set(creates) & set(stage.creates()) for _, creates in before)
     return makers, stage.follows(makers)
 
 
 def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
     """The dimensions of a PDAL stage that ours may read."""
-    return {"HeightAboveGround": "double"} if stage.get("type") in preparation.OF_PDAL else {}
+    return {"HeightAboveGround": "double"} if stage.get("type") in preprocessing.OF_PDAL else {}
 
 
 def _follow_preparations(expanded: Expanded) -> None:

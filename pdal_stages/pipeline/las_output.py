@@ -16,7 +16,7 @@ from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.extra_bytes import MOST_ENTRIES, extra_dimensions, restore_titles
 from ..base.las import LasHeader, header_there, named_copc, named_las, supersede_copc
 from ..base.las_repair import restore_texts
-from ..stages.base import stage_types
+from ..stages.registry import stage_types
 from . import pdal as pdal_env
 from .runtime import ExpandedStage, python_filter
 from .stage_files import is_reader, is_writer, reader_files, writes_las

@@ -10,7 +10,8 @@ import logging
 from typing import Any
 
 from ..base.errors import StageError
-from ..stages.base import Stage, stage_type, stage_types
+from ..stages.base import Stage
+from ..stages.registry import stage_type, stage_types
 from . import pdal as pdal_env
 from . import runtime
 from .expansion import expand_stage

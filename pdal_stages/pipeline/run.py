@@ -17,7 +17,7 @@ from ..base.files import Output, check_outputs, whole_files
 from ..base.las import refuse_pipe
 from ..base.las_check import check_complete, check_readable
 from ..base.report import Report
-from ..stages.base import stage_types
+from ..stages.registry import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand, merge_filters

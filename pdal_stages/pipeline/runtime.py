@@ -24,9 +24,10 @@ import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
 from ..base.report import Report
-from ..stages.base import Stage, place, stage_from
+from ..stages.base import Stage
 from ..stages.points import Points
-from ..stages.preparation import NEEDS_GROUND
+from ..stages.preprocessing import NEEDS_GROUND
+from ..stages.registry import place, stage_from
 from . import pdal as pdal_env
 
 

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 
 from ..base.version import __version__
 from ..pipeline.expansion import SPLITS
-from ..stages.base import Stage, stage_types
+from ..stages.base import Stage
 from ..stages.options import Option
+from ..stages.registry import stage_types
 
 #: Kind of option -> its type for PDAL's parser; others are text, which Python parses.
 _KINDS = {

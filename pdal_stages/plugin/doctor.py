@@ -20,7 +20,7 @@ from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..pipeline import pdal as pdal_env
 from ..pipeline import runtime
-from . import building
+from . import install
 
 #: Extra -> the package that it installs, and its purpose.
 _EXTRAS = {
@@ -136,7 +136,7 @@ def _python_of(what: str, run: Callable[[list], object]) -> Finding:
 
 
 def _plugin() -> Iterator[Finding]:
-    good, bad = building.check()
+    good, bad = install.check()
     if bad:
         cure = "pdal-stages plugin --install; pdal-stages itself does not need it"
         what = "native stages (pdal pipeline knows our names)"

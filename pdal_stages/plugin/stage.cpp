@@ -79,7 +79,7 @@ using namespace pdal;
 const char *const SCRIPT = R"python(
 def stage(ins, outs):
     try:
-        from pdal_stages.plugin.answers import answer
+        from pdal_stages.plugin.calls import answer
     except BaseException as error:
         import sys
         global out_metadata

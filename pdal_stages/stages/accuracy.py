@@ -22,8 +22,8 @@ from ..base.messages import plain
 from ..base.report import Report
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
+from .apply_model import ApplyModel
 from .base import Stage, files_read
-from .modelclassifier import ModelClassifier
 from .options import option
 from .points import Points
 from .selection import Selection
@@ -86,9 +86,7 @@ class AccuracyStage(Stage):
         cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
         taken: dict[str, Any] = {"files": files_read(before)}
-        models = [
-            s["model"] for s in before if s.get("type") == ModelClassifier.type and "model" in s
-        ]
+        models = [s["model"] for s in before if s.get("type") == ApplyModel.type and "model" in s]
         if models and given.get("dimension", "Classification") == "Classification":
             taken["model"] = models[-1]
         return taken

@@ -1,13 +1,8 @@
-"""What a stage is: an object made once from checked options, which then answers every question about itself.
-
-And where each is found by its type name: its module is imported when it is asked for.
-"""
+"""Define what a stage is: an object made once from checked options, which then describes itself and runs."""
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
-from collections import UserDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -15,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import PipelineError, StageError, suggest
+from ..base.errors import StageError
 from ..base.files import Output, check_writable
 from ..base.units import named_unit
 from .options import Option, option, parse_options
@@ -249,49 +244,3 @@ class ClassStage(Stage):
 
     def creates(self) -> dict[str, str]:
         return {"Classification": "uint8_t"}
-
-
-class _Types(UserDict):
-    """Modules that hold the stages, by type name; the stage itself when it is asked for."""
-
-    def __getitem__(self, name: str) -> type[Stage]:
-        module = importlib.import_module(f"{__package__}.{self.data[name]}")
-        return next(v for v in vars(module).values() if getattr(v, "type", None) == name)
-
-
-_TYPES = _Types(
-    {f"filters.{name}": name for name in (
-        "accuracy", "bridges", "detachednoise", "hag_minima", "hag_morphological", "modelclassifier",
-        "multiscalefeatures", "objects", "polygons", "wires",
-    )} | {"writers.classifiermodel": "classifiermodel", "writers.objects": "objectswriter"}
-)  # fmt: skip
-
-
-def stage_types() -> Mapping[str, type[Stage]]:
-    """All stages, by type name, in alphabetical order."""
-    return _TYPES
-
-
-def stage_type(name: str) -> type[Stage]:
-    """The stage of a type name; an error names the nearest one."""
-    if name not in _TYPES:
-        raise PipelineError(
-            f"there is no stage '{name}' in pdal_stages",
-            cure=f"{suggest(name, _TYPES)}Stages: {', '.join(_TYPES)}",
-        )
-    return _TYPES[name]
-
-
-#: Options of every PDAL stage that are not the stage's own.
-PDAL_OWN = ("tag", "inputs", "user_data", "log")
-
-
-def place(type_name: str, tag: str | None) -> str:
-    """How errors name a stage: its type, and its tag where it has one."""
-    return f"{type_name} (tag '{tag}')" if tag else type_name
-
-
-def stage_from(given: Mapping[str, Any]) -> Stage:
-    """A stage of ours, from its object in a pipeline."""
-    own = {name: value for name, value in given.items() if name not in ("type", *PDAL_OWN)}
-    return stage_type(given["type"])(own, place(given["type"], given.get("tag")))

@@ -24,7 +24,7 @@ from ..terrain.heights import filtered_ground
 from ..terrain.openings import opening_names
 from ..terrain.smrf import FilterOptions
 from .base import HEIGHTS_OUTSIDE
-from .farreaching import Blocks, FarReaching, inside_block
+from .first_round import Blocks, FarReaching, inside_block
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection

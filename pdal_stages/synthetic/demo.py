@@ -12,7 +12,7 @@ from typing import Any
 from ..base.errors import StageError
 from ..base.files import write_json
 from ..classifier.model_file import STANDARD
-from ..stages.preparation import PREPARATION
+from ..stages.preprocessing import PREPARATION
 
 #: Classes of the town that the demo tells apart; small ones are left to the reader.
 CLASSES = {

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.grid import places_among
-from ..stages.base import stage_from
-from ..stages.farreaching import FarReaching, inside_block
+from ..stages.first_round import FarReaching, inside_block
+from ..stages.registry import stage_from
 from .checkpoint import load_arrays, save_arrays, written
 from .plan import RunContext, TilePlan
 from .sorted_points import Piece

@@ -26,7 +26,7 @@ from ..pipeline.overrides import Override
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.object_layers import write_objects
-from ..stages.objectswriter import STRAIGHT, ObjectsWriter
+from ..stages.write_objects import STRAIGHT, WriteObjects
 
 if TYPE_CHECKING:
     from .classify import ClassifyTask
@@ -49,7 +49,7 @@ def refuse_tiles(task: ClassifyTask) -> None:
 
 
 def objects_of_files(
-    names: Sequence[str], stage: ObjectsWriter, workers: int = 1, metadata: str | None = None
+    names: Sequence[str], stage: WriteObjects, workers: int = 1, metadata: str | None = None
 ) -> dict[str, Any]:
     """Find objects in classified files, write and summarize them; returns the files, and counts by kind."""
     inputs = input_files(names)
@@ -82,7 +82,7 @@ def objects_of_files(
     return {"files": files, **summary}
 
 
-def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> ObjectsWriter:
+def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> WriteObjects:
     """The stage with the options of the command: ``--writers.objects.NAME=``, or ``--filters.objects.NAME=``."""
     for one in overrides:
         if one.by_tag or one.selector not in OPTIONS_OF:
@@ -90,13 +90,13 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Obj
                 "objects takes only options of writers.objects and filters.objects", found=one.flag
             )
         given[one.option] = one.value
-    stage = ObjectsWriter({**given, "filename": output})
+    stage = WriteObjects({**given, "filename": output})
     stage.widens = "cell" not in given
     return stage
 
 
 def _find_in_files(
-    inputs: Sequence[str], stage: ObjectsWriter, workers: int
+    inputs: Sequence[str], stage: WriteObjects, workers: int
 ) -> tuple[Objects, Units, str]:
     """The objects of all files together; the units of the coordinates and their reference (WKT)."""
     units = (stage.horizontal_unit, stage.vertical_unit)
@@ -118,7 +118,7 @@ def _find_in_files(
     return found, references[inputs[0]].units, wkt
 
 
-def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: int) -> Cells:
+def _all_cells(inputs: Sequence[str], stage: WriteObjects, wkt: str, workers: int) -> Cells:
     """The cells of all files."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
@@ -129,7 +129,7 @@ def _all_cells(inputs: Sequence[str], stage: ObjectsWriter, wkt: str, workers: i
     return cells
 
 
-def _cells_of(path: str, stage: ObjectsWriter, wkt: str) -> tuple[Cells, NDArray[np.int64]]:
+def _cells_of(path: str, stage: WriteObjects, wkt: str) -> tuple[Cells, NDArray[np.int64]]:
     """The cells of a file, and its number of points by class code."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)

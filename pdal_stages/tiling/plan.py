@@ -17,7 +17,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import MOVING
 from ..pipeline.stage_files import writes_las
 from ..stages.base import Stage
-from ..stages.farreaching import Blocks, FarReaching
+from ..stages.first_round import Blocks, FarReaching
 from .tile_grid import Box, TileGrid
 
 #: Dimensions that follow a point through a tile's pipeline.

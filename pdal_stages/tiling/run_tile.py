@@ -18,9 +18,9 @@ from ..pipeline.las_output import REPLACED, check_writers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
-from ..stages.base import stage_types
-from ..stages.farreaching import FarReaching
+from ..stages.first_round import FarReaching
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
+from ..stages.registry import stage_types
 from .checkpoint import save_arrays, written
 from .first_round import Changed, FromBefore, from_before, stage_of
 from .inputs import IndexedSource

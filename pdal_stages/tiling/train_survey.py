@@ -28,11 +28,11 @@ from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views
 from ..pipeline.spatial_reference import check_readers
-from ..stages.base import stage_from
-from ..stages.checked import CheckedChoice, CheckedPoints
-from ..stages.classifiermodel import ClassifierModel
+from ..stages.checked_points import CheckedChoice, CheckedPoints
 from ..stages.points import Points
-from ..stages.preparation import preparation_of
+from ..stages.preprocessing import preparation_of
+from ..stages.registry import stage_from
+from ..stages.train_model import TrainModel
 from .checkpoint import load_arrays, save_arrays, written
 from .inputs import find_sources, read_extent
 from .options import TilingOptions, fits_whole
@@ -42,15 +42,15 @@ from .write_outputs import NewValues, PieceResults, of_own_points, read_with
 
 #: Memory of a point in training in one piece, with voxels and neighborhoods of samples.
 TRAIN_POINT = 400
-#: Arrays of points that a person checked, and of others that the base model is sure of: see :mod:`..stages.checked`.
+#: Arrays of points that a person checked, and of others that the base model is sure of: see :mod:`..stages.checked_points`.
 _WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
 
 
-def _training_stage(given: Mapping[str, Any]) -> ClassifierModel:
+def _training_stage(given: Mapping[str, Any]) -> TrainModel:
     """The stage that trains."""
-    return cast(ClassifierModel, stage_from(given))
+    return cast(TrainModel, stage_from(given))
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
@@ -113,7 +113,7 @@ class TrainTask:
         """The training stage as in a pipeline; several files are scored by file, unless specified otherwise."""
         files = list(self.files)
         writer = {
-            "type": ClassifierModel.type,
+            "type": TrainModel.type,
             "filename": self.model,
             "files": files,
             **self.given,
@@ -142,7 +142,7 @@ class TrainTask:
         return sum(read_extent(source).count for source in find_sources(readers_of(self.files)))
 
     @cached_property
-    def stage(self) -> ClassifierModel:
+    def stage(self) -> TrainModel:
         """The stage that trains."""
         return _training_stage(self._writer)
 
@@ -180,7 +180,7 @@ class TrainTask:
         said = [*told, *report.messages]  # once what the preparation says as well
         return [one for one in said if not any(one.endswith(f": {other}") for other in said)]
 
-    def _read(self, heights: Sequence[Mapping[str, Any]], stage: ClassifierModel) -> Points:
+    def _read(self, heights: Sequence[Mapping[str, Any]], stage: TrainModel) -> Points:
         """The points with heights, and with file numbers where these are the groups of the score."""
         readers = [reader_of(file, f"input{i}") for i, file in enumerate(self.files, 1)]
         told = check_readers(readers)

@@ -116,7 +116,7 @@ _HEIGHT = {Kind.BUILDING: "h_ridge", Kind.TREE: "height", Kind.SPAN: "h_low", Ki
 _EXTENT = {Kind.BUILDING: "area", Kind.TREE: "area", Kind.SPAN: "length", Kind.DECK: "area"}
 
 
-class ObjectsFilter(ObjectOptions, Stage):
+class GroupObjects(ObjectOptions, Stage):
     type = "filters.objects"
     summary = "Group classified points into buildings, trees, spans of wires and bridge decks"
     source = (

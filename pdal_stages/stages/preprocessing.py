@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, StageError
 from ..base.las import number_type
-from .base import stage_type, stage_types
 from .options import Option, split_list
+from .registry import stage_type, stage_types
 
 #: The stage that makes the dimensions a model is trained on by default.
 PREPARATION: tuple[dict[str, Any], ...] = (

@@ -34,10 +34,10 @@ from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
 from .base import Stage, files_read
-from .checked import SURE, CheckedChoice, CheckedPoints
+from .checked_points import SURE, CheckedChoice, CheckedPoints
 from .options import option
 from .points import Points
-from .preparation import check
+from .preprocessing import check
 from .selection import UNWANTED, Selection
 
 #: The trainer's own options.
@@ -56,7 +56,7 @@ def trained(name: str, /, **other: Any) -> Any:
     return option(**{"default": field.default, **field.metadata, **other})
 
 
-class ClassifierModel(Stage):
+class TrainModel(Stage):
     type = "writers.classifiermodel"
     summary = "Train a classifier on the labeled points that reach it, and write one model file"
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"

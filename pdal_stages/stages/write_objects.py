@@ -8,7 +8,7 @@ from ..base.files import Output
 from ..base.vector import with_vector
 from ..objects.detect import find_objects
 from .base import Stage
-from .objects import ObjectOptions
+from .group_objects import ObjectOptions
 from .options import option
 from .points import Points
 
@@ -16,7 +16,7 @@ from .points import Points
 STRAIGHT, CELLS = "straight", "cells"
 
 
-class ObjectsWriter(ObjectOptions, Stage):
+class WriteObjects(ObjectOptions, Stage):
     type = "writers.objects"
     summary = "Write buildings, trees, spans of wires and bridge decks to a vector file"
     instead_of_tiles = "Write the points first, then: pdal-stages objects FILES town.gpkg"

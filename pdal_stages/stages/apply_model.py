@@ -17,10 +17,11 @@ from ..base.units import doubt_vertical_unit
 from ..classifier.calibration import Limit, Sureness, said, sureness_of
 from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.model_file import find
-from .base import Stage, stage_type
+from .base import Stage
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
-from .preparation import OF_PDAL, as_json, same, with_given_ground
+from .preprocessing import OF_PDAL, as_json, same, with_given_ground
+from .registry import stage_type
 from .selection import Selection
 
 HEIGHT = "HeightAboveGround"
@@ -31,7 +32,7 @@ _TOLERANCE = 0.5
 _PARTS, _PARTS_OF_HEIGHT = 64, 32
 
 
-class ModelClassifier(Stage):
+class ApplyModel(Stage):
     type = "filters.modelclassifier"
     summary = "Apply a model file: compute what the model needs block by block, and write classes"
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from ..base.errors import DependencyError, StageError
 from ..pipeline import pdal as pdal_env
-from ..stages.base import stage_types
+from ..stages.registry import stage_types
 from . import declarations
 
 SOURCE = Path(__file__).with_name("stage.cpp")

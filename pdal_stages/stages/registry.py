@@ -1,0 +1,108 @@
+"""Find stages by type name: one module each in this folder, and those of other packages through an entry point.
+
+A module of this folder that defines a stage holds a line ``type = "filters.NAME"`` in the body of its class; no list
+names it anywhere else. Other packages declare the entry point ``pdal_stages.stages``: type name -> ``module:Class``.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import re
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import PipelineError, StageError, suggest
+from .base import Stage
+
+#: The group of entry points in which other packages declare their stages.
+ENTRY_POINTS = "pdal_stages.stages"
+#: Options of every PDAL stage, which PDAL handles itself.
+PDAL_OWN = ("tag", "inputs", "user_data", "log")
+_TYPE_LINE = re.compile(r'^    type = "((?:filters|writers)\.\w+)"$', re.MULTILINE)
+
+
+class _Registry(Mapping[str, type[Stage]]):
+    """Return stage classes by type name; a module is imported when its stage is asked for."""
+
+    @functools.cached_property
+    def _modules(self) -> dict[str, str]:
+        """Type name -> module of this folder. Read as text: importing all of them takes half a second."""
+        return {
+            name: path.stem
+            for path in sorted(Path(__file__).parent.glob("*.py"))
+            for name in _TYPE_LINE.findall(path.read_text(encoding="utf-8"))
+        }
+
+    @functools.cached_property
+    def _entry_points(self) -> dict[str, metadata.EntryPoint]:
+        """Type name -> entry point of another package; a stage of ours cannot be replaced."""
+        return {
+            one.name: one
+            for one in metadata.entry_points(group=ENTRY_POINTS)
+            if one.name not in self._modules
+        }
+
+    def __getitem__(self, name: str) -> type[Stage]:
+        if name in self._modules:
+            module = importlib.import_module(f"{__package__}.{self._modules[name]}")
+            return next(v for v in vars(module).values() if getattr(v, "type", None) == name)
+        return _load(self._entry_points[name])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._modules or name in self._entry_points
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted([*self._modules, *self._entry_points]))
+
+    def __len__(self) -> int:
+        return len(self._modules) + len(self._entry_points)
+
+
+_STAGES = _Registry()
+
+
+def _load(entry: metadata.EntryPoint) -> type[Stage]:
+    """Import the stage of another package."""
+    package = entry.dist.name if entry.dist else entry.value
+    try:
+        stage = entry.load()
+        fits = isinstance(stage, type) and issubclass(stage, Stage) and stage.type == entry.name
+        found = None if fits else f"{entry.value} is not a Stage of type '{entry.name}'"
+    except Exception as error:
+        found = f"{type(error).__name__}: {error}"
+    if found:
+        raise StageError(
+            f"the stage '{entry.name}' of the package {package} cannot be loaded",
+            found=found,
+            cure=f"Update or uninstall {package}",
+        )
+    return stage
+
+
+def stage_types() -> Mapping[str, type[Stage]]:
+    """Return all stages by type name, in alphabetical order."""
+    return _STAGES
+
+
+def stage_type(name: str) -> type[Stage]:
+    """Return the stage of a type name; an error names the nearest one."""
+    if name not in _STAGES:
+        raise PipelineError(
+            f"there is no stage '{name}' in pdal_stages",
+            cure=f"{suggest(name, _STAGES)}Stages: {', '.join(_STAGES)}",
+        )
+    return _STAGES[name]
+
+
+def place(type_name: str, tag: str | None) -> str:
+    """Return how errors name a stage: its type, and its tag where it has one."""
+    return f"{type_name} (tag '{tag}')" if tag else type_name
+
+
+def stage_from(given: Mapping[str, Any]) -> Stage:
+    """Make a stage of ours from its object in a pipeline."""
+    options = {name: value for name, value in given.items() if name not in ("type", *PDAL_OWN)}
+    return stage_type(given["type"])(options, place(given["type"], given.get("tag")))
