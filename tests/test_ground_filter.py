@@ -144,7 +144,8 @@ def test_planes_equal_the_slow_reference(slope):
     floor = (rng.normal(0, 5, (h, w)) + slope * np.arange(w)).astype(np.float32)
     raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
     raster[ground] = floor[ground]
-    planes = planes_of_blocks(GroundRaster(window, raster, place, ground, floor, {}), 3)
+    every = np.ones((h, w), bool)
+    planes = planes_of_blocks(GroundRaster(window, raster, place, ground, floor, {}), 3, every)
     places = [(j, i, (i + left, j + bottom)) for j in range(h) for i in range(w)]
     cells = {c: (place[j, i, :2], place[j, i, 2]) for j, i, c in places if ground[j, i]}
     known = {c: floor[j, i] for j, i, c in places if np.isfinite(raster[j, i])}

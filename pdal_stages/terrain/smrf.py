@@ -187,10 +187,10 @@ def ground_raster(
     ground = np.isfinite(raster) & ~objects
     made = GroundRaster(kept, raster, place, ground, floor, opened)
     for number in range(1, ROUNDS + 1):
-        blocks = planes_of_blocks(made, options.levels(NEAR))
         seen = np.zeros(raster.shape, bool)
         seen[wanted.grown((ROUNDS - number) * step).within(kept).on(kept)] = True
-        cells = np.flatnonzero(np.isfinite(raster) & ~ground & seen)
+        seen &= np.isfinite(raster) & ~ground
+        blocks, cells = planes_of_blocks(made, options.levels(NEAR), seen), np.flatnonzero(seen)
         near = _near(
             cells, place, *blocks, *kept[:2], options.cell, options.threshold, options.scalar
         )

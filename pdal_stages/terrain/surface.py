@@ -165,12 +165,27 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
 
 
 @njit
-def _coarsest(moments, size, planes):
-    """Lay level planes at the mean of the floor of 3 x 3 blocks."""
+def _mark_parents(needed, left, bottom, parents, parents_left, parents_bottom):
+    """Mark the blocks (h, w) of the next coarser level whose planes `from_parents` blends for needed ones."""
+    for j in range(needed.shape[0]):
+        for i in range(needed.shape[1]):
+            if needed[j, i]:
+                b = ((j + bottom + 1) >> 1) - 1 - parents_bottom
+                a = ((i + left + 1) >> 1) - 1 - parents_left
+                for row in range(max(b, 0), min(b + 2, parents.shape[0])):
+                    for column in range(max(a, 0), min(a + 2, parents.shape[1])):
+                        parents[row, column] = True
+
+
+@njit
+def _coarsest(moments, size, needed, planes):
+    """Lay level planes at the mean of the floor of 3 x 3 blocks, where they are needed."""
     h, w = moments.shape[:2]
     sums = np.empty(9)
     for j in range(h):
         for i in range(w):
+            if not needed[j, i]:
+                continue
             _sum_around(moments, j, i, size, sums)
             planes[j, i, 0] = sums[6] / sums[0] if sums[0] > 0.0 else np.nan
             planes[j, i, 1], planes[j, i, 2] = 0.0, 0.0
@@ -188,12 +203,14 @@ def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, pl
 
 
 @njit
-def _fit(moments, size, planes):
-    """Correct planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
+def _fit(moments, size, needed, planes):
+    """Correct the needed planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
     h, w = moments.shape[:2]
     sums = np.empty(9)
     for j in range(h):
         for i in range(w):
+            if not needed[j, i]:
+                continue
             _sum_around(moments, j, i, size, sums)
             n, x, y = sums[0], sums[1], sums[2]
             if n == 0.0:
@@ -216,13 +233,16 @@ def _fit(moments, size, planes):
             planes[j, i, 2] = along + gy
 
 
-def planes_of_blocks(raster: GroundRaster, levels: int) -> Planes:
-    """Fit planes of blocks of 2 x 2 cells through the ground of a raster; there are `levels` coarser levels, at least 1."""
-    h, w = raster.shape
+def planes_of_blocks(raster: GroundRaster, levels: int, needed: NDArray[np.bool_]) -> Planes:
+    """Fit planes of blocks of 2 x 2 cells through the ground of a raster.
+
+    There are `levels` coarser levels, at least 1. Only the planes that cells `needed` (h, w) blend have values: a thin cloud
+    costs what its points do, not what its area does.
+    """
     moments: list[np.ndarray] = []
-    spans = [raster.window[:2]]
+    spans, wanted = [raster.window[:2]], [needed]
     for level in range(1, levels + 1):
-        a, b = spans[-1]
+        (a, b), (h, w) = spans[-1], wanted[-1].shape
         low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
         h, w = ((b + h - 1) >> 1) + 2 - low_b, ((a + w - 1) >> 1) + 2 - low_a
         made = np.zeros((h, w, 9))
@@ -231,20 +251,21 @@ def planes_of_blocks(raster: GroundRaster, levels: int) -> Planes:
             _moments_of_cells(raster.ground, raster.place, heights, 1, a, b, made, low_a, low_b)
         else:
             _moments_of_blocks(moments[-1], 2.0 ** (level - 1), a, b, made, low_a, low_b)
+        wanted.append(np.zeros((h, w), bool))
+        _mark_parents(wanted[-2], a, b, wanted[-1], low_a, low_b)
         moments.append(made)
         spans.append((low_a, low_b))
     planes = np.empty((h, w, 3))
     made = np.zeros((h, w, 9))
     middle, measured = np.broadcast_to(0.0, (*raster.shape, 2)), raster.lowest != HOLE
     _moments_of_cells(measured, middle, raster.floor, levels, *spans[0], made, *spans[levels])
-    _coarsest(made, 2.0**levels, planes)
+    _coarsest(made, 2.0**levels, wanted[levels], planes)
     for level in range(levels, 0, -1):
         made = moments.pop()
         if level < levels:
             coarser, planes = planes, np.empty((*made.shape[:2], 3))
-            every = np.ones(made.shape[:2], bool)
-            _finer(coarser, *spans[level + 1], 2.0**level, *spans[level], every, planes)
-        _fit(made, 2.0**level, planes)
+            _finer(coarser, *spans[level + 1], 2.0**level, *spans[level], wanted[level], planes)
+        _fit(made, 2.0**level, wanted[level], planes)
     return Planes(planes, *spans[1])
 
 
@@ -260,7 +281,7 @@ def surface(
     none. They are put into `planes` where that is given: those at the same cells, made before.
     """
     ground, place = raster.ground, raster.place
-    blocks = planes_of_blocks(raster, levels)
+    blocks = planes_of_blocks(raster, levels, needed)
     if planes is None:
         planes = np.zeros((*ground.shape, 3))
     _finer(blocks.values, blocks.left, blocks.bottom, 1.0, *raster.window[:2], needed, planes)
