@@ -201,9 +201,9 @@ def _measured(
     is_ground = options.is_ground(use, height, gradient)
     if means is None:
         count = np.zeros(raster.shape, np.int64)
-        raster.place[:] = 0.0
-        add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, raster.place)
-        raster = raster._replace(ground=means_of(count, raster.place))
+        place = np.zeros(raster.place.shape)
+        add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, place)
+        raster = raster._replace(ground=means_of(count, place), place=place)
     else:
         raster = raster._replace(ground=means[0], place=means[1])
     surface(raster, options.levels(FAR), needed, planes)

@@ -256,5 +256,6 @@ def add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, place
 
 def means_of(count: NDArray[np.int64], place: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Make such sums means: from the cell's center, in cells, and its height; which cells (h, w) hold ground."""
-    place /= (_PARTS * np.maximum(count, 1))[..., None]
-    return count > 0
+    held = count > 0
+    place[held] /= (_PARTS * count[held])[:, None]
+    return held

@@ -139,18 +139,17 @@ def _sum_around(moments, j, i, size, sums):
 
 @njit
 def _moments_of_cells(held, place, height, level, left, bottom, out, out_left, out_bottom):
-    """Add up moments of the held cells of each block of a level, about its center."""
-    size = 1 << level
-    for j in range(held.shape[0]):
-        for i in range(held.shape[1]):
-            if held[j, i]:
-                x = place[j, i, 0] + ((i + left) & (size - 1)) - (0.5 * size - 0.5)
-                y = place[j, i, 1] + ((j + bottom) & (size - 1)) - (0.5 * size - 0.5)
-                z = np.float64(height[j, i])
-                block = out[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
-                values = (1.0, x, y, x * x, x * y, y * y, z, x * z, y * z)
-                for k in range(len(values)):
-                    block[k] += values[k]
+    """Add up moments of the held cells (n,), numbered row by row, of each block of a level, about its center."""
+    size, width = 1 << level, height.shape[1]
+    for cell in held:
+        j, i = cell // width, cell % width
+        x = place[j, i, 0] + ((i + left) & (size - 1)) - (0.5 * size - 0.5)
+        y = place[j, i, 1] + ((j + bottom) & (size - 1)) - (0.5 * size - 0.5)
+        z = np.float64(height[j, i])
+        block = out[((j + bottom) >> level) - out_bottom, ((i + left) >> level) - out_left]
+        values = (1.0, x, y, x * x, x * y, y * y, z, x * z, y * z)
+        for k in range(len(values)):
+            block[k] += values[k]
 
 
 @njit
@@ -247,8 +246,8 @@ def planes_of_blocks(raster: GroundRaster, levels: int, needed: NDArray[np.bool_
         h, w = ((b + h - 1) >> 1) + 2 - low_b, ((a + w - 1) >> 1) + 2 - low_a
         made = np.zeros((h, w, 9))
         if level == 1:
-            heights = raster.place[..., 2]
-            _moments_of_cells(raster.ground, raster.place, heights, 1, a, b, made, low_a, low_b)
+            held, heights = np.flatnonzero(raster.ground), raster.place[..., 2]
+            _moments_of_cells(held, raster.place, heights, 1, a, b, made, low_a, low_b)
         else:
             _moments_of_blocks(moments[-1], 2.0 ** (level - 1), a, b, made, low_a, low_b)
         wanted.append(np.zeros((h, w), bool))
@@ -257,7 +256,8 @@ def planes_of_blocks(raster: GroundRaster, levels: int, needed: NDArray[np.bool_
         spans.append((low_a, low_b))
     planes = np.empty((h, w, 3))
     made = np.zeros((h, w, 9))
-    middle, measured = np.broadcast_to(0.0, (*raster.shape, 2)), raster.lowest != HOLE
+    middle = np.broadcast_to(0.0, (*raster.shape, 2))
+    measured = np.flatnonzero(raster.lowest != HOLE)
     _moments_of_cells(measured, middle, raster.floor, levels, *spans[0], made, *spans[levels])
     _coarsest(made, 2.0**levels, wanted[levels], planes)
     for level in range(levels, 0, -1):
@@ -286,10 +286,9 @@ def surface(
         planes = np.zeros((*ground.shape, 3))
     _finer(blocks.values, blocks.left, blocks.bottom, 1.0, *raster.window[:2], needed, planes)
     # Those of ground cells hold their cell's ground.
-    np.copyto(planes[..., 0], place[..., 2], where=ground)
-    for axis in (0, 1):
-        rise = place[..., axis] * planes[..., axis + 1]
-        np.subtract(planes[..., 0], rise, out=planes[..., 0], where=ground)
+    j, i = np.nonzero(ground & needed)
+    rise = place[j, i, :2] * planes[j, i, 1:]
+    planes[j, i, 0] = place[j, i, 2] - rise[:, 0] - rise[:, 1]
     return planes
 
 
