@@ -17,8 +17,8 @@ import laspy
 import numpy as np
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.classifier.interface import preparation_module
 from pdal_stages.classifier.model import load_model
+from pdal_stages.classifier.registry import preprocessing
 
 #: File, what its labels become, codes that are dropped.
 SURVEYS = {
@@ -55,7 +55,7 @@ def scores(folder: Path, name: str, base, counts):
     table[list(becomes)] = list(becomes.values())
     label = table[np.asarray(las.classification)[there]]
     dimensions = dict(
-        preparation_module().made_of_coordinates(base.info["preparation"], xyz, None, None)
+        preprocessing().made_of_coordinates(base.info["preparation"], xyz, None, None)
     )
     dimensions["ReturnNumber"] = np.asarray(las.return_number)[there]
     dimensions["NumberOfReturns"] = np.asarray(las.number_of_returns)[there]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from . import alsnet, stages
 from .base.version import __version__
 
 _WHERE = {

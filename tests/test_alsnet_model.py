@@ -224,6 +224,15 @@ def test_hostile_weights_are_refused(weights, text, tmp_path):
         load_model(rewritten(tmp_path / "bad.model", weights))
 
 
+def test_a_network_is_no_second_pass(tmp_path):
+    net = net_with()
+    manifest = model_of(net).manifest()
+    manifest["passes"] *= 2
+    model_file.write(tmp_path / "two.model", manifest, [net.arrays()] * 2)
+    with pytest.raises(ModelError, match="must read context"):
+        load_model(tmp_path / "two.model")
+
+
 def shallow(**changes):
     return {**TINY.to_dict(), **changes}
 

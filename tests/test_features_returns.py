@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.interface import gather, optional, required, with_returns
+from pdal_stages.classifier.input_dimensions import (
+    add_return_features,
+    optional_dimensions,
+    required_dimensions,
+    take_dimensions,
+)
 from pdal_stages.features import FeaturePlan, return_features
 
 
@@ -67,13 +72,13 @@ def test_any_order_of_points_and_a_tile_with_its_halo_give_the_same_bits():
 def test_without_return_numbers_all_is_zero():
     xyz, _ = cloud(50)
     assert (
-        required(return_features.NAMES) == ()
-        and optional(return_features.NAMES) == return_features.SOURCES
+        required_dimensions(return_features.NAMES) == ()
+        and optional_dimensions(return_features.NAMES) == return_features.SOURCES
     )
     for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in return_features.SOURCES}):
-        fed = gather(
+        fed = take_dimensions(
             return_features.NAMES,
-            with_returns(return_features.NAMES, xyz, dimensions),
+            add_return_features(return_features.NAMES, xyz, dimensions),
             50,
             np.arange(0, 50, 7),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,27 @@ def test_house(path):
                 if one.name.startswith("_") and one.name != "__version__"
             ]
             assert room == own or not private, f"line {node.lineno}: {private} of {room}"
+
+
+@pytest.mark.parametrize(
+    "path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT))
+)
+def test_no_import_upward_by_name(path):
+    """No string names a module of the same floor or above, as ``pkgutil.resolve_name`` would take it."""
+    room = path.relative_to(ROOT).parts[0]
+    tree = ast.parse(path.read_text())
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, documented) and node.body and isinstance(node.body[0], ast.Expr)
+    }
+    for node in ast.walk(tree) if room in FLOOR else ():
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            for other in re.findall(r"\bpdal_stages\.(\w+)", node.value):
+                assert (
+                    id(node) in docstrings or other == room or FLOOR.get(other, -1) < FLOOR[room]
+                ), f"line {node.lineno}: {room} names {other}"
 
 
 def test_one_class_one_name():

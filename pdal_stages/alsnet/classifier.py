@@ -13,14 +13,8 @@ import numpy.typing as npt
 from ..base import checks
 from ..base.errors import ModelError, StageError
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.interface import (
-    ArrayRule,
-    Column,
-    InputPlan,
-    PredictRequest,
-    gather,
-    with_returns,
-)
+from ..classifier.input_dimensions import add_return_features, take_dimensions
+from ..classifier.interface import ArrayRule, Column, InputPlan, PredictRequest
 from .batches import Circles, halo_m
 from .configuration import Configuration, parse_configuration
 from .network import Folded, Weights, check
@@ -140,9 +134,9 @@ class AlsNet:
 
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
-        values = gather(
+        values = take_dimensions(
             self.inputs,
-            with_returns(self.inputs, request.xyz, request.dimensions, request.threads),
+            add_return_features(self.inputs, request.xyz, request.dimensions, request.threads),
             len(request.xyz),
         )
         figures = request.report.figures

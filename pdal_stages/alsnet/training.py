@@ -21,7 +21,7 @@ from ..base.hashing import hash_of
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.class_map import ClassMap
-from ..classifier.interface import gather, with_returns
+from ..classifier.input_dimensions import add_return_features, take_dimensions
 from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.training_clouds import TrainingCloud, label_classes
@@ -102,8 +102,8 @@ class _Session:
         self.n_classes = len(classes.codes)
         each: list[dict[str, npt.NDArray[Any]]] = []
         for cloud, xyz in zip(clouds, self.clouds, strict=True):
-            there = with_returns(names, xyz, cloud.dimensions, self.threads)
-            each.append(gather(names, there, len(xyz), where=cloud.name))
+            there = add_return_features(names, xyz, cloud.dimensions, self.threads)
+            each.append(take_dimensions(names, there, len(xyz), where=cloud.name))
         values = {
             name: np.concatenate([own[name] for own in each]).astype(np.float64) for name in each[0]
         }

@@ -17,8 +17,10 @@ from ..base.errors import ModelError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.registry import BY_NAME
 from .context_features import OWN, Context
-from .interface import REFINED, ArrayRule, Column, PredictRequest, gather, with_returns
+from .input_dimensions import add_return_features, take_dimensions
+from .interface import ArrayRule, Column, PredictRequest
 from .random_forest import Forest
+from .registry import REFINED_FOREST
 
 #: As many labeled points of its rarest class count as much as the base.
 EVEN = 30
@@ -219,7 +221,7 @@ class FeatureForest:
 
     @property
     def name(self) -> str:
-        return "random_forest" if self.blend is None else REFINED
+        return "random_forest" if self.blend is None else REFINED_FOREST
 
     @property
     def plan(self) -> FeaturePlan:
@@ -235,7 +237,7 @@ class FeatureForest:
         """Return the forest that a model file describes as one of its passes, everything checked."""
         context = Context(tuple(entry["context"])) if entry["context"] else None
         blend = None
-        if entry["algorithm"] == REFINED:
+        if entry["algorithm"] == REFINED_FOREST:
             blend = Blend.from_dict(entry["parameters"], codes)
             if context is None or OWN not in context.tokens:
                 raise ModelError(f"a refined forest must read '{OWN}'", found=entry["context"][:10])
@@ -307,8 +309,10 @@ class CloudFeatures:
         self.features, self._request = features, request
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
-        self._dimensions = with_returns(names, request.xyz, request.dimensions, request.threads)
-        gather(
+        self._dimensions = add_return_features(
+            names, request.xyz, request.dimensions, request.threads
+        )
+        take_dimensions(
             names, self._dimensions, len(request.xyz), request.rows
         )  # says what is wrong with them
 
@@ -337,7 +341,9 @@ class CloudFeatures:
             )
         yield from self._engine.blocks(
             queries=rows,
-            dimensions=lambda some: gather(features.plan.dimensions, self._dimensions, n, some),
+            dimensions=lambda some: take_dimensions(
+                features.plan.dimensions, self._dimensions, n, some
+            ),
             threads=asked.threads,
             memory_mb=max(asked.memory_mb * memory_share, 16.0),
             progress=progress,

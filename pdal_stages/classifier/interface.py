@@ -1,55 +1,18 @@
-"""What kinds of classifiers of clouds share: what they are asked and answer, and the names by which they are known.
-
-A kind is a class with ``name``, ``rules`` (of its arrays in a model file; a name that ends in ``*`` stands for many),
-``plan``, ``features`` and ``context`` (None without), ``from_file(entry, arrays, codes)``, ``to_file(codes)``, ``arrays()``
-and ``columns(codes)``. It has ``probabilities(read, rows)`` where it has features, and else ``predict(request, finish)``,
-which yields (rows, what `finish` made of their probabilities) block by block. What trains it is a module with
-``optional_inputs`` (each with the dimensions it needs), ``own_options(given)``, ``inputs(options)``,
-``outputs(options)`` and ``train(clouds, options, progress)``.
-"""
+"""Interface of all kinds of classifiers: what they are asked, what they return, and how a model file describes them."""
 
 from __future__ import annotations
 
-import pkgutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import DimensionError, ModelError
 from ..base.report import Report
 from ..base.settings import Settings, setting
-from ..features import return_features
+from ..features import FeaturePlan
 from ..features.point_grid import CellGrid
-
-#: What every point has: the feature engine takes these from the coordinates.
-COORDINATES = ("X", "Y", "Z")
-#: What a model is trained on by default: always this, and these where points have them.
-DEFAULT_DIMENSIONS = ("HeightAboveGround",)
-OPTIONAL_DIMENSIONS = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
-#: 1 where a person has checked a point's class.
-CHECKED = "Checked"
-
-_READ = "It comes from the reader; this source has none. Use a model trained without it"
-_MAKERS = {
-    "HeightAboveGround": (
-        "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological before this stage, or "
-        "what the model was trained with"
-    ),
-    **dict.fromkeys(("Intensity", *return_features.SOURCES), _READ),
-}
-#: Each kind by its word in manifests and options: its class, and what trains it, imported when asked for.
-ALGORITHMS = {
-    "random_forest": (
-        "pdal_stages.classifier.feature_forest:FeatureForest",
-        "pdal_stages.classifier.train_forest",
-    ),
-    "alsnet": ("pdal_stages.alsnet.classifier:AlsNet", "pdal_stages.alsnet.training"),
-}
-#: A forest on top of other passes, which only training on a base makes.
-REFINED = "refined_forest"
 
 
 class ArrayRule(NamedTuple):
@@ -102,6 +65,48 @@ class PredictRequest:
         return len(self.xyz) if self.rows is None else len(self.rows)
 
 
+class PassClassifier(Protocol):
+    """Classifier that is one pass of a model; each kind is a class of its own.
+
+    A kind that reads features also has ``probabilities(values, rows)``; one that does not has
+    ``predict(request, finish)``, which yields (rows, what `finish` made of their probabilities) block by block.
+    """
+
+    #: arrays that the kind stores in a model file; a name that ends in ``*`` stands for many
+    rules: ClassVar[Mapping[str, ArrayRule]]
+
+    @property
+    def name(self) -> str:
+        """The kind, as a manifest has it."""
+
+    @property
+    def plan(self) -> FeaturePlan | InputPlan:
+        """What it reads of the points."""
+
+    @property
+    def features(self) -> Any:
+        """The features that it reads; None for a kind that reads the points themselves."""
+
+    @property
+    def context(self) -> Any:
+        """What it reads of the pass before; None where it reads nothing of it."""
+
+    @classmethod
+    def from_file(
+        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+    ) -> PassClassifier:
+        """Return the classifier that a pass of a manifest describes; ModelError where it contradicts itself."""
+
+    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+        """Return what a manifest says of it beside its arrays."""
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return its arrays, for the model file."""
+
+    def columns(self, codes: Sequence[int]) -> list[Column]:
+        """Return its inputs, in order."""
+
+
 @dataclass(frozen=True)
 class PredictionOptions(Settings):
     """How a cloud is classified."""
@@ -141,106 +146,3 @@ class Prediction:
     variance: npt.NDArray[np.float32] | None = None
     #: (n, classes) in the order of ``Model.classes``
     probabilities: npt.NDArray[np.float32] | None = None
-
-
-def algorithm(name: str) -> Any:
-    """The class of a kind by its name; ModelError where there is none."""
-    if name not in (*ALGORITHMS, REFINED):
-        raise ModelError(
-            "the model uses an algorithm this release does not know",
-            found=repr(name)[:60],
-            cure="Update pdal-stages",
-        )
-    return pkgutil.resolve_name(ALGORITHMS["random_forest" if name == REFINED else name][0])
-
-
-def trainer(name: str) -> Any:
-    """What trains a kind, one of :data:`ALGORITHMS`."""
-    return pkgutil.resolve_name(ALGORITHMS[name][1])
-
-
-def required(names: Iterable[str]) -> tuple[str, ...]:
-    """Dimensions the cloud must have for these dimension features."""
-    return tuple(
-        dict.fromkeys(
-            name
-            for name in names
-            if name not in COORDINATES and return_features.parse(name) is None
-        )
-    )
-
-
-def optional(names: Iterable[str]) -> tuple[str, ...]:
-    """Dimensions that these features can do without but use where the cloud has them."""
-    return (
-        return_features.SOURCES
-        if any(return_features.parse(name) is not None for name in names)
-        else ()
-    )
-
-
-def known(
-    names: Iterable[str],
-    dimensions: Mapping[str, npt.ArrayLike],
-    n: int,
-    rows: npt.NDArray[np.int64] | None = None,
-    where: str | None = None,
-) -> list[npt.NDArray[Any]]:
-    """Values (n,) of the dimensions that these features need, checked as by :func:`gather`, and of those that they use."""
-    found = [*required(names), *(name for name in optional(names) if name in dimensions)]
-    for name in found:
-        gather((name,), dimensions, n, rows, where)  # one after the other: it may be a copy
-    return [np.asarray(dimensions[name]) for name in found]
-
-
-def with_returns(
-    names: Iterable[str],
-    xyz: npt.NDArray[np.float64],
-    dimensions: Mapping[str, npt.ArrayLike],
-    threads: int | None = None,
-) -> Mapping[str, npt.ArrayLike]:
-    """The dimensions and those of `names` that are made of return numbers and the points around."""
-    made = return_features.return_features(names, xyz, dimensions, threads)
-    return {**dimensions, **made} if made else dimensions
-
-
-def gather(
-    names: Iterable[str],
-    dimensions: Mapping[str, npt.ArrayLike],
-    n: int,
-    rows: npt.NDArray[np.int64] | None = None,
-    where: str | None = None,
-) -> dict[str, npt.NDArray[Any]]:
-    """The values (len(rows),) of dimension features at some of n points, all by default, by name.
-
-    `dimensions` are (n,) values of the whole cloud, see :func:`with_returns`; `where` is the cloud, for error texts.
-    DimensionError where one is missing, of another length, or not finite somewhere.
-    """
-    out = {}
-    for name in names:
-        if name in COORDINATES:
-            continue
-        if name not in dimensions:
-            cure = _MAKERS.get(name, f"Put the stage that creates {name} before this one")
-            raise DimensionError(f"the dimension {name} is missing", where=where, cure=cure)
-        values = np.asarray(dimensions[name])
-        if values.shape != (n,) or values.dtype.kind not in "fiub":
-            raise DimensionError(
-                f"the dimension {name} must have one value per point",
-                where=where,
-                found=f"{values.dtype} of shape {values.shape}",
-            )
-        out[name] = values if rows is None else values[rows]
-        if values.dtype.kind == "f" and (bad := np.count_nonzero(~np.isfinite(out[name]))):
-            raise DimensionError(
-                f"the dimension {name} is not finite at some points",
-                where=where,
-                found=f"{bad:,} points",
-                cure=f"Remove them before this stage. {_MAKERS.get(name, '')}",
-            )
-    return out
-
-
-def preparation_module() -> Any:
-    """The module that knows the stages which make dimensions; it stands above this room, and is imported when asked for."""
-    return pkgutil.resolve_name("pdal_stages.stages.preprocessing")

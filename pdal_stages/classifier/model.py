@@ -23,17 +23,9 @@ from ..features.voxels import check_side, represent
 from . import model_description, model_file
 from .auto_context import WeightedPass, plan_of, predict
 from .feature_forest import weighed
-from .interface import (
-    InputPlan,
-    Prediction,
-    PredictionOptions,
-    PredictRequest,
-    algorithm,
-    known,
-    optional,
-    preparation_module,
-    required,
-)
+from .input_dimensions import list_values, optional_dimensions, required_dimensions
+from .interface import InputPlan, Prediction, PredictionOptions, PredictRequest
+from .registry import classifier_of, preprocessing
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1
@@ -88,12 +80,12 @@ class Model:
     @property
     def required_dimensions(self) -> tuple[str, ...]:
         """Dimensions a cloud must have beside its coordinates."""
-        return required(self.plan.dimensions)
+        return required_dimensions(self.plan.dimensions)
 
     @property
     def optional_dimensions(self) -> tuple[str, ...]:
         """Dimensions it uses where a cloud has them: return numbers."""
-        return optional(self.plan.dimensions)
+        return optional_dimensions(self.plan.dimensions)
 
     @property
     def voxel(self) -> float:
@@ -111,7 +103,7 @@ class Model:
         computed = any(one.features is not None for one in self.passes)
         features = {"filters.multiscalefeatures": ALGORITHM_VERSION} if computed else {}
         preparation = self.info.get("preparation") or []
-        return preparation_module().algorithm_versions(preparation) | features
+        return preprocessing().algorithm_versions(preparation) | features
 
     def record_preprocessing(self, preparation: Sequence[Mapping[str, Any]]) -> None:
         """Store the stages that made the training's dimensions, and the versions of the algorithms in this release."""
@@ -264,7 +256,7 @@ class Model:
         if may_be_ground is not None:
             may = _checked("may_be_ground", may_be_ground, n, "b", "true or false")
             out["second"], out["second_share"] = np.zeros(n, np.uint8), np.zeros(n, np.float32)
-        values = known(self.plan.dimensions, given, n, there)
+        values = list_values(self.plan.dimensions, given, n, there)
         representatives = represent(xyz, self.voxel, values, rows, there)
         del values, there
         taken: npt.NDArray[Any] | None = None
@@ -347,7 +339,7 @@ class Model:
             return given
         usable = None if ignore is None else ~np.asarray(ignore, bool)
         classes = None if current is None else np.asarray(current).astype(np.uint8)
-        made = preparation_module().made_of_coordinates(preparation, xyz, usable, threads, classes)
+        made = preprocessing().made_of_coordinates(preparation, xyz, usable, threads, classes)
         if made.keys() & given.keys() and made.keys() & set(
             missing
         ):  # heights of two kinds would be mixed
@@ -447,9 +439,9 @@ def load_model(path: str | os.PathLike) -> Model:
     name = os.fspath(path)
     file = model_file.find(name)
     try:
-        model = assemble(*model_file.read(file, lambda name: algorithm(name).rules))
+        model = assemble(*model_file.read(file, lambda name: classifier_of(name).rules))
         if asked := model.info.get("preparation"):
-            model.info["preparation"] = preparation_module().check(asked)
+            model.info["preparation"] = preprocessing().check(asked)
         return model
     except ModelError as error:
         others = [one for one in model_file.shipped() if one != name]
@@ -496,16 +488,16 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
             raise ModelError(
                 "a pass's classes must ascend, each once, with one factor each", found=own[:10]
             )
-        made = algorithm(entry["algorithm"]).from_file(entry, arrays[number], own)
+        if (number > 0) != bool(entry["context"]):
+            raise ModelError(
+                "every pass but the first must read context", found=f"pass {number + 1}"
+            )
+        made: Any = classifier_of(entry["algorithm"]).from_file(entry, arrays[number], own)
         if number and made.classes_before(own) != before:
             raise ModelError(
                 "a pass reads other classes than the one before gives", found=f"pass {number + 1}"
             )
         before = own
-        if (number > 0) != bool(entry["context"]):
-            raise ModelError(
-                "every pass but the first must read context", found=f"pass {number + 1}"
-            )
         importances = entry["importances"]
         if importances is not None and len(importances) != len(entry["feature_names"]):
             raise ModelError(

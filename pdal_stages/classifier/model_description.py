@@ -9,7 +9,8 @@ from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
 from ..features.neighborhoods import parse_neighborhoods
 from .calibration import Sureness
-from .interface import REFINED, Column
+from .interface import Column
+from .registry import REFINED_FOREST
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"
@@ -83,7 +84,7 @@ def text(info: Mapping[str, Any]) -> str:
     several = len(info["passes"]) > 1
     every = list(enumerate(info["passes"], 1))
     # A base's own file describes its passes.
-    passes = [(number, one) for number, one in every if one["algorithm"] == REFINED] or every
+    passes = [(number, one) for number, one in every if one["algorithm"] == REFINED_FOREST] or every
     rows = [*_measured(info), *_inputs(info, passes), *_passes(passes, several), *_training(info)]
     rows += [("warning", one) for one in info["outdated"]]
     lines = [score(info), "", *(f"{name:<16}{said}".rstrip() for name, said in rows), ""]

@@ -23,7 +23,8 @@ from .auto_context import FoldForests, WeightedPass, sample_context
 from .calibration import Sureness
 from .context_features import OWN, Context
 from .feature_forest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
-from .interface import OPTIONAL_DIMENSIONS, PredictRequest, gather, required
+from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
+from .interface import PredictRequest
 from .model import Model
 from .random_forest import Forest, grow_forest
 from .sampling import BLOCK, Folds, draw_samples, figures, split
@@ -70,13 +71,13 @@ class _ForestTraining:
     ) -> None:
         self.clouds, self.options, self.base = clouds, options, options.base
         self.progress = partial(Progress, enabled=progress)
-        if options.groups and required((options.groups,)) != (options.groups,):
+        if options.groups and required_dimensions((options.groups,)) != (options.groups,):
             raise OptionError(
                 "'groups' must name a dimension other than coordinates and what is made of them",
                 found=options.groups,
             )
         for cloud in clouds if options.groups else ():  # before any work: it may be missing
-            gather(
+            take_dimensions(
                 (options.groups,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name
             )
         self.labeled = label_classes(clouds, options, progress)
@@ -312,7 +313,7 @@ class _ForestTraining:
         cloud, name = self.clouds[number], self.options.groups
         if not name:
             return np.broadcast_to(np.array(cloud.survey), len(cloud))
-        return gather((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
+        return take_dimensions((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
 
     def _count_sure(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
         """Count in how far samples that were held out were right where they were sure, as the points lie."""

@@ -14,14 +14,9 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from ..features.point_grid import check_xyz
 from .context_features import Context
-from .interface import (
-    DEFAULT_DIMENSIONS,
-    OPTIONAL_DIMENSIONS,
-    preparation_module,
-    required,
-    trainer,
-)
+from .input_dimensions import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS, required_dimensions
 from .model import Model
+from .registry import preprocessing, trainer_of
 from .training_clouds import TrainingCloud, prepared, spooled
 from .training_options import TrainingOptions, feature_plan
 
@@ -89,7 +84,7 @@ def train(
                 "there are no points to train on",
                 cure=f"Give some; those of labels {left_out} are left out ('ignore') unless 'classes' names them",
             )
-        model = trainer(options.algorithm).train(made, options, progress)
+        model = trainer_of(options.algorithm).train(made, options, progress)
     if options.base is None:
         model.record_preprocessing(preparation)
     return model
@@ -109,7 +104,7 @@ def _prepared(
 ) -> tuple[dict[str, npt.NDArray[Any]], TrainingOptions, list[dict[str, Any]]]:
     """Heights of bare points, the options that use them, and the stage that makes them."""
     if tuple(options.dimensions) == DEFAULT_DIMENSIONS:
-        more = trainer(options.algorithm).optional_inputs
+        more = trainer_of(options.algorithm).optional_inputs
         options = replace(
             options,
             dimensions=(
@@ -117,7 +112,7 @@ def _prepared(
                 *(name for name in OPTIONAL_DIMENSIONS if name in more),
             ),
         )
-    preparation = preparation_module().preparation_of(required(options.inputs))
+    preparation = preprocessing().preparation_of(required_dimensions(options.inputs))
     usable = ~np.isin(np.asarray(labels), options.ignore)
-    made = preparation_module().made_of_coordinates(preparation, xyz, usable, options.threads)
+    made = preprocessing().made_of_coordinates(preparation, xyz, usable, options.threads)
     return made, options, preparation

@@ -25,7 +25,7 @@ from ..features.cell_means import density
 from ..features.point_grid import check_xyz
 from ..features.voxels import represent
 from .class_map import MAX_LABEL, ClassMap
-from .interface import known
+from .input_dimensions import list_values
 from .training_options import TrainingOptions
 
 #: A thinned copy is made where it would have less than this share of the points.
@@ -125,7 +125,7 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     ignored = [label for label in options.ignore if label not in named]
     if ignored and (gone := np.isin(labels, ignored)).any():
         cloud, labels = cloud.part(np.flatnonzero(~gone)), labels[~gone]
-    values = known(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
+    values = list_values(options.inputs, cloud.dimensions, len(cloud.xyz), where=cloud.name)
     representatives = represent(cloud.xyz, options.voxel, values)
     if representatives is None:
         return cloud

@@ -19,8 +19,8 @@ from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
 from .class_map import MAX_LABEL
 from .context_features import OWN, Context
-from .interface import ALGORITHMS, trainer
 from .recipes import with_recipe
+from .registry import kinds, trainer_of
 
 #: Most passes a model can have.
 MOST_PASSES = 3
@@ -287,13 +287,13 @@ class TrainingOptions(Settings):
         resolve_threads(self.threads)
 
     def _check_algorithm(self) -> None:
-        checks.one_of("'algorithm'", self.algorithm, ALGORITHMS)
-        for name in ALGORITHMS:  # an algorithm's own options stand under its name
+        checks.one_of("'algorithm'", self.algorithm, kinds())
+        for name in kinds():  # an algorithm's own options stand under its name
             if name != self.algorithm and getattr(self, name, None):
                 raise OptionError(
                     f"'{name}' applies only to algorithm '{name}'", found=self.algorithm
                 )
-        own = trainer(self.algorithm).own_options(getattr(self, self.algorithm, None))
+        own = trainer_of(self.algorithm).own_options(getattr(self, self.algorithm, None))
         if own is not None:
             object.__setattr__(self, self.algorithm, own)
 
@@ -307,7 +307,7 @@ class TrainingOptions(Settings):
     @property
     def inputs(self) -> tuple[str, ...]:
         """Dimensions of the points that the classifier will use, X, Y and Z among them."""
-        return trainer(self.algorithm).inputs(self)
+        return trainer_of(self.algorithm).inputs(self)
 
 
 def _tree_numbers(what: str, numbers: Any) -> tuple[int, ...]:

@@ -17,7 +17,7 @@ from ..base.grid import places_among
 from ..base.las import named_copc
 from ..base.polygons import Overlay, points_inside, polygons_of
 from ..base.vector import reading, vector
-from ..classifier.interface import CHECKED
+from ..classifier.input_dimensions import CHECKED
 from ..pipeline.las_chunks import can_read_chunks, laspy_header, read_chunks
 from ..pipeline.las_output import finish
 from ..pipeline.spatial_reference import reference_of_file

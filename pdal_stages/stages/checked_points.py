@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.hashing import hash_of
 from ..base.report import Report
-from ..classifier.interface import CHECKED
+from ..classifier.input_dimensions import CHECKED
 from .points import class_counts
 
 #: A base is sure of a point from this reliability on.

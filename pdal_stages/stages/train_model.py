@@ -17,18 +17,17 @@ from ..base.report import Report
 from ..classifier import model_description
 from ..classifier.calibration import of_the_base
 from ..classifier.class_map import ClassMap
-from ..classifier.interface import (
-    ALGORITHMS,
+from ..classifier.input_dimensions import (
     CHECKED,
     DEFAULT_DIMENSIONS,
-    gather,
-    optional,
-    required,
-    trainer,
+    optional_dimensions,
+    required_dimensions,
+    take_dimensions,
 )
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import digest_of, find
 from ..classifier.recipes import RECIPES, describe_recipes, with_recipe
+from ..classifier.registry import kinds, trainer_of
 from ..classifier.train_forest import SHORT
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
@@ -72,7 +71,7 @@ class TrainModel(Stage):
         choices=tuple(RECIPES),
     )
     base: str | None = trained("base")
-    algorithm: str = trained("algorithm", choices=tuple(ALGORITHMS))
+    algorithm: str = trained("algorithm", choices=tuple(kinds()))
     alsnet: dict | None = trained("alsnet")
     neighborhoods: list = trained("neighborhoods")
     feature_set: list = trained("feature_set")
@@ -188,7 +187,7 @@ class TrainModel(Stage):
 
     @property
     def _trainer(self) -> Any:
-        return trainer(self.algorithm)
+        return trainer_of(self.algorithm)
 
     @property
     def automatic(self) -> bool:
@@ -198,7 +197,7 @@ class TrainModel(Stage):
     @property
     def wished(self) -> tuple[str, ...]:
         """Dimensions worth making for the training, whether asked for or not."""
-        names = required(self.training.inputs)
+        names = required_dimensions(self.training.inputs)
         return (*names, *self._trainer.optional_inputs) if self.automatic else names
 
     def training_on(self, points: Points) -> TrainingOptions:
@@ -211,7 +210,7 @@ class TrainModel(Stage):
 
     def check(self) -> None:
         self.training.inputs  # noqa: B018  words that mean nothing are refused
-        if self.label in required(self.training.inputs):
+        if self.label in required_dimensions(self.training.inputs):
             raise OptionError(
                 f"option 'dimensions' names the label itself, '{self.label}'",
                 found=", ".join(map(str, self.dimensions)),
@@ -225,7 +224,7 @@ class TrainModel(Stage):
 
     def reads(self) -> list[str]:
         own = [name for name in (self.survey, self.groups) if name]
-        return [self.label, *own, *required(self.training.inputs)]
+        return [self.label, *own, *required_dimensions(self.training.inputs)]
 
     def run(self, points: Points) -> dict[str, NDArray]:
         training = self.training_on(points)
@@ -244,9 +243,11 @@ class TrainModel(Stage):
     ) -> TrainingCloud:
         """The points as a cloud to train on, all of one survey; with `marks` as more dimensions, from which follows later
         what samples are drawn from."""
-        needed = required((*training.inputs, *filter(None, [self.groups])))
+        needed = required_dimensions((*training.inputs, *filter(None, [self.groups])))
         dimensions = {name: points.dimension(name) for name in needed}
-        dimensions |= {n: points.arrays[n] for n in optional(training.inputs) if n in points.arrays}
+        dimensions |= {
+            n: points.arrays[n] for n in optional_dimensions(training.inputs) if n in points.arrays
+        }
         if self.survey:
             dimensions[self.survey] = points.dimension(self.survey)
         cloud = TrainingCloud(
@@ -337,7 +338,9 @@ class TrainModel(Stage):
         """The cloud as it is, or one for each value of the dimension `survey`, after that value."""
         if not self.survey:
             return [(0.0, cloud)]
-        value = gather((self.survey,), cloud.dimensions, len(cloud), where=cloud.name)[self.survey]
+        value = take_dimensions((self.survey,), cloud.dimensions, len(cloud), where=cloud.name)[
+            self.survey
+        ]
         parts = [(float(one), cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
         return [
             (one, replace(part, name=f"{self.survey} {one:g}", survey="")) for one, part in parts

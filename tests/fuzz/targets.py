@@ -29,8 +29,8 @@ from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.extra_bytes import extra_dimensions
 from pdal_stages.classifier import model_file
-from pdal_stages.classifier.interface import algorithm
 from pdal_stages.classifier.model import assemble
+from pdal_stages.classifier.registry import classifier_of
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.json_source import decode, parse_pipeline
@@ -308,7 +308,7 @@ def _models() -> list[bytes]:
 def model(data: bytes) -> str:
     """Read a model file and, where it is accepted, classify with it."""
     manifest, arrays = model_file.read(
-        put("fuzz.model", _model_file(data)), lambda name: algorithm(name).rules
+        put("fuzz.model", _model_file(data)), lambda name: classifier_of(name).rules
     )
     made = assemble(manifest, arrays)
     assert str(made) and made.describe() and made.halo_m >= 0

@@ -1,0 +1,130 @@
+"""Dimensions of points that classifiers read: which a cloud must have, their values, and errors that name the cure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.errors import DimensionError
+from ..features import return_features
+
+#: Dimensions of every point; the feature engine takes them from the coordinates.
+COORDINATES = ("X", "Y", "Z")
+#: Dimensions that a model is trained on by default.
+DEFAULT_DIMENSIONS = ("HeightAboveGround",)
+#: Dimensions that a model is trained on as well where the points have them.
+OPTIONAL_DIMENSIONS = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
+#: Dimension that is 1 where a person has checked a point's class.
+CHECKED = "Checked"
+
+_FROM_READER = "It comes from the reader; this source has none. Use a model trained without it"
+#: Dimension -> what to do where it is missing.
+_CURES = {
+    "HeightAboveGround": (
+        "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological before this stage, or "
+        "what the model was trained with"
+    ),
+    **dict.fromkeys(("Intensity", *return_features.SOURCES), _FROM_READER),
+}
+
+
+def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the dimensions among feature names that a cloud must have: neither coordinates nor return features."""
+    return tuple(
+        dict.fromkeys(
+            name
+            for name in names
+            if name not in COORDINATES and return_features.parse(name) is None
+        )
+    )
+
+
+def optional_dimensions(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the dimensions that features are computed from where a cloud has them: return numbers."""
+    if any(return_features.parse(name) is not None for name in names):
+        return return_features.SOURCES
+    return ()
+
+
+def list_values(
+    names: Iterable[str],
+    dimensions: Mapping[str, npt.ArrayLike],
+    n: int,
+    rows: npt.NDArray[np.int64] | None = None,
+    where: str | None = None,
+) -> list[npt.NDArray[Any]]:
+    """Return the values (n,) of the dimensions that features require, and of the optional ones that are there.
+
+    All are checked at `rows`, as by :func:`take_dimensions`.
+    """
+    names = tuple(names)
+    optional = (name for name in optional_dimensions(names) if name in dimensions)
+    found = [*required_dimensions(names), *optional]
+    for name in found:
+        take_dimensions(
+            (name,), dimensions, n, rows, where
+        )  # one after the other: it may be a copy
+    return [np.asarray(dimensions[name]) for name in found]
+
+
+def add_return_features(
+    names: Iterable[str],
+    xyz: npt.NDArray[np.float64],
+    dimensions: Mapping[str, npt.ArrayLike],
+    threads: int | None = None,
+) -> Mapping[str, npt.ArrayLike]:
+    """Return the dimensions (n,), and those of `names` that are computed from return numbers and points (n, 3)."""
+    computed = return_features.return_features(names, xyz, dimensions, threads)
+    return {**dimensions, **computed} if computed else dimensions
+
+
+def take_dimensions(
+    names: Iterable[str],
+    dimensions: Mapping[str, npt.ArrayLike],
+    n: int,
+    rows: npt.NDArray[np.int64] | None = None,
+    where: str | None = None,
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the values of dimensions at some rows of a cloud of n points, by name; coordinates are passed over.
+
+    Parameters
+    ----------
+    names : iterable of str
+    dimensions : mapping of str to (n,) array
+        See :func:`add_return_features`.
+    rows : (m,) int64, optional
+        All n by default.
+    where : str, optional
+        The cloud's name, for messages.
+
+    Raises
+    ------
+    DimensionError
+        Where a dimension is missing, has another length, or is not finite at one of the rows.
+    """
+    out = {}
+    for name in names:
+        if name in COORDINATES:
+            continue
+        if name not in dimensions:
+            cure = _CURES.get(name, f"Put the stage that creates {name} before this one")
+            raise DimensionError(f"the dimension {name} is missing", where=where, cure=cure)
+        values = np.asarray(dimensions[name])
+        if values.shape != (n,) or values.dtype.kind not in "fiub":
+            raise DimensionError(
+                f"the dimension {name} must have one value per point",
+                where=where,
+                found=f"{values.dtype} of shape {values.shape}",
+            )
+        out[name] = values if rows is None else values[rows]
+        if values.dtype.kind == "f" and (bad := np.count_nonzero(~np.isfinite(out[name]))):
+            raise DimensionError(
+                f"the dimension {name} is not finite at some points",
+                where=where,
+                found=f"{bad:,} points",
+                cure=f"Remove them before this stage. {_CURES.get(name, '')}",
+            )
+    return out
