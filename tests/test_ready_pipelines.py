@@ -37,7 +37,7 @@ def test_none_is_forgotten():
         "classify-regularized", *(f"paper-{recipe}" for recipe in RECIPES if recipe != "mobile"),
     }  # fmt: skip
     assert {f.stem for f in FILES} == tested
-    listed = (FOLDER.parent / "docs" / "how-to.md").read_text()
+    listed = (FOLDER.parent / "docs" / "pipelines.md").read_text()
     assert all(f"`{f.name}`" in listed for f in FILES)
 
 

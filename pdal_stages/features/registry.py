@@ -37,8 +37,8 @@ SHAPES = {
     "A3": "angle between two pulled points seen from a third",
     "D1": "distance of a pulled point from the centroid",
     "D2": "distance between two pulled points",
-    "D3": "square root of the area of the triangle of three pulled points",
-    "D4": "cube root of the volume of the tetrahedron of four pulled points",
+    "D3": "square root of the area of three pulled points",
+    "D4": "cube root of the volume of four pulled points",
 }
 
 #: Every feature, in the order of the columns. e1 >= e2 >= e3 are the eigenvalues l1, l2, l3 divided by their sum, n is the
@@ -52,8 +52,7 @@ FEATURES = (
     Feature("Eigenentropy", "covariance", "1", "-(e1 ln e1 + e2 ln e2 + e3 ln e3), 0 ln 0 = 0"),
     Feature("EigenvalueSum", "covariance", "m²", "l1 + l2 + l3"),
     Feature("SurfaceVariation", "covariance", "1", "e3"),
-    Feature("Density", "geometric", "1/m² or 1/m³", "points per area of a cylinder's base, n / (π r²), or per "
-            "volume of a sphere, n / (4/3 π r³), r the distance to the k-th neighbor where k is given"),
+    Feature("Density", "geometric", "1/m² or 1/m³", "n / (π r²) of cylinders, n / (4/3 π r³) of the rest"),
     Feature("Verticality", "geometric", "1", "1 - abs(nz)"),
     Feature("HeightRange", "geometric", "m", "highest minus lowest z"),
     Feature("HeightStd", "geometric", "m", "standard deviation of z (divisor n)"),
@@ -64,12 +63,12 @@ FEATURES = (
         for number in range(SHAPE_BINS)
     ),
     Feature("HeightAboveLowest", "relative", "m", "z of the point minus lowest z of the neighborhood [HWS16]"),
-    Feature("NormalAgreement", "surfaces", "1", "mean abs(n·n′) of the point's normal n and the normals n′ of the "
-            "neighborhood's points", ("knn",)),
-    Feature("SurfaceVariationMin", "surfaces", "1", "lowest surface variation of the neighborhood's points", ("knn",)),
-    Feature("SurfaceVariationMean", "surfaces", "1", "mean surface variation of the neighborhood's points", ("knn",)),
-    Feature("SurfaceVariationStd", "surfaces", "1", "standard deviation (divisor n) of the surface variation of the "
-            "neighborhood's points", ("knn",)),
+    Feature("NormalAgreement", "surfaces", "1", "mean abs(n·n′) of the normals of the point and its neighbors",
+            ("knn",)),
+    Feature("SurfaceVariationMin", "surfaces", "1", "lowest surface variation of the neighbors", ("knn",)),
+    Feature("SurfaceVariationMean", "surfaces", "1", "mean surface variation of the neighbors", ("knn",)),
+    Feature("SurfaceVariationStd", "surfaces", "1", "standard deviation of the neighbors' surface variation",
+            ("knn",)),
 )  # fmt: skip
 
 BY_NAME = {feature.name: feature for feature in FEATURES}
