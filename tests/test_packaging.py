@@ -28,7 +28,7 @@ def test_one_version_everywhere():
     assert (
         f"\nversion={__version__}\n" in (ROOT / "qgis" / "pdal_stages" / "metadata.txt").read_text()
     )
-    assert f"\n## {__version__} " in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\n## [{__version__}] - " in (ROOT / "CHANGELOG.md").read_text()
 
 
 @pytest.mark.parametrize("file", ["recipe/recipe.yaml", "environment.yml"])
