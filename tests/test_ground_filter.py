@@ -12,9 +12,9 @@ from scipy import ndimage
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
+from pdal_stages.base.grid import GridWindow
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground, pieces, smrf
-from pdal_stages.terrain.cells import CellWindow
 from pdal_stages.terrain.openings import objects_of, opening_radii
 from pdal_stages.terrain.smrf import FilterOptions
 from pdal_stages.terrain.surface import GroundRaster, planes_of_blocks
@@ -138,7 +138,7 @@ def slow_planes(cells, level, floor, at):
 @pytest.mark.parametrize("slope", [0.0, 3.0])
 def test_planes_equal_the_slow_reference(slope):
     rng = np.random.default_rng(4)
-    left, bottom, w, h = window = CellWindow(-13, 40, 26, 30)
+    left, bottom, w, h = window = GridWindow(-13, 40, 26, 30)
     ground = rng.random((h, w)) < 0.05
     place = rng.uniform(-0.5, 0.5, (h, w, 3)) * [1, 1, 40]
     floor = (rng.normal(0, 5, (h, w)) + slope * np.arange(w)).astype(np.float32)

@@ -86,6 +86,11 @@ def cell_keys(column: npt.NDArray, row: npt.NDArray, layer: Any = 0) -> Integers
     return (np.asarray(layer, np.int64) << _LAYER_SHIFT) + (row << _ROW_SHIFT) + (column + 2**31)
 
 
+def key_offset(columns: int, rows: int) -> int:
+    """Return what leads from the key of a cell to that of the cell `columns` and `rows` further."""
+    return (rows << _ROW_SHIFT) + columns
+
+
 def split_keys(keys: Integers) -> tuple[Integers, Integers, Integers]:
     """Return column, row and layer of keys of cells, whose rows lie below 2**26."""
     layer = (keys + (1 << (_LAYER_SHIFT - 1))) >> _LAYER_SHIFT

@@ -25,8 +25,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.grid import GridWindow, cell_numbers
 from ..base.jit import device, njit
-from ..terrain.cells import CellWindow, cell_numbers, levels
+from ..terrain.cells import levels
 from ..terrain.components import longest_sides, number_sets
 from ..terrain.pieces import patches
 
@@ -127,8 +128,8 @@ def find_decks(
 
 def _find(column, row, z, ground, rules) -> NDArray[np.bool_]:
     """Find the decks among the points (n,) of a piece."""
-    window = CellWindow.round(column, row)
-    cell = window.numbers(column, row)
+    window = GridWindow.enclosing(column, row)
+    cell = window.flat_index(column, row)
     order, begins = levels(z, cell)
     first = np.flatnonzero(begins)
     lowest = order[first]

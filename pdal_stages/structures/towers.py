@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.grid import GridWindow, cell_keys, cell_numbers
 from ..base.jit import device, njit
-from ..terrain.cells import CellWindow, cell_numbers, keys_of
 from ..terrain.pieces import patches
 
 #: Side of the cells, meters.
@@ -101,9 +101,9 @@ def find_towers(
     near = np.flatnonzero(use & (wire | (height > rules.foot_m)) & _near(column, row, wires, rules))
     for points, own in patches(column[near], row[near], int(rules.reach_m), int(rules.reach_m)):
         at = near[points]
-        window = CellWindow.round(column[at], row[at])
+        window = GridWindow.enclosing(column[at], row[at])
         left, bottom, w, h = window
-        cell = window.numbers(column[at], row[at])
+        cell = window.flat_index(column[at], row[at])
         order = np.argsort(cell, kind="stable")
         start = np.searchsorted(cell[order], np.arange(h * w + 1))
         some = at[order]
@@ -124,7 +124,7 @@ def _near(
     """Find the points in blocks at wires, and in those around."""
     arms = int(rules.wire_near * rules.max_scale + rules.arm_beside_m)
     side = arms + rules.max_half + rules.clear_rings
-    key = keys_of(column // side, row // side)
+    key = cell_keys(column // side, row // side)
     steps = np.array([(b << 32) + a for b in (-1, 0, 1) for a in (-1, 0, 1)])
     return np.isin(key, np.unique(key[wires])[:, None] + steps)
 

@@ -17,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.grid import GridWindow, cell_numbers
 from ..base.jit import device, njit
-from ..terrain.cells import CellWindow, cell_numbers, levels
+from ..terrain.cells import levels
 from ..terrain.components import longest_sides, number_sets
 from ..terrain.pieces import patches
 
@@ -103,9 +104,9 @@ def find_wires(
         column[high], row[high], int(rules.reach_m), int(rules.min_length_m)
     ):
         at = high[points]
-        window = CellWindow.round(column[at], row[at]).grown(_margin(rules))
-        near = np.flatnonzero(use & window.holds(column, row))
-        found = _find(xyz, window.numbers(column, row), near, at, window, rules)
+        window = GridWindow.enclosing(column[at], row[at]).padded(_margin(rules))
+        near = np.flatnonzero(use & window.contains(column, row))
+        found = _find(xyz, window.flat_index(column, row), near, at, window, rules)
         out[at[own]] = found[own]
     return out
 

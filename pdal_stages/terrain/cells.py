@@ -5,64 +5,18 @@ Points are cut into pieces whose rasters are small wherever points lie: groups f
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import StageError
-from ..base.grid import begins_run
+from ..base.grid import begins_run, cell_keys, cell_numbers
 
 #: What a raster has where nothing was measured.
 HOLE = np.float32(np.inf)
-#: Largest cell index either side of zero; beyond it coordinates cannot be terrain.
-_INDEX_LIMIT = 2**31 - 2
 #: Heights beyond this, in meters, are no terrain, and too much for the sums.
 HIGHEST = 1e6
 #: Levels of a cell are so many meters apart, at least.
 GAP = 1.0
-
-
-class CellWindow(NamedTuple):
-    """Cells from a column and row on."""
-
-    left: int
-    bottom: int
-    width: int
-    height: int
-
-    @classmethod
-    def round(cls, column: NDArray[np.int64], row: NDArray[np.int64]) -> CellWindow:
-        """The smallest one round some cells."""
-        left, bottom = int(column.min()), int(row.min())
-        return cls(left, bottom, int(column.max()) + 1 - left, int(row.max()) + 1 - bottom)
-
-    def grown(self, by: int) -> CellWindow:
-        """So many cells more on every side."""
-        return CellWindow(
-            self.left - by, self.bottom - by, self.width + 2 * by, self.height + 2 * by
-        )
-
-    def holds(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which cells lie in it."""
-        inside = (column >= self.left) & (column < self.left + self.width)
-        return inside & (row >= self.bottom) & (row < self.bottom + self.height)
-
-    def numbers(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Numbers of cells in it, row by row."""
-        return (row - self.bottom) * self.width + column - self.left
-
-    def within(self, other: CellWindow) -> CellWindow:
-        """What of it lies in another."""
-        left, bottom = max(self.left, other.left), max(self.bottom, other.bottom)
-        right = min(self.left + self.width, other.left + other.width)
-        top = min(self.bottom + self.height, other.bottom + other.height)
-        return CellWindow(left, bottom, max(right - left, 0), max(top - bottom, 0))
-
-    def on(self, other: CellWindow) -> tuple[slice, slice]:
-        """Rows and columns of its cells on the raster of another, which holds it."""
-        j, i = self.bottom - other.bottom, self.left - other.left
-        return slice(j, j + self.height), slice(i, i + self.width)
 
 
 def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
@@ -108,30 +62,6 @@ def usable(*axes: NDArray[np.float64], mask: ArrayLike | None = None) -> NDArray
     return use & kept
 
 
-def cell_numbers(coordinate: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
-    """Which cell coordinates fall in, counted from the origin; refuses those no survey has (they would wrap round)."""
-    index = np.asarray(coordinate / cell)
-    np.floor(index, out=index)
-    if index.size and max(-index.min(), index.max()) > _INDEX_LIMIT - 1:
-        raise StageError(
-            "coordinates are too large for the grid",
-            found=f"a cell index of {float(np.abs(index).max()):.3g}",
-            cure="Remove stray points, e.g. with filters.crop or filters.range, or use a larger 'cell'",
-        )
-    return index.astype(np.int64)
-
-
-def keys_of(column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One number for each cell, ascending by row and column."""
-    return (row << 32) + (column + 2**31)
-
-
-def runs(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Numbers of those (n,) that have the same key, for each there is."""
-    order = np.argsort(key, kind="stable")
-    return np.split(order, np.flatnonzero(begins_run(key[order]))[1:]) if len(key) else []
-
-
 def lowest_points(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -166,7 +96,7 @@ def lowest_of_cells(
     """
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     x, y, z = x[mine], y[mine], z[mine]
-    key = keys_of(cell_numbers(x, cell), cell_numbers(y, cell))
+    key = cell_keys(cell_numbers(x, cell), cell_numbers(y, cell))
     cells, number = np.unique(key, return_inverse=True)
     highest = np.full(len(cells), -np.inf)
     np.maximum.at(highest, number, z)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import HOLE, CellWindow
+from ..base.grid import GridWindow
+from .cells import HOLE
 from .low_outliers import pits_reach
 from .openings import openings_of
 from .pieces import patches
@@ -44,7 +45,7 @@ def given_pieces(
     margin = 2 + max([0, *options.opening_radii])
     for of, own in patches(points.column, points.row, reach_of_given(options), options.link):
         part = points.some(of)
-        window = CellWindow.round(part.column, part.row).grown(margin)
+        window = GridWindow.enclosing(part.column, part.row).padded(margin)
         shape = window.height, window.width
         count, place = np.zeros(shape, np.int64), np.zeros((*shape, 3))
         add_ground(
@@ -58,7 +59,7 @@ def given_pieces(
 
 
 def _openings(
-    points: GroundPoints, options: FilterOptions, window: CellWindow
+    points: GroundPoints, options: FilterOptions, window: GridWindow
 ) -> dict[int, NDArray[np.float32]]:
     """Return radius in cells -> opening (h, w) of the minimum grid of all points, low outliers left out; meters."""
     if not options.opening_radii:

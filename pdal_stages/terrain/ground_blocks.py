@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import HIGHEST, HOLE, CellWindow, cell_numbers, keys_of, lowest_of_cells, runs
+from ..base.grid import GridWindow, cell_keys, cell_numbers, group_by_key
+from .cells import HIGHEST, HOLE, lowest_of_cells
 from .smrf import (
     NEAR,
     CellMeans,
@@ -44,7 +45,7 @@ class GroundCells(NamedTuple):
     def in_parts(self, side: int) -> dict[str, NDArray]:
         """All by name, for files: those of squares of so many columns and rows by themselves."""
         column, row = (self.cells[name].astype(np.int64) // side for name in ("column", "row"))
-        parts = runs(keys_of(column, row))
+        parts = group_by_key(cell_keys(column, row))
         return {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
 
     @staticmethod
@@ -61,10 +62,10 @@ class GroundCells(NamedTuple):
         parts = (part for block in blocks for part in block.values())
         return GroundCells(np.concatenate([np.empty(0, _record(openings)), *parts]))
 
-    def on(self, window: CellWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
+    def on(self, window: GridWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
         """The cells of a window on its raster, and what their ground points say."""
         shape = window.height, window.width
-        cells = self.cells[window.holds(self.cells["column"], self.cells["row"])]
+        cells = self.cells[window.contains(self.cells["column"], self.cells["row"])]
         at = cells["row"] - window.bottom, cells["column"] - window.left
 
         def filled(name: str, value: Any, *more: int) -> NDArray:
@@ -107,7 +108,7 @@ def by_block(
     """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them; meters."""
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
-    parts = runs(keys_of(column, row))
+    parts = group_by_key(cell_keys(column, row))
     return {
         (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[mine[p]] for axis in (x, y, z)])
         for p in parts
@@ -139,7 +140,7 @@ def cells_of_block(
     `points` are all that may be ground in the block, in parts (n, 3).
     """
     x, y, z, top = np.ascontiguousarray(outer.T)
-    own = CellWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+    own = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     cell, openings = options.cell, options.opening_radii
     # Openings reach into cells without points.
     spill = max([*openings, 0]) + 2
@@ -149,15 +150,15 @@ def cells_of_block(
         return GroundPoints.of(x, y, z, top, np.ones(len(x), bool), cell)
 
     low = given(x, y, z, top)
-    if not own.grown(margin).holds(low.column, low.row).any():
+    if not own.padded(margin).contains(low.column, low.row).any():
         return GroundCells.of_blocks([], len(openings))
-    raster, _ = ground_raster(low, options, margin=spill, wanted=own.grown(margin))
-    inside = low.some(own.holds(low.column, low.row))
+    raster, _ = ground_raster(low, options, margin=spill, wanted=own.padded(margin))
+    inside = low.some(own.contains(low.column, low.row))
     needed = around(raster.window, inside.column, inside.row)
     planes = surface(raster, options.levels(NEAR), needed)
     # With a ring around: points blend the four cells round them.
-    kept = own.grown(1).within(raster.window)
-    raster, planes = raster.cut(kept), planes[kept.on(raster.window)].copy()
+    kept = own.padded(1).intersect(raster.window)
+    raster, planes = raster.cut(kept), planes[kept.slices_in(raster.window)].copy()
     left, bottom, _, _ = kept
     count, means = np.zeros(raster.shape, np.int64), np.zeros((*raster.shape, 3))
     for xyz in points:
@@ -172,7 +173,7 @@ def cells_of_block(
     for k, radius in enumerate(openings):
         opened[..., k] = raster.opened[radius]
     there = np.zeros(raster.shape, bool)
-    there[own.within(kept).on(kept)] = True
+    there[own.intersect(kept).slices_in(kept)] = True
     there &= np.isfinite(raster.lowest) | held | np.isfinite(opened).any(axis=-1)
     j, i = np.nonzero(there)
     cells = np.empty(len(j), _record(len(openings)))

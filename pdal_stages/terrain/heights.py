@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base.grid import GridWindow
 from ..base.threads import map_blocks
-from .cells import HIGHEST, CellWindow, columns, usable
+from .cells import HIGHEST, columns, usable
 from .classified_ground import given_pieces
 from .ground_blocks import GroundCells
 from .openings import above_opening, opening_names
@@ -169,7 +170,9 @@ def _from_cells(
 ) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
     """Yield pieces of the cloud with the ground raster that an earlier round computed."""
     for of, own in patches(points.column, points.row, 0, options.link):
-        window = CellWindow.round(points.column[of], points.row[of]).grown(options.reach_of_cells)
+        window = GridWindow.enclosing(points.column[of], points.row[of]).padded(
+            options.reach_of_cells
+        )
         yield of, own, *cells.on(window, options.opening_radii)
 
 

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import checks
 from ..base.errors import NoTerrainError, OptionError
-from ..base.grid import places_among
-from .cells import cell_numbers, columns, keys_of, usable
+from ..base.grid import cell_keys, cell_numbers, places_among
+from .cells import columns, usable
 
 
 class MinimaTerrain:
@@ -42,7 +42,7 @@ class MinimaTerrain:
         self.cell, self.resolution = float(cell), float(resolution)
         x, y, z = columns(x, y, z)
         use = usable(x, y, z, mask=mask)
-        key = keys_of(cell_numbers(x[use], cell), cell_numbers(y[use], cell))
+        key = cell_keys(cell_numbers(x[use], cell), cell_numbers(y[use], cell))
         self.keys, number = np.unique(key, return_inverse=True)
         self.minima = np.full(len(self.keys), np.inf)
         np.minimum.at(self.minima, number, z[use])
@@ -110,7 +110,7 @@ def _corners(x, y, cell: float, resolution: float):
     """Keys of the four coarse cells round the middle of each point's fine cell (4, n), and where between them it lies."""
     u, v = ((np.floor(axis / resolution) + 0.5) * (resolution / cell) - 0.5 for axis in (x, y))
     i, j = cell_numbers(u, 1.0), cell_numbers(v, 1.0)
-    return np.array([keys_of(i + a, j + b) for b in (0, 1) for a in (0, 1)]), u - i, v - j
+    return np.array([cell_keys(i + a, j + b) for b in (0, 1) for a in (0, 1)]), u - i, v - j
 
 
 def _places(keys: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -184,7 +184,9 @@ def terrain_reach(
     if not forms.any():  # farther than what was read
         around = max(box[0] - x.min(), box[1] - y.min(), x.max() - box[2], y.max() - box[3], 0.0)
         return float(around + box[2] - box[0])
-    filled = _places(np.unique(keys_of(cell_numbers(x[forms], cell), cell_numbers(y[forms], cell))))
+    filled = _places(
+        np.unique(cell_keys(cell_numbers(x[forms], cell), cell_numbers(y[forms], cell)))
+    )
     cells = _places(np.unique(_corners(x[wanted], y[wanted], cell, resolution)[0]))
     nearest = cKDTree(filled).query(cells)[0]
     radius = np.where(nearest > 0, nearest + _FILL, 0.0)[:, None] + 0.5  # whole cells around it

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.asprs import NOISE
-from ..base.grid import begins_run
+from ..base.grid import begins_run, cell_numbers
 from ..base.jit import device, njit
-from .cells import HIGHEST, cell_numbers, columns, sums_around, usable
+from .cells import HIGHEST, columns, sums_around, usable
 from .components import longest_sides, number_sets
 from .low_outliers import RULES as LOW_RULES
 from .low_outliers import below_ground

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.grid import places_among
+from ..base.grid import GridWindow, cell_keys, group_by_key, key_offset, places_among
 from ..base.las_check import DAMAGED
-from .cells import CellWindow, keys_of, runs
 from .components import number_sets
 
 #: Cells of the largest raster that is made in one piece.
@@ -34,7 +33,7 @@ def patches(
     points that no chain of others connects with steps of at most `link` cells. One piece, all points, where the whole
     is small enough.
     """
-    window = CellWindow.round(column, row)
+    window = GridWindow.enclosing(column, row)
     if window.width * window.height <= min(
         LARGEST_RASTER, SMALL_RASTER + MAX_CELLS_PER_POINT * len(column)
     ):
@@ -44,12 +43,12 @@ def patches(
     refuse_scattered([len(group) for group in groups])
     for group in groups:
         c, r = column[group], row[group]
-        window = CellWindow.round(c, r)
+        window = GridWindow.enclosing(c, r)
         if window.width * window.height <= LARGEST_RASTER:
             yield group, slice(None)
             continue
-        for own in runs(keys_of(c // SQUARE_SIDE, r // SQUARE_SIDE)):
-            inside = CellWindow.round(c[own], r[own]).grown(reach).holds(c, r)
+        for own in group_by_key(cell_keys(c // SQUARE_SIDE, r // SQUARE_SIDE)):
+            inside = GridWindow.enclosing(c[own], r[own]).padded(reach).contains(c, r)
             near, mine = np.flatnonzero(inside), np.zeros(len(c), bool)
             mine[own] = True
             for part in _groups(c[near], r[near], link):
@@ -77,12 +76,12 @@ def _groups(
     """Points that belong together: all within `link` cells of each other, and few that are a little farther apart."""
     side = -(-link // BLOCKS_PER_LINK)
     rings = -(-link // side)
-    blocks, of = np.unique(keys_of(column // side, row // side), return_inverse=True)
+    blocks, of = np.unique(cell_keys(column // side, row // side), return_inverse=True)
     pairs = []
     for b in range(rings + 1):
         for a in range(-rings if b else 1, rings + 1):
-            at, there = places_among(blocks, blocks + (b << 32) + a)
+            at, there = places_among(blocks, blocks + key_offset(a, b))
             pairs.append([np.flatnonzero(there), at[there]])
     label = np.empty(len(blocks), np.int64)
     number_sets(*np.concatenate(pairs, axis=1), label)
-    return runs(label[of])
+    return group_by_key(label[of])

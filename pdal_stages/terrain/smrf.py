@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from ..base import checks
 from ..base.errors import OptionError
+from ..base.grid import GridWindow, cell_numbers
 from ..base.jit import njit
-from .cells import HOLE, CellWindow, cell_numbers, lowest_points
+from .cells import HOLE, lowest_points
 from .low_outliers import pits, pits_reach
 from .openings import objects_of, opening_radius
 from .surface import GroundRaster, from_parents, planes_of_blocks
@@ -145,7 +146,7 @@ class GroundPoints(NamedTuple):
 
 
 def ground_raster(
-    points: GroundPoints, options: FilterOptions, margin: int = 1, wanted: CellWindow | None = None
+    points: GroundPoints, options: FilterOptions, margin: int = 1, wanted: GridWindow | None = None
 ) -> tuple[GroundRaster, NDArray[np.int64]]:
     """Classify the cells of the minimum grid round points into ground and objects.
 
@@ -157,7 +158,7 @@ def ground_raster(
     points : GroundPoints
     margin : int
         Empty cells on every side, one at least: points blend the four cells round them.
-    wanted : CellWindow, optional
+    wanted : GridWindow, optional
         The cells that are looked at; the raster holds these and as many around as later steps need.
 
     Returns
@@ -167,15 +168,15 @@ def ground_raster(
         Numbers of the points that are low outliers.
     """
     x, y, z, _, _, column, row = points
-    window = CellWindow.round(column, row).grown(margin)
+    window = GridWindow.enclosing(column, row).padded(margin)
     lowest, raster, low_outliers = minimum_grid(points, window, options.cell)
     objects, floor, opened = objects_of(
         raster, options.cell, options.slope, options.radius, options.opening_radii
     )
     step = planes_reach(options.levels(NEAR))
     wanted = wanted or window
-    kept = wanted.grown(ROUNDS * step).within(window)
-    part = kept.on(window)
+    kept = wanted.padded(ROUNDS * step).intersect(window)
+    part = kept.slices_in(window)
     lowest, raster = np.ascontiguousarray(lowest[part]), np.ascontiguousarray(raster[part])
     objects, floor = np.ascontiguousarray(objects[part]), np.ascontiguousarray(floor[part])
     opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
@@ -188,7 +189,7 @@ def ground_raster(
     made = GroundRaster(kept, raster, place, ground, floor, opened)
     for number in range(1, ROUNDS + 1):
         seen = np.zeros(raster.shape, bool)
-        seen[wanted.grown((ROUNDS - number) * step).within(kept).on(kept)] = True
+        seen[wanted.padded((ROUNDS - number) * step).intersect(kept).slices_in(kept)] = True
         seen &= np.isfinite(raster) & ~ground
         blocks, cells = planes_of_blocks(made, options.levels(NEAR), seen), np.flatnonzero(seen)
         near = _near(
@@ -199,7 +200,7 @@ def ground_raster(
 
 
 def minimum_grid(
-    points: GroundPoints, window: CellWindow, cell: float
+    points: GroundPoints, window: GridWindow, cell: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
     """Make the minimum grid of a window, without low outliers.
 
@@ -214,7 +215,7 @@ def minimum_grid(
     """
     shape, cells = (window.height, window.width), window.height * window.width
     usable = np.flatnonzero(points.use)
-    inside = window.numbers(points.column[usable], points.row[usable])
+    inside = window.flat_index(points.column[usable], points.row[usable])
     x, y, z = (axis[usable] for axis in points[:3])
     low = lowest_points(x, y, z, inside, cells).reshape(shape)
     lowest = np.append(usable, -1)[low]

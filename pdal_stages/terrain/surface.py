@@ -16,8 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.grid import GridWindow
 from ..base.jit import device, njit
-from .cells import HOLE, CellWindow
+from .cells import HOLE
 from .openings import highest_around
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
@@ -30,7 +31,7 @@ _HOLD = 0.1
 class GroundRaster(NamedTuple):
     """A minimum grid and what was found on it."""
 
-    window: CellWindow  #: which cells
+    window: GridWindow  #: which cells
     #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
     lowest: NDArray[np.float32]
     #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
@@ -44,9 +45,9 @@ class GroundRaster(NamedTuple):
         """Rows and columns."""
         return self.ground.shape
 
-    def cut(self, window: CellWindow) -> GroundRaster:
+    def cut(self, window: GridWindow) -> GroundRaster:
         """A copy of some of the cells."""
-        part = window.on(self.window)
+        part = window.slices_in(self.window)
         return self._replace(
             window=window,
             opened={radius: values[part].copy() for radius, values in self.opened.items()},
@@ -303,8 +304,8 @@ def heights_above(x, y, z, cell, left, bottom, planes, height, gradient):
         gradient[p] = np.sqrt(across * across + along * along) / cell
 
 
-def around(window: CellWindow, column: NDArray, row: NDArray) -> NDArray[np.bool_]:
+def around(window: GridWindow, column: NDArray, row: NDArray) -> NDArray[np.bool_]:
     """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose planes points blend."""
     held = np.zeros((window.height, window.width), bool)
-    held.ravel()[window.numbers(column, row)] = True
+    held.ravel()[window.flat_index(column, row)] = True
     return highest_around(held, 1, 0)
