@@ -17,7 +17,7 @@ import shapely
 
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
-from pdal_stages.objects.compare import compare_buildings, matched_by_overlap, matched_by_place
+from pdal_stages.objects.comparison import compare_buildings, match_by_overlap, match_by_place
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 from pdal_stages.synthetic import TownOptions, make_town
 
@@ -85,13 +85,13 @@ def town(seed, codes=None, refuse=()):
     x0, y0 = made.options.origin[:2]
     square = shapely.box(x0, y0, x0 + SIZE, y0 + SIZE)
     codes, told = (made.classification, None) if codes is None else codes(made)
-    cells = Cells.of(*made.xyz.T, codes, 0.5, reliability=told)
+    cells = Cells.from_points(*made.xyz.T, codes, 0.5, reliability=told)
     rows = {}
     for step in (0.0, STEP):
         started = time.process_time()
         found, _ = find_objects(cells, ObjectSettings(step=step), progress=False).without(refuse)
         raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
-        shapes = [shapely.transform(s, lambda xy: xy / 2) for s in straight_outlines(raw, 0.5)]
+        shapes = [shapely.transform(s, lambda xy: xy / 2) for s in straight_outlines(raw)]
         seconds = time.process_time() - started
         houses = [h.intersection(square) for h in true_buildings(true.houses, step)]
         rows[f"buildings, step {step:g}"] = (
@@ -109,7 +109,7 @@ def town(seed, codes=None, refuse=()):
     at = np.column_stack([table["x"], table["y"]])
     inner = shapely.contains_xy(square.buffer(-2), *at.T)
     at, tall = at[inner], table["height"][inner]
-    pairs = matched_by_place(at, tall, places, high)
+    pairs = match_by_place(at, tall, places, high)
     away = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
     np.fill_diagonal(away, np.inf)
     alone = (away > radius[:, None] + radius[None] + 0.5).all(1)
@@ -123,7 +123,7 @@ def town(seed, codes=None, refuse=()):
         for many in (paths, true_paths)
     ]
     lines[1] = [shape for shape in lines[1] if shape.area > 8]
-    rows["spans"] = 2 * len(matched_by_overlap(*lines)) / sum(map(len, lines))
+    rows["spans"] = 2 * len(match_by_overlap(*lines)) / sum(map(len, lines))
     rows["trees"] = 2 * len(pairs) / (len(at) + len(places)), 2 * hit / (hit + wrong + alone.sum())
     return rows
 
@@ -136,11 +136,11 @@ def delft(data, picture=None):
 
     las = laspy.read(Path(data) / "delft" / "train.laz")
     xyz, codes = np.column_stack([las.x, las.y, las.z]), np.asarray(las.classification)
-    found = find_objects(Cells.of(*xyz.T, codes, 0.5), progress=False)
+    found = find_objects(Cells.from_points(*xyz.T, codes, 0.5), progress=False)
     raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
     listed = json.loads((Path(data) / "delft" / "buildings_train.geojson").read_text())["features"]
     true = [shapely.make_valid(shapely.from_geojson(json.dumps(f["geometry"]))) for f in listed]
-    for name, shapes in (("cells", raw), ("straight", straight_outlines(raw, 0.5))):
+    for name, shapes in (("cells", raw), ("straight", straight_outlines(raw))):
         shapes = [shapely.transform(s, lambda xy: xy / 2) for s in shapes]
         got = compare_buildings(shapes, true)
         print(

@@ -29,7 +29,7 @@ import shapely
 
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
-from pdal_stages.objects.compare import matched_by_place
+from pdal_stages.objects.comparison import match_by_place
 from pdal_stages.objects.crowns import canopy
 
 #: Plots by which settings were chosen, and those that were only scored; points/m2 where they are thinned, or None.
@@ -55,8 +55,8 @@ class Plot(NamedTuple):
 
     @property
     def cells(self):
-        cells = Cells.of(*self.xyz.T, self.codes, 0.5)
-        while cells.thin():
+        cells = Cells.from_points(*self.xyz.T, self.codes, 0.5)
+        while cells.sparse_kind():
             cells = cells.doubled()
         return cells
 
@@ -254,7 +254,7 @@ def main():
             found, true = method(plot), plot.true
             found = found[shapely.contains_xy(plot.area, *found[:, :2].T) & (found[:, 2] >= LEAST)]
             matched = [
-                matched_by_place(found[:, :2], found[:, 2], true[:, :2], true[:, 2], *by)
+                match_by_place(found[:, :2], found[:, 2], true[:, :2], true[:, 2], *by)
                 for by in TOLERANCES
             ]
             rows.append([f1(len(pairs), len(found), len(true)) for pairs in matched])

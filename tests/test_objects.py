@@ -12,7 +12,8 @@ from town_truth import true_objects
 import pdal_stages as ps
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.base.errors import StageError
-from pdal_stages.objects.cells import CLASSES, Kind, cell_keys, kind_of_code, object_id
+from pdal_stages.base.grid import cell_keys
+from pdal_stages.objects.cells import CLASSES, Kind, kind_of_code, object_id
 from pdal_stages.objects.crowns import crown_cells
 from pdal_stages.objects.raster_view import fill_gaps
 from pdal_stages.objects.roofs import connected
@@ -42,7 +43,7 @@ def scene(*parts, size=40.0, origin=(0.0, 0.0)):
 
 def found_in(xyz, codes, **options):
     chosen = ObjectSettings(**options)
-    return find_objects(Cells.of(*xyz.T, codes, chosen.cell), chosen, progress=False)
+    return find_objects(Cells.from_points(*xyz.T, codes, chosen.cell), chosen, progress=False)
 
 
 def same(a, b):
@@ -70,23 +71,23 @@ def test_records_against_a_plain_twin():
     xyz = np.round(rng.uniform(-4, 4, (500, 3)), 3)
     codes = rng.choice([1, 2, 5, 6, 7, 14, 17], 500).astype(np.uint8)
     told = np.where(np.arange(500) % 9, rng.uniform(0, 1, 500), np.nan)
-    cells = Cells.of(*xyz.T, codes, 0.5, reliability=told)
+    cells = Cells.from_points(*xyz.T, codes, 0.5, reliability=told)
     twin: dict[int, list[int]] = {}
     for n, ((x, y, _), code) in enumerate(zip(xyz, codes, strict=True)):
         kind = kind_of_code(CLASSES)[code] if code != 1 else Kind.OTHER
         if code != 7:
             wide = 1.0 if kind == Kind.GROUND else 0.5
-            key = int(cell_keys(int(kind), np.floor(y / wide), np.floor(x / wide)))
+            key = int(cell_keys(*np.floor([[x / wide], [y / wide]]).astype(int), kind)[0])
             twin.setdefault(key, []).append(n)
     assert cells.key.tolist() == sorted(twin)
     for at, key in enumerate(sorted(twin)):
         mm = np.rint(xyz[twin[key], 2] * 1000).astype(int)
         row = {name: int(values[at]) for name, values in cells.columns.items()}
-        assert row["count"] == len(mm) and row["told"] == np.count_nonzero(
+        assert row["count"] == len(mm) and row["rated"] == np.count_nonzero(
             ~np.isnan(told[twin[key]])
         )
         assert (row["low"], row["high"], row["sum"]) == (mm.min(), mm.max(), mm.sum())
-        assert row["sure"] == np.nansum(np.rint(told[twin[key]] * 1000))
+        assert row["reliability"] == np.nansum(np.rint(told[twin[key]] * 1000))
 
 
 @settings(max_examples=10, deadline=None)
@@ -94,9 +95,9 @@ def test_records_against_a_plain_twin():
 def test_records_do_not_depend_on_order_or_parts(seed, parts):
     rng = np.random.default_rng(seed)
     xyz, codes = rng.normal(0, 20, (300, 3)), rng.choice([2, 5, 6], 300).astype(np.uint8)
-    whole = Cells.of(*xyz.T, codes, 0.5)
+    whole = Cells.from_points(*xyz.T, codes, 0.5)
     order = np.array_split(rng.permutation(300), parts)
-    joined = Cells.join([Cells.of(*xyz[part].T, codes[part], 0.5) for part in order])
+    joined = Cells.join([Cells.from_points(*xyz[part].T, codes[part], 0.5) for part in order])
     np.testing.assert_array_equal(joined.key, whole.key)
     for name in whole.columns:
         np.testing.assert_array_equal(joined.columns[name], whole.columns[name])
@@ -230,7 +231,7 @@ def test_a_building_larger_than_any_block_and_its_margin():
     ground, codes = house(-10, 0, 510, 30, 0.0, 0.9, 2)
     xyz = np.concatenate([long, ground])
     codes = np.r_[np.full(len(long), 6, np.uint8), codes]
-    cells = Cells.of(*xyz.T, codes, 0.5)
+    cells = Cells.from_points(*xyz.T, codes, 0.5)
     whole = find_objects(cells, progress=False)
     assert len(whole.tables[Kind.BUILDING]) == 1
     same(whole, find_objects(cells, block=100, progress=False))
@@ -311,7 +312,7 @@ def test_blocks_change_nothing(town):
         near = np.hypot(town.xyz[:, 0] - x, town.xyz[:, 1] - y) < 2.5
         codes[near] = np.where(codes[near] == 6, 5, np.where(codes[near] == 5, 6, codes[near]))
     part = (town.xyz[:, :2] < town.xyz[:, :2].min(0) + 90).all(axis=1)
-    cells = Cells.of(*town.xyz[part].T, codes[part], 0.5)
+    cells = Cells.from_points(*town.xyz[part].T, codes[part], 0.5)
     same(find_objects(cells, progress=False), find_objects(cells, block=64, progress=False))
 
 
@@ -361,26 +362,26 @@ def test_far_points_cost_nothing():
     stray, more = np.random.default_rng(1).uniform(-1e6, 1e6, (2000, 3)), np.full(2000, 6, np.uint8)
     got = found_in(np.concatenate([xyz, stray]), np.r_[codes, more])
     assert len(got.tables[Kind.BUILDING]) == 1
-    with pytest.raises(StageError, match="too far out"):
-        found_in(np.concatenate([xyz, stray * 1e4]), np.r_[codes, more])
+    with pytest.raises(StageError, match="too large for the grid"):
+        found_in(np.concatenate([xyz, stray * [1e4, 1e4, 1]]), np.r_[codes, more])
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.6, 0.9]))
-def test_boundaries_of_cells_against_their_union(seed, share):
+def test_boundaries_polygon_against_their_union(seed, share):
     shapely = pytest.importorskip("shapely")
-    from pdal_stages.objects.outlines import _of_cells
+    from pdal_stages.objects.outlines import _polygon
 
     rng = np.random.default_rng(seed)
     row, column = np.nonzero(rng.random(rng.integers(1, 14, 2)) < share)
     if row.size:
         row, column = row - 1_000_000, column + 2_000_000
         whole = shapely.union_all(shapely.box(column, row, column + 1, row + 1))
-        walked = _of_cells(shapely, row, column, 0.0)
+        walked = _polygon(shapely, row, column, 0.0)
         assert walked.is_valid and walked.equals(whole) and walked.area == row.size
         parts = [shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= 3])
                  for p in shapely.get_parts(whole)]  # fmt: skip
-        assert _of_cells(shapely, row, column, 3.0).equals(shapely.MultiPolygon(parts))
+        assert _polygon(shapely, row, column, 3.0).equals(shapely.MultiPolygon(parts))
 
 
 def test_what_is_nowhere_two_meters_wide_is_to_be_checked():
@@ -477,7 +478,7 @@ def test_lamps_among_trees_are_to_be_checked():
     leaves = np.concatenate([lamp, mast, slim[0]])
     table = found_in(*scene((leaves, np.full(len(leaves), 5, np.uint8)))).tables[Kind.TREE]
     poles = {tuple(np.floor([x / 5, y / 5]).astype(int).tolist()) for x, y, p in zip(
-        table.columns["x"], table.columns["y"], table.having(["pole"]), strict=True) if p}  # fmt: skip
+        table.columns["x"], table.columns["y"], table.has_reason(["pole"]), strict=True) if p}  # fmt: skip
     assert len(table) == 4 and poles == {(2, 2)}
 
 

@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from pdal_stages.objects.compare import (
+from pdal_stages.objects.comparison import (
     compare_buildings,
     compare_trees,
-    matched_by_overlap,
-    matched_by_place,
+    match_by_overlap,
+    match_by_place,
 )
 
 shapely = pytest.importorskip("shapely")
@@ -54,7 +54,7 @@ def test_overlaps_are_matched_as_by_hand():
             one.add(a)
             other.add(b)
             kept.append((a, b))
-    assert len(kept) > 5 and sorted(matched_by_overlap(found, true, 0.3)) == sorted(kept)
+    assert len(kept) > 5 and sorted(match_by_overlap(found, true, 0.3)) == sorted(kept)
 
 
 def test_trees_are_matched_as_by_hand():
@@ -73,7 +73,7 @@ def test_trees_are_matched_as_by_hand():
             one.add(a)
             other.add(b)
             kept.append((a, b))
-    assert len(kept) > 10 and sorted(matched_by_place(found, high, true, true_high)) == sorted(kept)
+    assert len(kept) > 10 and sorted(match_by_place(found, high, true, true_high)) == sorted(kept)
 
 
 def test_figures_of_buildings():
@@ -176,7 +176,7 @@ def test_delft_against_official_outlines(tmp_path, run, data_dir):
 
 
 def test_heights_of_trees_may_be_texts_of_numbers_or_missing(tmp_path):
-    from pdal_stages.objects.compare import Things
+    from pdal_stages.objects.comparison import VectorObjects
 
     spots = [shapely.Point(10 * n, 5) for n in range(4)]
     path = write(
@@ -186,9 +186,9 @@ def test_heights_of_trees_may_be_texts_of_numbers_or_missing(tmp_path):
         "trees",
         height=np.array(["12.5", "", "nan", "7"], object),
     )
-    np.testing.assert_array_equal(Things(path).trees[1], [12.5, np.nan, np.nan, 7])
+    np.testing.assert_array_equal(VectorObjects.read(path).trees[1], [12.5, np.nan, np.nan, 7])
     path = write(tmp_path / "u.gpkg", spots, "Point", "trees", h_m=[1, 2, 3, 4])
-    assert np.isnan(Things(path).trees[1]).all()
+    assert np.isnan(VectorObjects.read(path).trees[1]).all()
 
 
 def test_heights_that_are_none(tmp_path, run, bad="12,5 m"):

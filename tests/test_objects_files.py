@@ -13,6 +13,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages import Cells, cli
 from pdal_stages.base.errors import StageError
+from pdal_stages.base.vector import vector
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.synthetic import write_town
@@ -62,14 +63,14 @@ def turned_rectangles(*boxes, angle=0.3):
 @pytest.mark.parametrize("angle", [0.0, 0.7])
 def test_walls_are_straight(angle):
     true, cells = turned_rectangles((5, 5, 45, 25), angle=angle)
-    (made,) = straight_outlines(cells, 0.5)
+    (made,) = straight_outlines(cells)
     assert made.is_valid and len(made.exterior.coords) == 5
     assert made.symmetric_difference(true[0]).area < 0.05 * true[0].area
 
 
 def test_neighbors_share_their_wall():
     true, cells = turned_rectangles((5, 5, 30, 25), (30, 5, 50, 20), angle=0.4)
-    made = straight_outlines(cells, 0.5)
+    made = straight_outlines(cells)
     assert all(m.is_valid for m in made)
     assert made[0].intersection(made[1]).area < 1e-6
     assert made[0].boundary.intersection(made[1].boundary).length > 12
@@ -86,11 +87,13 @@ def test_holes_stay_and_small_ones_close():
     chimney = (np.abs(x - 8) < 0.8) & (np.abs(y - 8) < 0.8)
     roof = (x > 4) & (x < 36) & (y > 4) & (y < 36) & ~court & ~chimney
     found = find_objects(
-        Cells.of(x, y, np.where(roof, 6.0, 0.0), np.where(roof, 6, 2).astype(np.uint8), 0.5),
+        Cells.from_points(
+            x, y, np.where(roof, 6.0, 0.0), np.where(roof, 6, 2).astype(np.uint8), 0.5
+        ),
         progress=False,
     )
     raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
-    for (shape,) in (raw, straight_outlines(raw, 0.5)):
+    for (shape,) in (raw, straight_outlines(raw)):
         assert shape.is_valid and len(shape.interiors) == 1
         assert shapely.Polygon(shape.interiors[0]).area * 0.25 == pytest.approx(100, rel=0.15)
 
@@ -224,14 +227,12 @@ def test_what_cannot_be(folder, tmp_path, target, text, capsys):
 
 
 def test_without_the_extra(monkeypatch):
-    from pdal_stages.objects import outlines
-
     monkeypatch.setitem(sys.modules, "shapely", None)
     monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
     with pytest.raises(
         StageError, match=r"needs the Python package 'shapely'.*pip install 'pdal-stages\[vector\]'"
     ):
-        outlines.vector("shapely")
+        vector("shapely")
 
 
 @pytest.mark.pdal
@@ -318,7 +319,7 @@ def test_frames_in_one_call(folder):
     geopandas = pytest.importorskip("geopandas")
     las = laspy.read(folder / "town.laz")
     frames = ps.object_frames(las.xyz, las.classification, crs="EPSG:25832")
-    cells = ps.Cells.of(*las.xyz.T, np.asarray(las.classification), 0.5)
+    cells = ps.Cells.from_points(*las.xyz.T, np.asarray(las.classification), 0.5)
     layers = ps.object_layers(ps.find_objects(cells, progress=False))
     assert list(frames) == list(layers)
     for name, frame in frames.items():

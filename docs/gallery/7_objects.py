@@ -18,7 +18,7 @@ INKS = {
 TO_CHECK = ("#facd5a", "#aa6e00")
 
 points = town(seed=4)
-cells = ps.Cells.of(*points.xyz.T, points.classification, 0.5)
+cells = ps.Cells.from_points(*points.xyz.T, points.classification, 0.5)
 objects = ps.find_objects(cells, ps.ObjectSettings(), progress=False)
 layers = ps.object_layers(objects)
 west, south, east, north = shapely.total_bounds(

@@ -144,8 +144,8 @@ class GridWindow(NamedTuple):
             self.left - cells, self.bottom - cells, self.width + 2 * cells, self.height + 2 * cells
         )
 
-    def contains(self, column: npt.NDArray, row: npt.NDArray) -> npt.NDArray[np.bool_]:
-        """Return which cells lie in the window."""
+    def contains(self, column: Any, row: Any) -> Any:
+        """Return which cells, arrays or numbers, lie in the window."""
         inside = (column >= self.left) & (column < self.left + self.width)
         return inside & (row >= self.bottom) & (row < self.bottom + self.height)
 

@@ -166,7 +166,7 @@ def _accuracy(options: argparse.Namespace) -> None:
 def _compare_objects(options: argparse.Namespace) -> None:
     """``accuracy town.gpkg --objects reference.gpkg``."""
     from ..base.files import write_json
-    from ..objects.compare import compare_objects, remarks, table, to_json
+    from ..objects.comparison import compare_objects, table, to_json
 
     if len(options.inputs) != 1 or options.reference or options.overrides or options.html:
         raise StageError(
@@ -176,9 +176,9 @@ def _compare_objects(options: argparse.Namespace) -> None:
     found, reference = options.inputs[0], options.objects
     outputs = [Output(options.json, "json", JSON)] if options.json else []
     check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
-    figures, one, two = compare_objects(found, reference, options.area)
+    figures, warnings = compare_objects(found, reference, options.area)
     print(table(figures), end="")
-    print_messages(*remarks(one, two))
+    print_messages(*warnings)
     if options.json:
         write_json(options.json, to_json(figures), "json")
 

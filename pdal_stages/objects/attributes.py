@@ -1,8 +1,9 @@
-"""What is measured of an object, and the verdict: sure, or to be checked and why."""
+"""Measures of an object, and its verdict: sure, or to be checked and why."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,76 +14,112 @@ from .cells import MM
 from .results import ObjectSettings
 from .roofs import roof_planes
 
-SURE, CHECK = "sure", "check"
-#: A building holds a square of this side, meters; wires that were taken for one do not.
-WIDE = 2.0
-#: Less than such a mean reliability of its points is unsure.
-RELIABLE = 0.7
-#: What stands about and is no building, by reason: its width, length and height, meters, as cells show them, up to two
-#: cells wider; how many times as long as wide it is at least; and how much its top slopes at most, degrees.
-BOXES = {
-    "vehicle": ((1.5, 3.2), (3.5, 7.0), (0.0, 2.4), 1.5, 25.0),
-    "container": ((2.0, 3.7), (5.5, 13.5), (2.2, 3.8), 1.9, 6.0),
-}
-#: A lamp or pole that was taken for a tree: no higher, meters; its width at most such a share of its height; and in fewer
-#: than `CROWN` of its cells points `DEEP` meters above each other, since an arm answers once, a crown at several heights.
-POLE, SLIM, DEEP, CROWN = 15.0, 0.35, 0.8, 0.36
+#: Verdicts.
+SURE = "sure"
+CHECK = "check"
 #: Why an object is to be checked.
 REASONS = (
-    "no ground near", "small", "narrow", "vehicle", "container", "low", "rough roof", "unsure points", "no facade",
-    "few points", "thin crown", "wide crown", "pole", "short", "not straight",
+    "no ground near", "small", "narrow", "vehicle", "container", "low", "rough roof",
+    "unsure points", "no facade", "few points", "thin crown", "wide crown", "pole", "short",
+    "not straight",
 )  # fmt: skip
 
 
-class Body(NamedTuple):
-    """An object's cells, row by row, and what was measured in each."""
+@dataclass(frozen=True)
+class CheckRules:
+    """Limits beyond which an object is to be checked; lengths in meters, areas in m2."""
+
+    min_reliability: float = 0.7  #: mean of the object's points
+    min_building_area: float = 10.0  #: sheds are kept, yet often something else
+    min_building_width: float = 2.0  #: side of the square that it must hold; wires do not
+    min_building_height: float = 2.2  #: of the ridge: a door's height
+    min_planar_share: float = 0.3  #: cells of a roof in a plane; less looks like vegetation
+    rough_from_area: float = 30.0  #: smaller roofs hold too few cells for planes
+    facade_to_area: float = 50.0  #: larger buildings may hide their walls from the laser
+    min_facade: float = 1.5  #: height between points of a cell at the edge that shows a wall
+    max_box_area: float = 45.0  #: larger objects are no vehicles or containers
+    min_tree_points: int = 10
+    min_crown_ratio: float = 0.12  #: crown diameter / height
+    max_crown_ratio: float = 1.6  #: crown diameter / height
+    max_pole_height: float = 15.0  #: lamps are no higher
+    max_pole_ratio: float = 0.35  #: width / height of a pole with its arm
+    crown_depth: float = 0.8  #: points of a cell of a crown lie this far above each other
+    min_crown_share: float = 0.36  #: cells that deep: an arm returns one echo, a crown several
+    min_span: float = 8.0
+    min_straightness: float = 0.9  #: distance between a span's ends / its length
+    min_deck_area: float = 20.0
+    min_deck_height: float = 0.5
+
+
+@dataclass(frozen=True)
+class BoxShape:
+    """Ranges of a box's sides in meters, as cells show them: up to two cells wider than it is."""
+
+    width: tuple[float, float]
+    length: tuple[float, float]
+    height: tuple[float, float]
+    min_ratio: float  #: length / width
+    max_slope: float  #: of the top, degrees
+
+
+RULES = CheckRules()
+#: Boxes that are often taken for buildings, by reason.
+BOXES = {
+    "vehicle": BoxShape((1.5, 3.2), (3.5, 7.0), (0.0, 2.4), 1.5, 25.0),
+    "container": BoxShape((2.0, 3.7), (5.5, 13.5), (2.2, 3.8), 1.9, 6.0),
+}
+
+
+class ObjectCells(NamedTuple):
+    """Cells of an object, row by row: (n,) arrays."""
 
     row: NDArray[np.int64]
     column: NDArray[np.int64]
-    z: NDArray[np.float64]  # of the roof, the canopy, the wires: highest point, meters
-    low: NDArray[np.float64]  # lowest point; NaN in cells without points
-    ground: NDArray[np.float64]  # NaN where it is not known
-    points: NDArray[np.int64]  # points
-    sure: NDArray[np.float64]  # sum of reliabilities, thousandths
-    told: NDArray[np.int64]  # points that have one
+    z: NDArray[np.float64]  #: highest point of the roof, canopy or wires, meters
+    low: NDArray[np.float64]  #: lowest point, meters; NaN in cells without points
+    ground: NDArray[np.float64]  #: height of the ground, meters; NaN where it is not known
+    points: NDArray[np.int64]
+    reliability: NDArray[np.float64]  #: sum over points, thousandths
+    rated: NDArray[np.int64]  #: points with a reliability
 
     @property
     def place(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns from the object's own first ones."""
         return self.row - self.row.min(), self.column - self.column.min()
 
-    def image(self, values: NDArray) -> NDArray:
-        """Values of the cells as an array (rows, columns), NaN outside."""
+    def raster(self, values: NDArray) -> NDArray:
+        """Return values of the cells as a raster (rows, columns), NaN outside."""
         out = np.full((int(np.ptp(self.row)) + 1, int(np.ptp(self.column)) + 1), np.nan)
         out[self.place] = values
         return out
 
     @property
     def ground_height(self) -> float:
-        """The middle one of the ground's heights, NaN where there is none."""
+        """Median height of the ground, NaN where it is not known."""
         return float(np.nanmedian(self.ground)) if not np.isnan(self.ground).all() else math.nan
 
-    def record(self, measures: dict[str, Any], reasons: dict[str, bool]) -> dict[str, Any]:
-        """Measures, points and their mean reliability (NaN where they have none), and the verdict that follows."""
-        told = int(self.told.sum())
-        reliability = float(self.sure.sum()) / told / MM if told else math.nan
-        reasons["unsure points"] = reliability < RELIABLE
+    def describe(self, measures: dict[str, Any], reasons: dict[str, bool]) -> dict[str, Any]:
+        """Return the measures with points, mean reliability (NaN if unknown) and verdict."""
+        rated = int(self.rated.sum())
+        reliability = float(self.reliability.sum()) / rated / MM if rated else math.nan
+        reasons["unsure points"] = reliability < RULES.min_reliability
         text = ", ".join(reason for reason, holds in reasons.items() if holds)
         verdict = {"verdict": CHECK if text else SURE, "reason": text}
         return {**measures, "points": int(self.points.sum()), "reliab": reliability, **verdict}
 
 
-def building(body: Body, size: float) -> dict[str, Any]:
-    """Heights, roof and verdict of a building."""
-    image, ground = body.image(body.z), body.ground_height
-    inside, area = ~np.isnan(image), len(body.row) * size * size
-    above = body.z - (np.nanmin(body.low) if math.isnan(ground) else ground)
-    edge = ~scipy.ndimage.binary_erosion(inside)[body.place]
-    square = np.ones((math.ceil(WIDE / size),) * 2, bool)
-    planes, slope, planar = roof_planes(image, size)
-    facade = np.mean(np.nan_to_num(body.z[edge] - body.low[edge]) >= 1.5)
+def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
+    """Return heights, roof and verdict of a building."""
+    raster, ground = cells.raster(cells.z), cells.ground_height
+    inside, area = ~np.isnan(raster), len(cells.row) * size * size
+    above = cells.z - (np.nanmin(cells.low) if math.isnan(ground) else ground)
+    edge = ~scipy.ndimage.binary_erosion(inside)[cells.place]
+    square = np.ones((math.ceil(RULES.min_building_width / size),) * 2, bool)
+    planes, slope, planar = roof_planes(raster, size)
+    facade = np.mean(np.nan_to_num(cells.z[edge] - cells.low[edge]) >= RULES.min_facade)
     ridge = float(np.percentile(above, 98))
-    like = _box_like(body, ridge, slope, size) if area < 45 else ""
-    return body.record(
+    box = _box_like(cells, ridge, slope, size) if area < RULES.max_box_area else ""
+    return cells.describe(
         {
             "area": area,
             "h_eave": float(np.percentile(above[edge], 25)),
@@ -94,106 +131,107 @@ def building(body: Body, size: float) -> dict[str, Any]:
         },
         {
             "no ground near": math.isnan(ground),
-            "small": area < 10,
+            "small": area < RULES.min_building_area,
             "narrow": not scipy.ndimage.binary_erosion(inside, square).any(),
-            like: bool(like),
-            "low": ridge < 2.2,
-            "rough roof": planar < 0.3 and area >= 30,
-            "no facade": facade == 0 and area < 50,
+            box: bool(box),
+            "low": ridge < RULES.min_building_height,
+            "rough roof": planar < RULES.min_planar_share and area >= RULES.rough_from_area,
+            "no facade": facade == 0 and area < RULES.facade_to_area,
         },
     )
 
 
-def _box_like(body: Body, height: float, slope: float, size: float) -> str:
-    """Which of `BOXES` an object may be; empty where none."""
+def _box_like(cells: ObjectCells, height: float, slope: float, size: float) -> str:
+    """Return which of `BOXES` an object may be; empty where it is like none of them."""
     turns = np.radians(np.arange(0.0, 90.0, 3.0))[:, None]
-    u = body.column * np.cos(turns) + body.row * np.sin(turns)
-    v = body.row * np.cos(turns) - body.column * np.sin(turns)
+    u = cells.column * np.cos(turns) + cells.row * np.sin(turns)
+    v = cells.row * np.cos(turns) - cells.column * np.sin(turns)
     sides = np.array([np.ptp(u, axis=1) + 1.0, np.ptp(v, axis=1) + 1.0]) * size
     width, length = sorted(sides[:, np.argmin(np.round(sides.prod(axis=0), 6))].tolist())
-    for name, (wide, long, high, ratio, flat) in BOXES.items():
-        fits = (
-            wide[0] <= width <= wide[1]
-            and long[0] <= length <= long[1]
-            and high[0] <= height <= high[1]
-        )
-        if fits and length >= ratio * width and slope <= flat:
+    for name, box in BOXES.items():
+        ranges = (box.width, width), (box.length, length), (box.height, height)
+        fits = all(low <= value <= high for (low, high), value in ranges)
+        if fits and length >= box.min_ratio * width and slope <= box.max_slope:
             return name
     return ""
 
 
-def tree(body: Body, top_row: int, top_column: int, chosen: ObjectSettings) -> dict[str, Any]:
-    """Place, height, crown and likely stem of a tree, and the verdict."""
-    size = chosen.cell
-    area = len(body.row) * size * size
-    above = body.z - body.ground
+def measure_tree(
+    cells: ObjectCells, top_row: int, top_column: int, settings: ObjectSettings
+) -> dict[str, Any]:
+    """Return place, height, crown, estimated stem and verdict of a tree."""
+    size = settings.cell
+    area = len(cells.row) * size * size
+    above = cells.z - cells.ground
     highest = int(np.argmax(np.where(np.isnan(above), -np.inf, above)))
     height, diameter = float(above[highest]), 2.0 * math.sqrt(area / math.pi)
-    deep = np.mean(np.nan_to_num(body.z - body.low) > DEEP)
-    return body.record(
+    crown_share = np.mean(np.nan_to_num(cells.z - cells.low) > RULES.crown_depth)
+    slim = height <= RULES.max_pole_height and diameter < RULES.max_pole_ratio * height
+    return cells.describe(
         {
             "x": (top_column + 0.5) * size,
             "y": (top_row + 0.5) * size,
             "height": height,
             "area": area,
             "diam": diameter,
-            "dbh": chosen.dbh_factor * max(height * diameter, 0.0) ** chosen.dbh_power,
-            "ground": float(body.ground[highest]),
+            "dbh": settings.dbh_factor * max(height * diameter, 0.0) ** settings.dbh_power,
+            "ground": float(cells.ground[highest]),
         },
         {
-            "few points": body.points.sum() < 10,
-            "thin crown": diameter < 0.12 * height,
-            "wide crown": diameter > 1.6 * height,
-            "pole": height <= POLE and diameter < SLIM * height and bool(deep < CROWN),
+            "few points": cells.points.sum() < RULES.min_tree_points,
+            "thin crown": diameter < RULES.min_crown_ratio * height,
+            "wide crown": diameter > RULES.max_crown_ratio * height,
+            "pole": slim and bool(crown_share < RULES.min_crown_share),
         },
     )
 
 
-def span(body: Body, size: float) -> dict[str, Any]:
-    """Length and clearance of the wires between two masts, the path (k, 3) along them, and the verdict."""
-    path = path_of(body, size)
+def measure_span(cells: ObjectCells, size: float) -> dict[str, Any]:
+    """Return length, clearance, sag, path and verdict of the wires between two masts."""
+    path = wire_path(cells, size)
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))]
-    length, clearance = float(along[-1]), body.low - body.ground
+    length, clearance = float(along[-1]), cells.low - cells.ground
     chord = np.interp(along, along[[0, -1]], path[[0, -1], 2])
-    return body.record(
+    straight = float(np.hypot(*(path[-1, :2] - path[0, :2])))
+    return cells.describe(
         {
             "length": length,
             "h_low": float(np.nanmin(clearance)) if not np.isnan(clearance).all() else math.nan,
-            "z_high": float(body.z.max()),
+            "z_high": float(cells.z.max()),
             "sag": float(max(0.0, np.max(chord - path[:, 2]))),
             "path": path,
         },
         {
-            "short": length < 8,
-            "not straight": bool(np.hypot(*(path[-1, :2] - path[0, :2])) < 0.9 * length),
+            "short": length < RULES.min_span,
+            "not straight": straight < RULES.min_straightness * length,
         },
     )
 
 
-def path_of(body: Body, size: float) -> NDArray[np.float64]:
-    """A line along wires (n, 3), meters: the middle of each piece of 2 m along their main direction."""
-    x, y = (body.column + 0.5) * size, (body.row + 0.5) * size
+def wire_path(cells: ObjectCells, size: float) -> NDArray[np.float64]:
+    """Return a line along wires (n, 3), meters: means of pieces of 2 m along their direction."""
+    x, y = (cells.column + 0.5) * size, (cells.row + 0.5) * size
     u, v = x - x.min(), y - y.min()
     du, dv = u - u.mean(), v - v.mean()
     angle = 0.5 * math.atan2(2.0 * float(du @ dv), float(du @ du - dv @ dv))
     c, s = math.cos(angle), math.sin(angle)
-    along, aside = u * c + v * s, v * c - u * s
+    along, across = u * c + v * s, v * c - u * s
     _, piece = np.unique(np.floor((along - along.min()) / 2.0), return_inverse=True)
-    many = np.bincount(piece)
-    if len(many) == 1:  # a wire seen in one place
+    count = np.bincount(piece)
+    if len(count) == 1:  # a wire of one piece
         ends = [np.argmin(along), np.argmax(along)]
-        return np.column_stack([x, y, body.z])[ends]
-    if np.ptp(aside) < 4.0:  # wires side by side: one straight line between them
-        aside = np.full(len(aside), aside.mean())
-    u, v, z = (np.bincount(piece, weights=values) / many for values in (along, aside, body.z))
+        return np.column_stack([x, y, cells.z])[ends]
+    if np.ptp(across) < 4.0:  # wires side by side: one straight line between them
+        across = np.full(len(across), across.mean())
+    u, v, z = (np.bincount(piece, weights=values) / count for values in (along, across, cells.z))
     u[[0, -1]] = along.min(), along.max()  # from one end to the other
     return np.column_stack([x.min() + u * c - v * s, y.min() + u * s + v * c, z])
 
 
-def deck(body: Body, size: float) -> dict[str, Any]:
-    """Area, height and clearance of a bridge deck, and the verdict."""
-    area, ground, height = len(body.row) * size * size, body.ground_height, float(np.median(body.z))
-    return body.record(
-        {"area": area, "z": height, "clear": height - ground, "ground": ground},
-        {"small": area < 20, "low": height - ground < 0.5},
+def measure_deck(cells: ObjectCells, size: float) -> dict[str, Any]:
+    """Return area, height, clearance and verdict of a bridge deck."""
+    area, ground, z = len(cells.row) * size * size, cells.ground_height, float(np.median(cells.z))
+    return cells.describe(
+        {"area": area, "z": z, "clear": z - ground, "ground": ground},
+        {"small": area < RULES.min_deck_area, "low": z - ground < RULES.min_deck_height},
     )

@@ -1,9 +1,10 @@
-"""Find all objects in records of cells, block by block of the absolute grid.
+"""Detect all objects in records of cells, block by block of the absolute grid.
 
-Memory is that of a block with its surroundings and of what was found. A block is looked at with `MARGIN` around it, within
-which the ground and crowns are what they are in the whole; where a building, span or deck that reaches into the block comes
-near the rim of what is seen, more is looked at. An object is of the block that its first cell (a tree: its top) lies in.
-So blocks, and tiles that hold as much, find exactly what one look at everything finds.
+Memory is that of one block with its surroundings, and of the objects. A block is seen with
+`MARGIN` around it, within which ground and crowns are those of the whole area; where a building,
+span or deck that reaches into the block comes near the rim of the view, the view is widened. An
+object belongs to the block that its first cell (a tree: its top) lies in. So blocks, and tiles
+with as much around them, give exactly the objects of the whole area.
 """
 
 from __future__ import annotations
@@ -15,19 +16,35 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ..base.grid import GridWindow, cell_keys, split_keys
 from ..base.progress import Progress
 from . import attributes, crowns, roofs
-from .attributes import Body
-from .cells import Cells, Kind, cell_keys, object_id, unpack
-from .raster_view import AROUND, MARGIN, CellView, Window
-from .results import Objects, ObjectSettings, Table
+from .attributes import ObjectCells
+from .cells import Cells, Kind, object_id
+from .raster_view import MARGIN, NEIGHBORS, CellView, pad_evenly
+from .results import Objects, ObjectSettings, ObjectTable
 
-#: Meters more that are looked at first: most buildings that reach into a block end there, so few blocks are looked at twice.
-AHEAD = 64.0
+#: Meters beyond `MARGIN` in the first view: most buildings that reach into a block end there.
+LOOKAHEAD = 64.0
 #: Side of a block, cells.
 BLOCK = 2048
-#: Kinds that are found.
-FOUND = (Kind.BUILDING, Kind.TREE, Kind.SPAN, Kind.DECK)
+#: Distance around a tower within which wires end, meters.
+TOWER_RADIUS = 1.5
+#: Vegetation on a roof counts as roof up to this height above it (chimneys, gutters), meters.
+ROOF_TOLERANCE = 0.5
+#: Fewest cells of a span.
+MIN_SPAN_CELLS = 4
+#: Height step that separates two decks, meters.
+DECK_STEP = 1.0
+#: Smallest area of a deck's part, m2; smaller ones join their neighbor.
+DECK_PART = 10.0
+
+
+class _Object(NamedTuple):
+    identity: int
+    record: dict[str, Any]  # measures and verdict
+    cells: ObjectCells
+    keys: NDArray[np.int64]  # of the cells whose points belong to it
 
 
 def find_objects(
@@ -37,171 +54,162 @@ def find_objects(
     block: int = BLOCK,
     progress: bool | None = None,
 ) -> Objects:
-    """All objects of an area.
+    """Return all objects of an area.
 
     Parameters
     ----------
     cells : Cells
-        Records of all points of the area, by :meth:`Cells.of`; a meter or two of its edge may be cut off objects.
+        Records of all points of the area, by :meth:`Cells.from_points`; objects may be cut a meter
+        or two from its edge.
     settings : ObjectSettings, optional
     block : int
         Side of the blocks of work, in cells; even. It changes nothing but memory.
     progress : bool, optional
         Whether to show progress on stderr.
     """
-    chosen = settings or ObjectSettings(cell=cells.size)
-    if chosen.cell != cells.size:
-        raise ValueError(f"cells of {cells.size} m, settings for {chosen.cell} m")
-    found: dict[Kind, list[_One]] = {kind: [] for kind in FOUND}
-    of_block: dict[tuple[int, int], list[Kind]] = {}
-    for kind in FOUND:
-        _, row, column = unpack(cells.of_kind(kind).key)
-        for north, east in np.unique(np.stack([row // block, column // block]), axis=1).T.tolist():
-            of_block.setdefault((north, east), []).append(kind)
-    with Progress(len(of_block), "objects", "blocks", enabled=progress) as line:
-        for (north, east), kinds in of_block.items():
-            core = Window(north * block, east * block, block, block)
-            near = CellView(cells, core.widened(round((MARGIN + AHEAD) / cells.size)), chosen)
+    settings = settings or ObjectSettings(cell=cells.size)
+    if settings.cell != cells.size:
+        raise ValueError(f"cells of {cells.size} m, settings for {settings.cell} m")
+    kinds_of_block: dict[tuple[int, int], list[Kind]] = {}
+    for kind in _DETECTORS:
+        column, row, _ = split_keys(cells.of_kind(kind).key)
+        for j, i in np.unique(np.stack([row // block, column // block]), axis=1).T.tolist():
+            kinds_of_block.setdefault((j, i), []).append(kind)
+    detected: dict[Kind, list[_Object]] = {kind: [] for kind in _DETECTORS}
+    with Progress(len(kinds_of_block), "objects", "blocks", enabled=progress) as progress_line:
+        for (j, i), kinds in kinds_of_block.items():
+            core = GridWindow(i * block, j * block, block, block)
+            window = pad_evenly(core, round((MARGIN + LOOKAHEAD) / cells.size))
+            view = CellView(cells, window, settings)
             for kind in kinds:
-                found[kind] += _FINDERS[kind](near, core, kind)
-            line.update()
-    none = [np.empty(0, np.int64)]
-    key = np.concatenate(none + [one.keys for ones in found.values() for one in ones])
-    owner = np.repeat(
-        np.array([one.identity for ones in found.values() for one in ones], np.int64),
-        [len(one.keys) for ones in found.values() for one in ones],
-    )
+                detected[kind] += _DETECTORS[kind](view, core, kind)
+            progress_line.update()
+    every = [each for objects in detected.values() for each in objects]
+    key = np.concatenate([np.empty(0, np.int64), *(each.keys for each in every)])
+    identities = np.array([each.identity for each in every], np.int64)
+    owner = np.repeat(identities, [len(each.keys) for each in every])
     order = np.argsort(key, kind="stable")
-    return Objects(
-        chosen, {kind: _table(ones) for kind, ones in found.items()}, key[order], owner[order]
+    tables = {kind: _table(objects) for kind, objects in detected.items()}
+    return Objects(settings, tables, key[order], owner[order])
+
+
+def _table(objects: list[_Object]) -> ObjectTable:
+    objects = sorted(objects, key=lambda each: each.identity)
+    names = [name for name in (objects[0].record if objects else ()) if name != "path"]
+    return ObjectTable(
+        np.array([each.identity for each in objects], np.int64),
+        {name: np.array([each.record[name] for each in objects]) for name in names},
+        [np.column_stack([each.cells.row, each.cells.column, each.cells.z]) for each in objects],
+        [each.record["path"] for each in objects if "path" in each.record],
     )
 
 
-class _One(NamedTuple):
-    """An object: its id, what was measured, its cells, and the keys of those that hold its points."""
-
-    identity: int
-    record: dict[str, Any]
-    body: Body
-    keys: NDArray[np.int64]
-
-
-def _table(ones: list[_One]) -> Table:
-    ones = sorted(ones, key=lambda one: one.identity)
-    columns = {
-        name: np.array([one.record[name] for one in ones])
-        for name in (ones[0].record if ones else ())
-        if name != "path"
-    }
-    return Table(
-        np.array([one.identity for one in ones], np.int64),
-        columns,
-        [np.column_stack([one.body.row, one.body.column, one.body.z]) for one in ones],
-        [one.record["path"] for one in ones if "path" in one.record],
-    )
-
-
-def _bodies(
-    number: NDArray[np.int64],
-) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
-    """Every object's number, and the rows and columns of its cells, row by row."""
-    flat = np.flatnonzero(number.ravel() >= 0)
-    order = flat[np.argsort(number.ravel()[flat], kind="stable")]
-    values, first = np.unique(number.ravel()[order], return_index=True)
+def _parts(label: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
+    """Yield each label from 0, and the rows and columns of its cells, row by row."""
+    flat = np.flatnonzero(label.ravel() >= 0)
+    order = flat[np.argsort(label.ravel()[flat], kind="stable")]
+    values, first = np.unique(label.ravel()[order], return_index=True)
     for n, cells in zip(values.tolist(), np.split(order, first[1:]), strict=False):
-        yield n, cells // number.shape[1], cells % number.shape[1]
+        yield n, cells // label.shape[1], cells % label.shape[1]
 
 
-def _surfaces(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
-    """Buildings and decks."""
-    view, mask = near.whole(core, lambda view: view.surface(kind)[0])
-    chosen, z = view.chosen, view.surface(kind)[1]
-    area = chosen.cell**2
-    step, part = (chosen.step, chosen.roof_part) if kind == Kind.BUILDING else (1.0, 10.0)
-    number = roofs.building_parts(mask, z, step=step, smallest=int(np.ceil(part / area)))
-    number = _without_small(number, chosen.building_area / area)
-    # Points of a wall that stands out, and low ones beside it, belong to the lowest number beside them.
+def _detect_surfaces(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
+    """Yield buildings or decks."""
+    view, mask = view.widened_to_whole(core, lambda view: view.surface(kind)[0])
+    settings, z = view.settings, view.surface(kind)[1]
+    area = settings.cell**2
+    step, part, measure = DECK_STEP, DECK_PART, attributes.measure_deck
+    if kind == Kind.BUILDING:
+        step, part, measure = settings.step, settings.roof_part, attributes.measure_building
+    label = roofs.building_parts(mask, z, step=step, smallest=int(np.ceil(part / area)))
+    label = _without_small(label, settings.building_area / area)
+    # Points of a protruding wall, and low ones beside it, belong to the lowest label beside them.
     none = np.iinfo(np.int64).max
-    beside = np.where(number < 0, none, number)
+    beside = np.where(label < 0, none, label)
     beside = scipy.ndimage.minimum_filter(beside, 3, mode="constant", cval=none)
-    theirs = np.where((number < 0) & (beside < none), beside, number)
-    measured = attributes.building if kind == Kind.BUILDING else attributes.deck
-    return _objects(view, number, theirs, z, core, kind, measured)
+    owner = np.where((label < 0) & (beside < none), beside, label)
+    return _measured(view, label, owner, z, core, kind, measure)
 
 
-def _spans(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
-    chosen = near.chosen
+def _detect_spans(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
+    """Yield spans: wires, joined over gaps, between towers."""
+    settings = view.settings
 
-    def dilated(mask: NDArray[np.bool_], meters: float) -> NDArray[np.bool_]:
-        cells = round(meters / chosen.cell)
-        return scipy.ndimage.binary_dilation(mask, AROUND, iterations=cells) if cells else mask
+    def dilate(mask: NDArray[np.bool_], meters: float) -> NDArray[np.bool_]:
+        cells = round(meters / settings.cell)
+        return scipy.ndimage.binary_dilation(mask, NEIGHBORS, iterations=cells) if cells else mask
 
-    def masked(view: CellView) -> NDArray[np.bool_]:
-        tower, wire = (view.held(one)[1] >= 0 for one in (Kind.TOWER, kind))
-        return dilated(wire, chosen.span_gap / 2) & ~dilated(tower, 1.5)
+    def mask_of(view: CellView) -> NDArray[np.bool_]:
+        tower, wire = (view.indices(each) >= 0 for each in (Kind.TOWER, kind))
+        return dilate(wire, settings.span_gap / 2) & ~dilate(tower, TOWER_RADIUS)
 
-    view, mask = near.whole(core, masked, beside=False)
-    high = view.high(kind)
+    view, mask = view.widened_to_whole(core, mask_of, with_neighbors=False)
+    high = view.highest(kind)
     joined, _ = scipy.ndimage.label(mask)
-    number = _without_small(np.where(np.isnan(high), -1, joined - 1), 4)
-    return _objects(view, number, number, high, core, kind, attributes.span)
+    label = _without_small(np.where(np.isnan(high), -1, joined - 1), MIN_SPAN_CELLS)
+    return _measured(view, label, label, high, core, kind, attributes.measure_span)
 
 
-def _trees(near: CellView, core: Window, kind: Kind) -> Iterator[_One]:
-    chosen, window = near.chosen, near.window
-    size, high = chosen.cell, near.high(kind)
-    mask, roof = near.surface(Kind.BUILDING)
+def _detect_trees(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
+    """Yield trees; see :mod:`.crowns`."""
+    settings, window = view.settings, view.window
+    size, high = settings.cell, view.highest(kind)
+    mask, roof = view.surface(Kind.BUILDING)
     with np.errstate(invalid="ignore"):
-        # Chimneys, gutters and walls that were taken for leaves are no trees.
-        high[mask & (high <= roof + 0.5)] = np.nan
-    height = crowns.canopy(high, near.ground)
+        high[mask & (high <= roof + ROOF_TOLERANCE)] = np.nan
+    height = crowns.canopy(high, view.ground)
     top = crowns.crown_cells(
-        crowns.smoothed(height, chosen.smoothing / size),
-        chosen.tree_height,
-        chosen.saddle,
+        crowns.smooth(height, settings.smoothing / size),
+        settings.tree_height,
+        settings.saddle,
         crowns.REACH / size,
     )
-    number = np.where(np.isnan(high), -1, top)
-    z = np.where(np.isnan(high), near.ground + height, high)
-    for n, r, c in _bodies(number):
-        tr, tc = n // window.columns + window.row, n % window.columns + window.column
-        if not core.holds(tr, tc) or len(r) * size**2 < chosen.tree_area:
+    label = np.where(np.isnan(high), -1, top)
+    z = np.where(np.isnan(high), view.ground + height, high)
+    for n, r, c in _parts(label):
+        row, column = n // window.width + window.bottom, n % window.width + window.left
+        if not core.contains(column, row) or len(r) * size**2 < settings.tree_area:
             continue
-        body = near.body(kind, r, c, z)
-        record = attributes.tree(body, tr, tc, chosen)
-        if record["height"] >= chosen.tree_height:
-            yield _One(
-                int(object_id(kind, tr, tc)), record, body, cell_keys(kind, body.row, body.column)
-            )
+        cells = view.object_cells(kind, r, c, z)
+        record = attributes.measure_tree(cells, row, column, settings)
+        if record["height"] >= settings.tree_height:
+            keys = cell_keys(cells.column, cells.row, kind)
+            yield _Object(int(object_id(kind, row, column)), record, cells, keys)
 
 
-_FINDERS = {Kind.BUILDING: _surfaces, Kind.TREE: _trees, Kind.SPAN: _spans, Kind.DECK: _surfaces}
+_DETECTORS = {
+    Kind.BUILDING: _detect_surfaces,
+    Kind.TREE: _detect_trees,
+    Kind.SPAN: _detect_spans,
+    Kind.DECK: _detect_surfaces,
+}
 
 
-def _objects(
+def _measured(
     view: CellView,
-    number: NDArray[np.int64],
-    theirs: NDArray[np.int64],
+    label: NDArray[np.int64],
+    owner: NDArray[np.int64],
     z: NDArray,
-    core: Window,
+    core: GridWindow,
     kind: Kind,
-    measured: Callable[[Body, float], dict[str, Any]],
-) -> Iterator[_One]:
-    """The objects whose first cell lies in the block; `theirs` says whose points cells hold."""
+    measure: Callable[[ObjectCells, float], dict[str, Any]],
+) -> Iterator[_Object]:
+    """Yield the objects whose first cell lies in the block; `owner` labels cells' points."""
     window, none = view.window, np.empty(0, np.int64)
     keys = {
-        n: cell_keys(kind, r + window.row, c + window.column)
-        for n, r, c in _bodies(np.where(np.isnan(view.high(kind)), -1, theirs))
+        n: cell_keys(c + window.left, r + window.bottom, kind)
+        for n, r, c in _parts(np.where(np.isnan(view.highest(kind)), -1, owner))
     }
-    for n, r, c in _bodies(number):
-        row, column = int(r[0]) + window.row, int(c[0]) + window.column
-        if core.holds(row, column):
-            body = view.body(kind, r, c, z)
-            record = measured(body, view.chosen.cell)
-            yield _One(int(object_id(kind, row, column)), record, body, keys.get(n, none))
+    for n, r, c in _parts(label):
+        row, column = int(r[0]) + window.bottom, int(c[0]) + window.left
+        if core.contains(column, row):
+            cells = view.object_cells(kind, r, c, z)
+            record = measure(cells, view.settings.cell)
+            yield _Object(int(object_id(kind, row, column)), record, cells, keys.get(n, none))
 
 
-def _without_small(number: NDArray[np.int64], smallest: float) -> NDArray[np.int64]:
-    size = np.bincount(number.ravel() + 1)
+def _without_small(label: NDArray[np.int64], smallest: float) -> NDArray[np.int64]:
+    """Return labels with -1 in place of those of fewer than `smallest` cells."""
+    size = np.bincount(label.ravel() + 1)
     size[0] = 0
-    return np.where(size[number + 1] >= smallest, number, -1)
+    return np.where(size[label + 1] >= smallest, label, -1)

@@ -1,206 +1,197 @@
-"""What a window of the absolute grid shows: heights, ground and roofs, and as much around it as objects need."""
+"""A window of the grid as rasters: heights, ground, roofs, and what objects need around it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache, cached_property
-from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ..base.grid import GridWindow, split_keys
 from . import crowns, roofs
-from .attributes import Body
-from .cells import GROUND_CELLS, MM, Cells, Kind, unpack
+from .attributes import ObjectCells
+from .cells import GROUND_WIDTH, MM, Cells, Kind
 from .results import ObjectSettings
 
-#: How far the ground is looked for, meters: half the width of the largest building.
+#: Farthest that ground is interpolated from, meters: half the width of the largest building.
 GROUND_REACH = 120.0
-#: Meters around a place that decide about it, but for the extent of buildings, spans and decks.
+#: Surroundings that decide about a place, meters; buildings, spans and decks may extend farther.
 MARGIN = GROUND_REACH + 2 * crowns.REACH
-#: How far a roof goes on into what a classifier took for leaves, meters.
-GROWTH = 3.0
-#: How far the cells of a roof from which nothing came back lie from its rim at most, meters.
-DARK = 6.0
+#: Farthest that a roof is extended into what a classifier took for leaves, meters.
+ROOF_GROWTH = 3.0
+#: Farthest that cells of a hole in a roof (dark or wet, without returns) lie from its rim, meters.
+MAX_HOLE_DEPTH = 6.0
+#: Empty cells around what a view holds, so that filters see no edge.
+EMPTY_RIM = 8
 #: A cell and its eight neighbors.
-AROUND = np.ones((3, 3), bool)
+NEIGHBORS = np.ones((3, 3), bool)
 
 
-class Window(NamedTuple):
-    """A rectangle of cells; all numbers are even, so it holds whole cells of the ground."""
-
-    row: int
-    column: int
-    rows: int
-    columns: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.rows, self.columns
-
-    def widened(self, margin: int) -> Window:
-        margin += margin % GROUND_CELLS
-        return Window(
-            self.row - margin,
-            self.column - margin,
-            self.rows + 2 * margin,
-            self.columns + 2 * margin,
-        )
-
-    def common(self, other: Window) -> Window:
-        row, column = max(self.row, other.row), max(self.column, other.column)
-        rows = min(self.row + self.rows, other.row + other.rows) - row
-        columns = min(self.column + self.columns, other.column + other.columns) - column
-        return Window(row, column, max(rows, 0), max(columns, 0))
-
-    def part(self, other: Window) -> tuple[slice, slice]:
-        """Where in this window's arrays another lies."""
-        both = self.common(other)
-        row, column = both.row - self.row, both.column - self.column
-        return slice(row, row + both.rows), slice(column, column + both.columns)
-
-    def holds(self, row: int, column: int) -> bool:
-        return (
-            self.row <= row < self.row + self.rows
-            and self.column <= column < self.column + self.columns
-        )
-
-
-def _extent(parts: Mapping[Kind, Cells]) -> Window:
-    """The rectangle that holds the cells of all kinds, of which there must be one, and an empty rim."""
-    places = [np.stack(unpack(part.key)[1:]) * _width(kind) for kind, part in parts.items()]
-    low, high = (end(np.concatenate(places, axis=1), axis=1) for end in (np.min, np.max))
-    low, high = (
-        end // GROUND_CELLS * GROUND_CELLS for end in (low - 8, high + 8 + 2 * GROUND_CELLS)
-    )
-    return Window(*low.tolist(), *(high - low).tolist())
+def pad_evenly(window: GridWindow, cells: int) -> GridWindow:
+    """Return a window with `cells` more on every side, rounded up to whole cells of the ground."""
+    return window.padded(cells + cells % GROUND_WIDTH)
 
 
 def _width(kind: Kind) -> int:
-    return GROUND_CELLS if kind == Kind.GROUND else 1
+    return GROUND_WIDTH if kind == Kind.GROUND else 1
+
+
+def _occupied_window(parts: Mapping[Kind, Cells]) -> GridWindow:
+    """Return the even window of the cells of all kinds (at least one) and an empty rim."""
+    places = [np.stack(split_keys(part.key)[:2]) * _width(kind) for kind, part in parts.items()]
+    low, high = (end(np.concatenate(places, axis=1), axis=1) for end in (np.min, np.max))
+    low = (low - EMPTY_RIM) // GROUND_WIDTH * GROUND_WIDTH
+    high = (high + EMPTY_RIM + 2 * GROUND_WIDTH) // GROUND_WIDTH * GROUND_WIDTH
+    return GridWindow(*low.tolist(), *(high - low).tolist())
 
 
 class CellView:
-    """What the cells of a window hold, as arrays of the part of it that has any; what several kinds need is made once."""
+    """Rasters of the records in a window, cut to the part that holds any.
 
-    def __init__(self, cells: Cells, window: Window, chosen: ObjectSettings) -> None:
-        self.cells, self.seen, self.chosen = cells, window, chosen
-        self.inside = {
-            kind: cells.within(kind, *(n // _width(kind) for n in window)) for kind in Kind
+    Parameters
+    ----------
+    cells : Cells
+        Records of the whole area.
+    requested : GridWindow
+        The window; all its numbers are even, so it holds whole cells of the ground.
+    settings : ObjectSettings
+    """
+
+    def __init__(self, cells: Cells, requested: GridWindow, settings: ObjectSettings) -> None:
+        self.cells, self.requested, self.settings = cells, requested, settings
+        self._records = {
+            kind: cells.in_window(kind, GridWindow(*(n // _width(kind) for n in requested)))
+            for kind in Kind
         }
-        self.window = window.common(_extent(self.inside))
-        self.held, self.surface = cache(self._held), cache(self._surface)
+        self.window = requested.intersect(_occupied_window(self._records))
+        self.indices, self.surface = cache(self._indices), cache(self._surface)
 
-    def _held(self, kind: Kind) -> tuple[Cells, NDArray[np.int32]]:
-        """The cells of a kind, and where among them each of the window is, -1 for those that are not.
+    def _indices(self, kind: Kind) -> NDArray[np.int32]:
+        """Return a raster of a kind's indices of records, -1 for none; ground in wider cells."""
+        left, bottom, width, height = (n // _width(kind) for n in self.window)
+        key = self._records[kind].key
+        column, row, _ = split_keys(key)
+        raster = np.full((height, width), -1, np.int32)
+        raster[row - bottom, column - left] = np.arange(len(key))
+        return raster
 
-        Those of the ground in a window of its own, wider cells.
-        """
-        first_row, first_column, *shape = (n // _width(kind) for n in self.window)
-        inside = self.inside[kind]
-        _, row, column = unpack(inside.key)
-        place = np.full(shape, -1, np.int32)
-        place[row - first_row, column - first_column] = np.arange(len(inside))
-        return inside, place
+    def _column(self, kind: Kind, name: str) -> NDArray[np.float64]:
+        """Return a raster of one column of a kind's records; NaN where there are none."""
+        values = self._records[kind].columns[name]
+        return np.append(values.astype(np.float64), np.nan)[self.indices(kind)]
 
-    def column(self, kind: Kind, name: str, empty: float) -> NDArray[np.float64]:
-        """What cells of a kind hold, `empty` where there is none."""
-        inside, place = self.held(kind)
-        return np.append(inside.columns[name].astype(np.float64), empty)[place]
-
-    def high(self, kind: Kind) -> NDArray[np.float64]:
-        """Height of the highest point of a kind, meters; NaN where there is none."""
-        return self.column(kind, "high", np.nan) / MM
+    def highest(self, kind: Kind) -> NDArray[np.float64]:
+        """Return a raster of the highest point of a kind, meters; NaN where there is none."""
+        return self._column(kind, "high") / MM
 
     @cached_property
     def ground(self) -> NDArray[np.float64]:
-        """Height of the ground, meters; NaN where none is within reach."""
-        mean = (
-            self.column(Kind.GROUND, "sum", np.nan) / self.column(Kind.GROUND, "count", np.nan) / MM
-        )
-        return _wide(fill_gaps(mean, round(GROUND_REACH / (self.cells.size * GROUND_CELLS))))
+        """Raster of the height of the ground, meters; NaN where none is within reach."""
+        mean = self._column(Kind.GROUND, "sum") / self._column(Kind.GROUND, "count") / MM
+        return _repeat(fill_gaps(mean, round(GROUND_REACH / (self.cells.size * GROUND_WIDTH))))
 
     def _surface(self, kind: Kind) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Cells of decks and their heights; or of roofs, gone on into vegetation in their planes and over gaps."""
-        if kind != Kind.BUILDING:
-            return roofs.roof_cells(self.high(kind))
-        chosen, leaves = self.chosen, self.high(Kind.TREE)
-        seen = (
-            _wide(self.held(Kind.GROUND)[1] >= 0)
-            | ~np.isnan(leaves)
-            | (self.held(Kind.OTHER)[1] >= 0)
-        )
-        with np.errstate(invalid="ignore"):
-            leaves[leaves - self.ground < chosen.building_height] = np.nan
-        thick = leaves - self.column(Kind.TREE, "low", np.nan) / MM
-        reach = round(GROWTH / chosen.cell)
-        high = roofs.continued(self.high(Kind.BUILDING), leaves, thick, chosen.cell, reach)
-        high = np.where(high - self.ground < chosen.building_height, np.nan, high)
-        return roofs.roof_cells(roofs.covered(high, seen, round(DARK / chosen.cell)))
+        """Return the cells of decks, or of roofs, and their heights.
 
-    def body(self, kind: Kind, r: NDArray, c: NDArray, z: NDArray) -> Body:
-        """An object's cells, of which rows and columns in the window are given, with heights `z` of the window."""
-        known, place = self.held(kind)
-        at = place[r, c]
-
-        def held(name: str, empty: float) -> NDArray:
-            return np.where(at >= 0, known.columns[name][at], empty)
-
-        return Body(
-            r + self.window.row,
-            c + self.window.column,
-            z[r, c],
-            held("low", np.nan) / MM,
-            self.ground[r, c],
-            held("count", 0).astype(np.int64),
-            held("sure", 0.0),
-            held("told", 0).astype(np.int64),
-        )
-
-    def whole(
-        self, core: Window, masked: Callable[[CellView], NDArray[np.bool_]], beside: bool = True
-    ) -> tuple[CellView, NDArray[np.bool_]]:
-        """The view with as much around a block as it takes for all that reaches into the block to be whole; its mask.
-
-        `beside`: cells beside an object are looked at, too, so objects a cell apart reach as far as both.
+        Roofs are extended into vegetation that lies in their planes, and over holes without
+        returns.
         """
-        margin, view = round(MARGIN / self.chosen.cell), self
+        if kind != Kind.BUILDING:
+            return roofs.roof_cells(self.highest(kind))
+        settings, leaves = self.settings, self.highest(Kind.TREE)
+        occupied = _repeat(self.indices(Kind.GROUND) >= 0) | ~np.isnan(leaves)
+        occupied |= self.indices(Kind.OTHER) >= 0
+        with np.errstate(invalid="ignore"):
+            leaves[leaves - self.ground < settings.building_height] = np.nan
+        thickness = leaves - self._column(Kind.TREE, "low") / MM
+        high = roofs.extend_roofs(
+            self.highest(Kind.BUILDING),
+            leaves,
+            thickness,
+            settings.cell,
+            round(ROOF_GROWTH / settings.cell),
+        )
+        high = np.where(high - self.ground < settings.building_height, np.nan, high)
+        filled = roofs.fill_holes(high, occupied, round(MAX_HOLE_DEPTH / settings.cell))
+        return roofs.roof_cells(filled)
+
+    def object_cells(self, kind: Kind, r: NDArray, c: NDArray, z: NDArray) -> ObjectCells:
+        """Return the cells of an object at rows `r`, columns `c` of the view, at heights `z`."""
+        columns, index = self._records[kind].columns, self.indices(kind)[r, c]
+
+        def values(name: str, missing: float) -> NDArray:
+            return np.where(index >= 0, columns[name][index], missing)
+
+        return ObjectCells(
+            row=r + self.window.bottom,
+            column=c + self.window.left,
+            z=z[r, c],
+            low=values("low", np.nan) / MM,
+            ground=self.ground[r, c],
+            points=values("count", 0).astype(np.int64),
+            reliability=values("reliability", 0.0),
+            rated=values("rated", 0).astype(np.int64),
+        )
+
+    def widened_to_whole(
+        self,
+        core: GridWindow,
+        mask_of: Callable[[CellView], NDArray[np.bool_]],
+        with_neighbors: bool = True,
+    ) -> tuple[CellView, NDArray[np.bool_]]:
+        """Return a view in which all objects that reach into a block are whole, and its mask.
+
+        Parameters
+        ----------
+        core : GridWindow
+            The block.
+        mask_of : function of a view
+            Returns the cells of objects.
+        with_neighbors : bool
+            Whether cells beside an object matter, too, so that objects a cell apart count as one.
+        """
+        margin, view = round(MARGIN / self.settings.cell), self
         while True:
-            mask = masked(view)
+            mask = mask_of(view)
             part, count = scipy.ndimage.label(
-                scipy.ndimage.binary_dilation(mask, AROUND) if beside else mask
+                scipy.ndimage.binary_dilation(mask, NEIGHBORS) if with_neighbors else mask
             )
-            reached = np.zeros(count + 1, bool)
-            reached[part[view.window.part(core)]] = True
-            reached[0] = False
-            part[view.window.part(view.seen.widened(-margin))] = 0
-            if not reached[part].any():
+            reaches_core = np.zeros(count + 1, bool)
+            reaches_core[part[view._slices(core)]] = True
+            reaches_core[0] = False
+            part[view._slices(pad_evenly(view.requested, -margin))] = 0
+            if not reaches_core[part].any():
                 return view, mask
-            more = max(margin, (view.seen.rows - core.rows) // 4)
-            view = CellView(self.cells, view.seen.widened(more), self.chosen)
+            more = max(margin, (view.requested.height - core.height) // 4)
+            view = CellView(self.cells, pad_evenly(view.requested, more), self.settings)
+
+    def _slices(self, window: GridWindow) -> tuple[slice, slice]:
+        return window.intersect(self.window).slices_in(self.window)
 
 
-def _wide(values: NDArray) -> NDArray:
-    """Values of cells of the ground for the cells in them."""
-    return np.repeat(np.repeat(values, GROUND_CELLS, axis=0), GROUND_CELLS, axis=1)
+def _repeat(values: NDArray) -> NDArray:
+    """Return a raster of cells of the ground as one of the smaller cells."""
+    return np.repeat(np.repeat(values, GROUND_WIDTH, axis=0), GROUND_WIDTH, axis=1)
 
 
 def fill_gaps(z: NDArray, reach: int) -> NDArray:
-    """Values where there are none (NaN), from the nearest along rows and columns, weighed by one over the distance.
+    """Fill cells without a value (NaN) from the nearest ones along rows and columns.
 
-    Two that lie opposite give what a line between them does, so a slope goes on below a building. What lies farther
-    than `reach` cells does not count: the surroundings of a place decide, whatever the extent of the array.
+    Weights are 1 / distance. Two opposite values give what a line between them gives, so a slope
+    continues below a building. Values farther than `reach` cells do not count: the surroundings of
+    a place decide, whatever the extent of the array.
     """
     total, weight = np.zeros(z.shape), np.zeros(z.shape)
-    for turned in (np.s_[:, :], np.s_[:, ::-1]):
+    for direction in (np.s_[:, :], np.s_[:, ::-1]):
         for values, sums, weights in ((z, total, weight), (z.T, total.T, weight.T)):
-            values, place = values[turned], np.arange(values.shape[1])
+            values, place = values[direction], np.arange(values.shape[1])
             last = np.maximum.accumulate(np.where(np.isnan(values), -1, place), axis=1)
             away = place - last
             near = (last >= 0) & (away > 0) & (away <= reach)
-            sums[turned] += np.where(
-                near, np.take_along_axis(values, last, axis=1) / np.maximum(away, 1), 0.0
-            )
-            weights[turned] += np.where(near, 1.0 / np.maximum(away, 1), 0.0)
+            share = np.where(near, 1.0 / np.maximum(away, 1), 0.0)
+            known = np.take_along_axis(values, last, axis=1) / np.maximum(away, 1)
+            sums[direction] += np.where(near, known, 0.0)
+            weights[direction] += share
     return np.where(np.isnan(z) & (weight > 0.0), total / np.maximum(weight, 1e-12), z)

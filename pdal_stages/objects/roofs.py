@@ -1,6 +1,8 @@
-"""Buildings of cells: roofs that are connected, parted where they part."""
+"""Roofs of buildings: their cells, extension and holes; buildings that touch; roof planes."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -9,27 +11,53 @@ from numpy.typing import NDArray
 from ..base.jit import njit
 from ..terrain.components import number_sets
 
-#: Scatter of a roof's plane that is gone on from, and how near to it vegetation is of the roof, meters.
-PLANE, NEAR = 0.12, 0.2
-#: How far apart, up and down, the points of a cell lie at most where a roof was taken for leaves, meters.
-SURFACE = 0.5
-#: So many cells inside its border a roof's height is measured where two roofs are compared.
-INSIDE = 2
-#: Within how many meters the rim of a hole in a roof is at one height, and how much of the rim.
-LEVEL, RIM = 1.0, 0.65
-#: Cells of a roof's plane: how far those around scatter from it, meters; how much its gradient changes from one cell to the
-#: next; and the smallest plane that counts, m2.
-SMOOTH, TILT, SMALLEST = 0.25, 0.2, 3.0
-#: The share of the border of two roofs along which their heights meet where they are of one building.
-_SHARE = 0.34
+
+@dataclass(frozen=True)
+class RoofRules:
+    """Thresholds of roofs; lengths in meters, areas in m2."""
+
+    # Vegetation that belongs to a roof (`extend_roofs`)
+    max_scatter: float = 0.12  #: of the roof around a plane that is extended
+    max_plane_distance: float = 0.2  #: of vegetation from that plane
+    max_thickness: float = 0.5  #: between points of a cell: a roof is a surface, a crown is not
+    max_slope: float = 2.0  #: rise per meter: 63 degrees
+    # Holes without returns (`fill_holes`)
+    level_tolerance: float = 1.0  #: of a hole's rim around its median height
+    min_level_share: float = 0.65  #: cells of the rim within that tolerance
+    # Buildings that touch (`building_parts`)
+    roof_step: float = 1.0  #: height difference of neighboring cells of one roof
+    inside: int = 2  #: cells from the border inward: beyond rims and walls
+    min_meeting_share: float = 0.34  #: border along which the roofs of one building meet
+    # Roof planes (`roof_planes`)
+    smooth_scatter: float = 0.25  #: of cells around the plane through them
+    max_bend: float = 0.2  #: difference of the gradients of neighboring cells, rise per meter
+    min_plane_area: float = 3.0
+
+
+RULES = RoofRules()
 
 
 @njit
 def planes(z: NDArray, level: NDArray, size: float, reach: float) -> NDArray:
-    """The plane, by least squares, through the five by five cells around each cell that lie within `reach` of its level.
+    """Fit a plane, by least squares, to the 5 x 5 cells around each cell.
 
-    (4, r, c): rise per meter east and north, height above `level` at the cell, and the mean square of how far the cells lie
-    from it; NaN where they are fewer than six, or in a row, and where there is no level.
+    Parameters
+    ----------
+    z : (r, c) float64
+        Heights, meters; NaN for none.
+    level : (r, c) float64
+        Height around which cells count, meters; NaN where no plane is wanted.
+    size : float
+        Side of a cell, meters.
+    reach : float
+        Farthest that a cell lies above or below the level, meters.
+
+    Returns
+    -------
+    (4, r, c) float64
+        Rise per meter east and north, height above `level` at the cell, and mean squared distance
+        from the plane; NaN where cells are fewer than six, or in a row, and where there is no
+        level.
     """
     out = np.full((4, *z.shape), np.nan)
     for r in range(z.shape[0]):
@@ -66,186 +94,207 @@ def planes(z: NDArray, level: NDArray, size: float, reach: float) -> NDArray:
 
 
 def roof_cells(high: NDArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Cells of roofs and the height of each, meters, from the highest point of a roof in each cell (r, c), NaN for none.
+    """Return the cells of roofs and their heights, (r, c) each.
 
-    Empty cells with at least seven of eight neighbors are filled, twice, and what is one cell wide, a wall or a stray point,
-    is left out.
+    Empty cells with at least seven of eight neighbors are filled, twice; parts one cell wide, a
+    wall or a stray point, are left out.
+
+    Parameters
+    ----------
+    high : (r, c) float64
+        Highest point of a roof in each cell, meters; NaN for none.
     """
     for _ in range(2):
-        high = _closed(high)
+        high = _close(high)
     return scipy.ndimage.binary_opening(~np.isnan(high), np.ones((2, 2), bool)), high
 
 
-def continued(high: NDArray, leaves: NDArray, thick: NDArray, size: float, reach: int) -> NDArray:
-    """Heights of roofs, gone on into cells of vegetation that lie in their planes: what a classifier took for leaves.
+def extend_roofs(
+    high: NDArray, leaves: NDArray, thickness: NDArray, size: float, reach: int
+) -> NDArray[np.float64]:
+    """Return heights of roofs extended into vegetation that lies in their planes.
 
-    `high` and `leaves` (r, c) are heights of the highest point of a roof, and of vegetation, in each cell, meters, NaN for
-    none; `thick` is how far the lowest point of vegetation lies below. It goes on by `reach` cells of `size` meters.
+    Parameters
+    ----------
+    high, leaves : (r, c) float64
+        Highest point of a roof, and of vegetation, in each cell, meters; NaN for none.
+    thickness : (r, c) float64
+        Height between the lowest and highest point of vegetation, meters.
+    size : float
+        Side of a cell, meters.
+    reach : int
+        Farthest extension, cells.
     """
     for _ in range(reach):
-        east, north, above, scatter = planes(
-            high, np.where(np.isnan(high), leaves, np.nan), size, 1.0
-        )
-        steep = east**2 + north**2
-        lean = size * np.sqrt(steep)  # the highest point of a cell lies anywhere in it
-        added = (
-            (scatter <= PLANE**2 + 0.09 * lean**2)
-            & (steep <= 4.0)
-            & (thick <= SURFACE + 1.5 * lean)
-        )
-        added &= np.abs(above) - 0.4 * lean <= NEAR
+        empty = np.where(np.isnan(high), leaves, np.nan)
+        east, north, above, scatter = planes(high, empty, size, 1.0)
+        steepness = east**2 + north**2
+        rise = size * np.sqrt(steepness)  # the highest point of a cell lies anywhere in it
+        added = scatter <= RULES.max_scatter**2 + 0.09 * rise**2
+        added &= steepness <= RULES.max_slope**2
+        added &= thickness <= RULES.max_thickness + 1.5 * rise
+        added &= np.abs(above) - 0.4 * rise <= RULES.max_plane_distance
         if not added.any():
             break
         high = np.where(added, leaves, high)
     return high
 
 
-def covered(high: NDArray, seen: NDArray, reach: int) -> NDArray:
-    """Heights of roofs with the holes filled from which nothing came back, neither roof nor ground: dark or wet ones.
+def fill_holes(high: NDArray, occupied: NDArray, reach: int) -> NDArray[np.float64]:
+    """Return heights of roofs with holes without returns filled: dark or wet roofs.
 
-    A hole is filled where nearly all around it is roof, at nearly one height, and no cell of it lies more than `reach`
-    cells from the rim. `high` (r, c) is the height of a building's highest point, meters, NaN for none; `seen` (r, c) says
-    where points of ground or vegetation lie.
+    A hole is filled where nearly all around it is roof, at nearly one height, and it does not
+    reach the raster's edge.
+
+    Parameters
+    ----------
+    high : (r, c) float64
+        Highest point of a roof in each cell, meters; NaN for none.
+    occupied : (r, c) bool
+        Cells with ground, vegetation or other points.
+    reach : int
+        Farthest that a cell of a hole lies from its rim, cells.
     """
-    out, empty = high.copy(), np.isnan(high) & ~seen
+    out, empty = high.copy(), np.isnan(high) & ~occupied
     holes, count = scipy.ndimage.label(empty)
-    deepest = scipy.ndimage.maximum(
+    depth = scipy.ndimage.maximum(
         scipy.ndimage.distance_transform_cdt(empty), holes, np.arange(count + 1)
     )
-    near = np.zeros(count + 1, bool)
-    near[holes[scipy.ndimage.binary_dilation(~np.isnan(high))]] = True
-    near[0] = False
-    for edge in (0, -1):  # what is seen ends there
-        near[holes[edge]] = near[holes[:, edge]] = False
+    beside_roof = np.zeros(count + 1, bool)
+    beside_roof[holes[scipy.ndimage.binary_dilation(~np.isnan(high))]] = True
+    beside_roof[0] = False
+    for edge in (0, -1):
+        beside_roof[holes[edge]] = beside_roof[holes[:, edge]] = False
     boxes = scipy.ndimage.find_objects(holes)
-    for number in np.flatnonzero(near & (deepest <= reach)).tolist():
-        box = tuple(slice(one.start - 1, one.stop + 1) for one in boxes[number - 1])
+    for number in np.flatnonzero(beside_roof & (depth <= reach)).tolist():
+        box = tuple(slice(axis.start - 1, axis.stop + 1) for axis in boxes[number - 1])
         hole = holes[box] == number
-        levels = high[box][scipy.ndimage.binary_dilation(hole) & ~hole]
-        level = np.nanmedian(levels) if not np.isnan(levels).all() else np.nan
-        if np.mean(np.abs(levels - level) <= LEVEL) >= RIM:
+        rim = high[box][scipy.ndimage.binary_dilation(hole) & ~hole]
+        level = np.nanmedian(rim) if not np.isnan(rim).all() else np.nan
+        if np.mean(np.abs(rim - level) <= RULES.level_tolerance) >= RULES.min_level_share:
             out[box][hole] = level
     return out
 
 
-def _closed(high: NDArray) -> NDArray:
-    """Heights with those of empty cells that have at least seven neighbors: the mean of them."""
-    known = ~np.isnan(high)
-    around = np.ones((3, 3))
-    count = scipy.ndimage.correlate(known.astype(np.float64), around, mode="constant")
-    total = scipy.ndimage.correlate(np.where(known, high, 0.0), around, mode="constant")
+def _close(high: NDArray) -> NDArray:
+    """Return heights with empty cells of seven or eight neighbors set to the neighbors' mean."""
+    known, kernel = ~np.isnan(high), np.ones((3, 3))
+    count = scipy.ndimage.correlate(known.astype(np.float64), kernel, mode="constant")
+    total = scipy.ndimage.correlate(np.where(known, high, 0.0), kernel, mode="constant")
     return np.where(~known & (count >= 7), total / np.maximum(count, 1), high)
 
 
 def connected(mask: NDArray, step: float, *values: NDArray) -> NDArray[np.int64]:
-    """Number of each cell's part, from 0 in the order of their first cells; -1 outside the mask.
+    """Return labels of connected cells, from 0 by their first cells; -1 outside the mask.
 
-    Two cells side by side are of one part where their values, in sum, differ by at most `step`.
+    Two cells side by side are connected where their values differ, in sum, by at most `step`.
     """
-    number = np.full(mask.shape, -1, np.int64)
+    label = np.full(mask.shape, -1, np.int64)
     count = int(np.count_nonzero(mask))
-    number[mask] = np.arange(count)
+    label[mask] = np.arange(count)
     pairs = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         with np.errstate(invalid="ignore"):
             joined = mask[a] & mask[b] & ~(sum(np.abs(v[a] - v[b]) for v in values) > step)
-        pairs.append((number[a][joined], number[b][joined]))
-    number[mask] = _sets(
-        np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]), count
-    )
-    return number
+        pairs.append((label[a][joined], label[b][joined]))
+    a, b = np.concatenate(pairs, axis=1)
+    label[mask] = _sets(a, b, count)
+    return label
 
 
 def _sets(a: NDArray, b: NDArray, count: int) -> NDArray[np.int64]:
-    """Of each of `count` members the number of its set, in the order of their first members; a and b are joined."""
-    number = np.empty(count, np.int64)
-    number_sets(a, b, number)
-    return number
+    """Return the set of each of `count` members after pairs are joined, by first members."""
+    label = np.empty(count, np.int64)
+    number_sets(a, b, label)
+    return label
 
 
 def building_parts(
     mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int
 ) -> NDArray[np.int64]:
-    """Number of each cell's building, from 0 in the order of their first cells; -1 outside.
+    """Return labels of buildings, from 0 in the order of their first cells; -1 outside.
 
-    Connected cells whose heights differ by at most 1 m are a roof. Roofs of fewer than `smallest` cells (dormers,
-    chimneys) go with the neighbor that they share the longest border with. Then two roofs are of one building where their
-    heights (measured beyond rims and walls) differ by at most `step` along at least a third of their border. A `step`
-    of 0 parts nothing.
+    Connected cells whose heights differ by at most `RoofRules.roof_step` are a roof. Roofs of
+    fewer than `smallest` cells (dormers, chimneys) join the neighbor with the longest common
+    border. Then roofs are of one building where their heights, measured beyond rims and walls,
+    differ by at most `step` along at least a third of their border. A `step` of 0 separates
+    nothing.
     """
     if step <= 0:
         return connected(mask, np.inf, z)
-    number = connected(mask, min(1.0, step), z)
+    label = connected(mask, min(RULES.roof_step, step), z)
     while True:
-        a, b, length, _ = _borders(number)
-        size = np.bincount(number[number >= 0])
+        a, b, length, _ = _borders(label)
+        size = np.bincount(label[label >= 0])
         a, b, length = np.r_[a, b], np.r_[b, a], np.r_[length, length]
-        order = np.lexsort(
-            (b, -length, a)
-        )  # the longest border; of equal ones the part that begins first
+        order = np.lexsort((b, -length, a))  # of equal borders the part that begins first
         order = order[size[a[order]] < smallest]
         small, first = np.unique(a[order], return_index=True)
         if not len(small):
             break
-        number = _renamed(number, small, b[order][first])
+        label = _join(label, small, b[order][first])
     z = np.where(mask, z, np.nan)
     surface = z, *planes(z, z, 1.0, 1.0)[:3]
     while True:
-        a, b, length, near = _borders(number, surface, step)
-        meets = near >= _SHARE * length
+        a, b, length, meeting = _borders(label, surface, step)
+        meets = meeting >= RULES.min_meeting_share * length
         if not meets.any():
-            return number
-        number = _renamed(number, a[meets], b[meets])
+            return label
+        label = _join(label, a[meets], b[meets])
 
 
 def _borders(
-    number: NDArray[np.int64], surface: tuple[NDArray, ...] | None = None, step: float = np.inf
+    label: NDArray[np.int64], surface: tuple[NDArray, ...] | None = None, step: float = np.inf
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Neighboring parts, the lower number first; how long their border is, in cells, and how much of it is within step."""
-    pairs, near = [], []
+    """Return pairs of neighboring labels, the lower first, and the length of their border.
+
+    The last array is the length along which heights of `surface` differ by at most `step`.
+    """
+    pairs, meeting = [], []
     for down, right in ((1, 0), (0, 1)):
-        one, other = number[: len(number) - down, : number.shape[1] - right], number[down:, right:]
-        at = np.array(np.nonzero((one >= 0) & (other >= 0) & (one != other)))
-        pairs.append(np.sort([one[tuple(at)], other[tuple(at)]], axis=0))
+        lower, upper = label[: len(label) - down, : label.shape[1] - right], label[down:, right:]
+        at = np.array(np.nonzero((lower >= 0) & (upper >= 0) & (lower != upper)))
+        pairs.append(np.sort([lower[tuple(at)], upper[tuple(at)]], axis=0))
         if surface is None:
-            near.append(np.ones(at.shape[1]))
+            meeting.append(np.ones(at.shape[1]))
             continue
-        way = np.array([[down], [right]])
-        levels = [
-            _roof_level(number, surface, at, -way),
-            _roof_level(number, surface, at + way, way),
-        ]
-        near.append(np.abs(levels[0] - levels[1]) <= step)
+        across = np.array([[down], [right]])
+        heights = (
+            _border_height(label, surface, at, -across),
+            _border_height(label, surface, at + across, across),
+        )
+        meeting.append(np.abs(heights[0] - heights[1]) <= step)
     both, which, length = np.unique(
         np.concatenate(pairs, axis=1), axis=1, return_inverse=True, return_counts=True
     )
-    return *both, length, np.bincount(which.ravel(), np.concatenate(near), len(length))
+    return *both, length, np.bincount(which.ravel(), np.concatenate(meeting), len(length))
 
 
-def _roof_level(
-    number: NDArray, surface: tuple[NDArray, ...], at: NDArray, way: NDArray
+def _border_height(
+    label: NDArray, surface: tuple[NDArray, ...], at: NDArray, inward: NDArray
 ) -> NDArray:
-    """Heights of roofs at their border: at the outer side of cells there, whose inner neighbors lie `way`.
+    """Return heights of roofs at the outer side of their border cells `at` (2, n).
 
-    The cell itself and the next may hold the rim of a flat roof, or the wall of a higher one: so it is the plane through
-    the cells around the `INSIDE`-th beyond it, carried on to the border.
+    The cell itself and the next one may hold the rim of a flat roof or the wall of a higher one.
+    So the plane is taken around the cell `RoofRules.inside` cells `inward`, and extended to the
+    border.
     """
-    shape, inside = np.array(number.shape)[:, None], np.zeros(at.shape[1], np.int64)
-    for far in range(1, INSIDE + 1):
-        there = at + far * way
-        within = ((there >= 0) & (there < shape)).all(axis=0)
-        inside[within & (number[tuple(there % shape)] == number[tuple(at)])] = far
-    z, east, north, above = (values[tuple(at + inside * way)] for values in surface)
-    return z + np.nan_to_num(above - (inside + 0.5) * (north * way[0] + east * way[1]))
+    shape, inside = np.array(label.shape)[:, None], np.zeros(at.shape[1], np.int64)
+    for distance in range(1, RULES.inside + 1):
+        place = at + distance * inward
+        valid = ((place >= 0) & (place < shape)).all(axis=0)
+        inside[valid & (label[tuple(place % shape)] == label[tuple(at)])] = distance
+    z, east, north, above = (values[tuple(at + inside * inward)] for values in surface)
+    return z + np.nan_to_num(above - (inside + 0.5) * (north * inward[0] + east * inward[1]))
 
 
-def _renamed(number: NDArray[np.int64], a: NDArray, b: NDArray) -> NDArray[np.int64]:
-    """Numbers of parts after parts `a` and `b` were put together, pair by pair."""
-    return np.where(number >= 0, _sets(a, b, int(number.max()) + 1)[number], -1)
+def _join(label: NDArray[np.int64], a: NDArray, b: NDArray) -> NDArray[np.int64]:
+    """Return labels after parts `a` and `b` are joined, pair by pair."""
+    return np.where(label >= 0, _sets(a, b, int(label.max()) + 1)[label], -1)
 
 
 def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]:
-    """How many planes a roof has, their mean slope in degrees, and the share of its cells that lie in one.
+    """Return the number of planes of a roof, their mean slope (degrees), and their share of cells.
 
     Parameters
     ----------
@@ -255,15 +304,12 @@ def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]
         Side of a cell, meters.
     """
     east, north, _, scatter = planes(z, z, size, 1.5)
-    part = connected(scatter < SMOOTH**2, TILT, east, north)
+    part = connected(scatter < RULES.smooth_scatter**2, RULES.max_bend, east, north)
     cells = np.bincount(part.ravel() + 1)[1:]
-    large = np.append(cells * size * size >= SMALLEST, False)
-    taken = large[part]
-    if not taken.any():
+    large = np.append(cells * size * size >= RULES.min_plane_area, False)
+    in_plane = large[part]
+    if not in_plane.any():
         return 0, 0.0, 0.0
-    slope = np.degrees(np.arctan(np.hypot(east[taken], north[taken])))
-    return (
-        int(large.sum()),
-        float(slope.mean()),
-        float(taken.sum() / np.count_nonzero(~np.isnan(z))),
-    )
+    slope = np.degrees(np.arctan(np.hypot(east[in_plane], north[in_plane])))
+    share = in_plane.sum() / np.count_nonzero(~np.isnan(z))
+    return int(large.sum()), float(slope.mean()), float(share)

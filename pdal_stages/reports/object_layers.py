@@ -21,7 +21,7 @@ from ..objects.attributes import CHECK
 from ..objects.cells import CLASSES, Cells, Kind, refuse_unclassified
 from ..objects.detect import find_objects
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines
-from ..objects.results import Objects, ObjectSettings, Table
+from ..objects.results import Objects, ObjectSettings, ObjectTable
 
 #: Ending of a file's name -> GDAL's driver, and whether one file holds many layers.
 DRIVERS = {
@@ -82,7 +82,7 @@ def object_layers(
     layers = {}
     for kind, name in ((Kind.BUILDING, "buildings"), (Kind.DECK, "decks")):
         shapes = raw_outlines(tables[kind], size)
-        shapes = straight_outlines(shapes, size) if straight else shapes
+        shapes = straight_outlines(shapes) if straight else shapes
         columns[kind]["area"] = np.round(np.array([shape.area * size**2 for shape in shapes]), 3)
         layers[name] = polygons(shapes, kind)
     trees = tables[Kind.TREE]
@@ -95,7 +95,7 @@ def object_layers(
     return {name: layers[name] for name in LAYERS}
 
 
-def _columns(table: Table, kind: Kind) -> dict[str, NDArray]:
+def _columns(table: ObjectTable, kind: Kind) -> dict[str, NDArray]:
     out: dict[str, NDArray] = {"object_id": table.ids}
     for name, of in COLUMNS[kind].items():
         values = table.columns.get(name, np.empty(0, of))
@@ -158,7 +158,7 @@ def object_frames(
         raise StageError("coordinates must be finite", cure="Leave out rows of NaN or infinity")
     codes, chosen = codes.astype(np.uint8), settings or ObjectSettings()
     x, y, z = xyz.T
-    cells = Cells.of(x, y, z, codes, chosen.cell, reliability=told, classes=classes)
+    cells = Cells.from_points(x, y, z, codes, chosen.cell, reliability=told, classes=classes)
     refuse_unclassified(cells, codes)
     layers = object_layers(find_objects(cells, chosen, progress=False), straight=straight)
     return {

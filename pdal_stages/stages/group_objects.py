@@ -14,7 +14,14 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.grid import places_among
 from ..objects.attributes import CHECK, REASONS
-from ..objects.cells import CLASSES, ENOUGH, Cells, Kind, kind_of_code, refuse_unclassified
+from ..objects.cells import (
+    CLASSES,
+    MIN_POINTS_PER_CELL,
+    Cells,
+    Kind,
+    kind_of_code,
+    refuse_unclassified,
+)
 from ..objects.detect import find_objects
 from ..objects.raster_view import MARGIN
 from ..objects.results import Objects, ObjectSettings
@@ -89,10 +96,10 @@ class ObjectOptions:
             if not self.own_points:
                 raise
             points.report.warnings.append(str(error))
-        if thin := cells.thin():
+        if thin := cells.sparse_kind():
             points.report.warnings.append(
-                f"cells of {cells.size:g} m hold fewer than {ENOUGH:g} points of {thin[0]} on average, so objects may fall "
-                f"apart: set cell to {2 * cells.size:g} or more"
+                f"cells of {cells.size:g} m hold fewer than {MIN_POINTS_PER_CELL:g} points of "
+                f"{thin[0]} on average, so objects may fall apart: set cell to {2 * cells.size:g} or more"
             )
         return cells
 
@@ -104,7 +111,9 @@ class ObjectOptions:
         if not usable.all():
             x, y, z, codes = x[usable], y[usable], z[usable], codes[usable]
             told = None if told is None else told[usable]
-        return Cells.of(x, y, z, codes, self.settings.cell, reliability=told, classes=self.classes)
+        return Cells.from_points(
+            x, y, z, codes, self.settings.cell, reliability=told, classes=self.classes
+        )
 
 
 for _name, _one in _SETTINGS.items():
@@ -205,7 +214,7 @@ class GroupObjects(ObjectOptions, Stage):
                     np.nan_to_num(columns[_HEIGHT[kind]][which]) / points.units.vertical
                 )
                 out["ObjectExtent"][rows] = columns[_EXTENT[kind]][which]
-            refused[rows] = table.having(self.refuse)[which]
+            refused[rows] = table.has_reason(self.refuse)[which]
         if self.refuse:
             codes = points.class_codes.copy()
             codes[refused] = self.refused_class

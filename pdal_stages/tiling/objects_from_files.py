@@ -104,8 +104,8 @@ def _find_in_files(
     print_messages(*check_one_reference(references))
     wkt = references[inputs[0]].wkt
     cells = _all_cells(inputs, stage, wkt, workers)
-    size, thin = cells.size, cells.thin()
-    while stage.widens and cells.thin() and cells.size < LARGEST:
+    size, thin = cells.size, cells.sparse_kind()
+    while stage.widens and cells.sparse_kind() and cells.size < LARGEST:
         cells = cells.doubled()
     if thin:
         too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
