@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 
 import laspy
@@ -217,6 +218,37 @@ def test_commands_and_stages_take_the_same_units(
     assert reference_of_file(str(path), "ft", "m").units == Units(FOOT, 1.0)
 
 
+#: Units of x and y that agree with a system or contradict it, and units or systems of heights.
+PLANES = [(3072, 26910), (3072, 2992), (3072, 32767), (1024, 1)]
+HEIGHT_KEYS = [(4099, 9001), (4099, 9003), (4096, 6360)]
+
+
+@pytest.mark.parametrize("minor", [2, 4])
+@pytest.mark.parametrize("plane", PLANES)
+def test_outputs_keep_the_units_of_their_inputs(tmp_path, write_las, plane, minor):
+    """GDAL writes the unit of z for that of x and y into GeoTIFF keys where they differ."""
+    path, out = tmp_path / "in.las", tmp_path / "out.las"
+    xyz = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 40, (3, 50)), strict=True))
+    writer = {"type": "writers.las", "filename": str(out), "forward": "all"}
+    writer |= {"minor_version": minor, "dataformat_id": 6 if minor == 4 else 1}
+    for unit, height in itertools.product((9001, 9002), HEIGHT_KEYS):
+        referenced(write_las(path, xyz, 1), dict([plane, (3076, unit), height]))
+        ps.run_pipeline([str(path), writer])
+        assert reference_of_file(str(out)).units == reference_of_file(str(path)).units, (
+            unit,
+            height,
+        )
+
+
+def test_outputs_of_tiles_keep_the_units_of_their_inputs(tmp_path, write_las):
+    xyz = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 40, (3, 50)), strict=True))
+    path = write_las(tmp_path / "in.las", xyz, 1)
+    referenced(path, {3072: 26910, 3076: 9002, 4099: 9001})
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las"), "forward": "all"}
+    run_tiled([str(path), {"type": "filters.hag_minima"}, writer], 20, workers=0)
+    assert reference_of_file(str(tmp_path / "o_in.las")).units == Units(FOOT, 1.0)
+
+
 def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, write_las):
     """Feet across, meters up: by `objects`, `writers.objects`, and of what `classify --objects` writes."""
     pyogrio = pytest.importorskip("pyogrio")
@@ -256,12 +288,13 @@ def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, wri
     assert 3 < np.percentile(found.HeightAboveGround, 99) < np.ptp(z)
 
 
-def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las):
-    """A wood of 40 m in feet; with a reference that names the heights' system it is a wood of 40 m."""
+@pytest.mark.parametrize(("slope", "top"), [(0.0, 40.0), (0.7, 26.0)])
+def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las, slope, top):
+    """A wood of 40 m in feet, or low woods on a slope; with a reference that names the heights' system all is well."""
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 60, (2, 40_000))
     wood = (np.arange(40_000) % 4 > 0) & (np.hypot(x - 30, y - 30) < 25)
-    z = np.where(wood, rng.uniform(25, 40, 40_000), 0.0) / FOOT
+    z = (np.where(wood, rng.uniform(25, top, 40_000), 0.0) + slope * (x + y)) / FOOT
     returns = {"ReturnNumber": np.where(wood, 1, 2), "NumberOfReturns": np.full(40_000, 2)}
     source = write_las(tmp_path / "in.las", {"X": x + 5e5, "Y": y + 5e6, "Z": z, **returns}, 1)
     referenced(source, {3072: 26910})

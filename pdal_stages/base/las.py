@@ -7,6 +7,7 @@ checked.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import struct
 from collections.abc import Iterator
@@ -217,6 +218,39 @@ def geotiff_code(path: str | os.PathLike) -> str:
     across, upward = keys.get(3072) or keys.get(2048, 0), keys.get(4096, 0)
     height = f"+{upward}" * (0 < upward < 32767)  # which stands for a user's own
     return f"EPSG:{across}{height}" if 0 < across < 32767 else ""
+
+
+#: GeoTIFF keys: type of the model (1 projected), angular unit, unit of x and y.
+_MODEL_TYPE, _ANGULAR_UNIT, _PLANE_UNIT = 1024, 2054, 3076
+#: EPSG's codes of units by their length in meters.
+_UNIT_CODES = {1.0: 9001, 0.3048: 9002, 1200 / 3937: 9003}
+
+
+def set_geotiff_unit(path: str | os.PathLike, unit: float) -> None:
+    """Set the unit of x and y in the GeoTIFF keys of a LAS file, in place, where the keys name a unit.
+
+    GDAL writes the unit of z there where the two differ, and of a plane without a projection it leaves out the
+    model's type, without which the unit of z is not read. `unit` is a length in meters; one without a code of EPSG's
+    changes nothing.
+    """
+    code = next((c for length, c in _UNIT_CODES.items() if math.isclose(length, unit)), None)
+    header = read_header(path)
+    if code is None or header is None:
+        return
+    with open(path, "r+b") as file:
+        for record in islice(records(file, header), _MOST_RECORDS):
+            if (record.user, record.number) != (b"LASF_Projection", 34735):
+                continue
+            file.seek(record.data + 8)
+            data = file.read(min(record.length, LARGEST_RECORD) - 8)
+            keys = {row[0]: row for row in struct.iter_unpack("<4H", data[: len(data) // 8 * 8])}
+            if keys.get(_PLANE_UNIT, ())[1:] not in ((0, 1, c) for c in _UNIT_CODES.values()):
+                continue
+            keys[_PLANE_UNIT] = (_PLANE_UNIT, 0, 1, code)
+            if _MODEL_TYPE not in keys and keys.pop(_ANGULAR_UNIT, None):  # its row gets free
+                keys[_MODEL_TYPE] = (_MODEL_TYPE, 0, 1, 1)
+            file.seek(record.data + 8)
+            file.write(b"".join(struct.pack("<4H", *keys[key]) for key in sorted(keys)))
 
 
 def number_type(kind: str) -> np.dtype:

@@ -14,7 +14,14 @@ from typing import Any
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.extra_bytes import MOST_ENTRIES, extra_dimensions, restore_titles
-from ..base.las import LasHeader, header_there, named_copc, named_las, supersede_copc
+from ..base.las import (
+    LasHeader,
+    header_there,
+    named_copc,
+    named_las,
+    set_geotiff_unit,
+    supersede_copc,
+)
 from ..base.las_repair import restore_texts
 from ..stages.registry import stage_types
 from . import pdal as pdal_env
@@ -72,13 +79,25 @@ def replaced(sources: Iterable[str], made: Iterable[str]) -> list[str]:
     return [f"{REPLACED} {', '.join(names)}. To keep the old ones, rename them first"]
 
 
-def finish(made: Path, sources: Iterable[str]) -> None:
-    """Correct in an output what PDAL forwards wrongly of the LAS files it was made from; others stay as they are."""
+def finish(made: Path, sources: Iterable[str], unit: float | None = None) -> None:
+    """Correct in a LAS output what PDAL forwards wrongly; other outputs stay as they are.
+
+    Parameters
+    ----------
+    made : Path
+        The output.
+    sources : iterable of str
+        The files it was made from.
+    unit : float, optional
+        The unit of its x and y in meters, where it is that of the sources.
+    """
     supersede_copc(made)
     if named_las(made):
         sources = list(sources)
         restore_titles(made, sources)
         restore_texts(made, sources)
+        if unit is not None:
+            set_geotiff_unit(made, unit)
 
 
 # ---- limits, checked before any work -------------------------------------------------------------

@@ -224,7 +224,7 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
 
 
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
-_FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure.*)")
+_FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure (?!\(\d+\) PROJ:).*)")
 BROKEN_REFERENCE = "the spatial reference in the file cannot be read"
 REFERENCE_CURE = 'Name the right one, --readers.las.override_srs=EPSG:CODE (in a pipeline "override_srs" of the reader)'
 #: How PDAL begins a line of its log; some stages say their name once more.

@@ -24,7 +24,7 @@ from .expansion import Expanded, check_dimensions, expand, merge_filters
 from .inputs_outputs import check_octrees, locations, stage_files
 from .json_source import PipelineSource, read_pipeline
 from .overrides import Override, apply_overrides
-from .spatial_reference import check_readers
+from .spatial_reference import check_readers, plane_unit
 from .stage_files import (
     is_reader,
     is_writer,
@@ -212,7 +212,7 @@ class Pipeline:
         def finish(made: Path, final: Path, number: int) -> None:
             count = result.count if alone and "#" not in outputs[0] else None
             check_complete(made, final, writers[number], count)
-            las_output.finish(made, sources)
+            las_output.finish(made, sources, plane_unit(stages, result.metadata))
 
         runtime.remember_stdout()
         for ours in self.expanded.ours:

@@ -164,11 +164,7 @@ def points_of_views(
     arrays = [array for array in arrays if len(array)] or list(arrays[:1])
     names = arrays[0].dtype.names or () if arrays else ()
     columns = {name: np.concatenate([array[name] for array in arrays]) for name in names}
-    said = [
-        node for kind, node in metadata.get("metadata", {}).items() if kind.startswith("readers.")
-    ]
-    first = said[0] if said else None
-    wkt = wkt_of(first[0] if isinstance(first, list) else first)
+    wkt = wkt_of(reader_metadata(metadata))
     return made(
         columns, wkt=wkt, legacy_flags=pdal_env.flags_inside_classification(names, metadata)
     )
@@ -248,6 +244,13 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
 def _encodable(text: str) -> str:
     """Text that PDAL can take: valid UTF-8 without NUL."""
     return text.encode("utf-8", "replace").decode().replace("\0", "?")
+
+
+def reader_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what PDAL's metadata of a run holds about the first reader; empty without one."""
+    inner = metadata.get("metadata", {})
+    node: Any = next((node for kind, node in inner.items() if kind.startswith("readers.")), {})
+    return node[0] if isinstance(node, list) else node
 
 
 def wkt_of(reference: Any) -> str:

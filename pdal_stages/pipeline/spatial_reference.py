@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from ..base.errors import PipelineError, StageError
 from ..base.las import header_there, named_las, projection, read_header
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from . import pdal as pdal_env
-from .runtime import wkt_of
+from .runtime import reader_metadata, wkt_of
 from .stage_files import reader_files
 
 #: Stages that may bring points into one reference.
@@ -50,9 +51,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str 
     # Without extra bytes: of a file with odd ones, all of it would be copied for a single point.
     plain = {"ignore_vlr": "LASF_Spec/4"} if reader["type"] == "readers.las" else {}
     run = pdal_env.execute([plain | dict(reader)], arrays=False)
-    said = run.metadata.get("metadata", {})
-    node: Any = next((node for kind, node in said.items() if kind.startswith("readers.")), {})
-    srs = (node[0] if isinstance(node, list) else node).get("srs", {})
+    srs = reader_metadata(run.metadata).get("srs", {})
     wkt = wkt_of(srs)
     if not wkt and "GDAL failure" in run.log:
         raise PipelineError(
@@ -77,6 +76,19 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str 
     root = parse_wkt(wkt)
     height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
     return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt), wkt)
+
+
+def plane_unit(stages: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any]) -> float | None:
+    """Return the unit of x and y, in meters, that a pipeline's readers give its writers; None where that is not known.
+
+    `metadata` is PDAL's, of the run.
+    """
+    if any(stage["type"] in MOVING or "a_srs" in stage for stage in stages):
+        return None
+    with suppress(StageError):
+        if wkt := wkt_of(reader_metadata(metadata)):
+            return units_of_wkt(wkt).horizontal
+    return None
 
 
 def reference_of_file(path: str, horizontal: str = "", vertical: str = "") -> Reference:

@@ -13,7 +13,7 @@ from ..base.asprs import GROUND, LOW, MEDIUM, by_height
 from ..base.asprs import HIGH as HIGH_VEGETATION
 from ..base.errors import OptionError
 from ..base.progress import Progress
-from ..base.units import doubt_vertical_unit
+from ..base.units import doubt_vertical_unit, median_slope
 from ..classifier.calibration import Limit, Sureness, said, sureness_of
 from ..classifier.model import UNCLASSIFIED, Model, loaded_model
 from ..classifier.model_file import find
@@ -258,6 +258,7 @@ class ApplyModel(Stage):
         }
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
         ground = self._may_be_ground(points) if self.given_ground else None
+        slope = median_slope(points.xyz, points.dimension(HEIGHT)) if HEIGHT in points.arrays else 0
         points.keep_only([*dimensions, *self.creates(), HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             found = self.model.predict(
@@ -286,7 +287,8 @@ class ApplyModel(Stage):
             found.report.figures["classes"] = class_counts(found.classification[wanted])
         if HEIGHT in points.arrays:
             leaves = wanted & np.isin(found.classification, (LOW, MEDIUM, HIGH_VEGETATION))
-            doubt = doubt_vertical_unit(points.dimension(HEIGHT)[leaves], points.units.vertical)
+            leaf_heights = points.dimension(HEIGHT)[leaves]
+            doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical)
             points.report.warnings += [doubt] if doubt else []
         values: dict[str, NDArray] = {
             "Classification": found.classification,

@@ -23,6 +23,7 @@ from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.las_chunks import laspy_header, read_chunks
 from ..pipeline.runtime import Callbacks
+from ..pipeline.spatial_reference import plane_unit
 from ..pipeline.stage_files import LAS_WRITERS
 from ..stages.points import class_counts
 from .checkpoint import load_arrays, written
@@ -178,7 +179,7 @@ def run_tail(
         check_complete(
             made, final, writers[number], None if "where" in writers[number] else run.count
         )
-        las_output.finish(made, sources)
+        las_output.finish(made, sources, plane_unit(stages, run.metadata))
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
     callbacks = Callbacks()
