@@ -247,7 +247,7 @@ def set_geotiff_unit(path: str | os.PathLike, unit: float) -> None:
             if keys.get(_PLANE_UNIT, ())[1:] not in ((0, 1, c) for c in _UNIT_CODES.values()):
                 continue
             keys[_PLANE_UNIT] = (_PLANE_UNIT, 0, 1, code)
-            if _MODEL_TYPE not in keys and keys.pop(_ANGULAR_UNIT, None):  # its row gets free
+            if _MODEL_TYPE not in keys and keys.pop(_ANGULAR_UNIT, ()):  # its row gets free
                 keys[_MODEL_TYPE] = (_MODEL_TYPE, 0, 1, 1)
             file.seek(record.data + 8)
             file.write(b"".join(struct.pack("<4H", *keys[key]) for key in sorted(keys)))
