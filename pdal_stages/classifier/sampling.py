@@ -1,12 +1,14 @@
-"""Training samples, as many of each class, spread over space, whatever the order of the points; and ground held out.
+"""Draw training samples, and hold ground out.
 
-Each class's points are put in the order of a space-filling curve (Morton's, over 0.5 m cells) and taken from it at equal
-steps, from a place drawn by the seed on. So samples follow the class wherever it is, none of them clumped, and a class's
-dense parts weigh as they do in the cloud. Ties within a cell are ordered by a hash of the coordinates.
+Samples: as many of each class, spread over space, whatever the order of the points. Each class's
+points are put in the order of a space-filling curve (Morton's, over 0.5 m cells) and taken from it
+at equal steps, from a place drawn by the seed on. So samples follow the class wherever it is, none
+of them clumped, and a class's dense parts weigh as they do in the cloud. Ties within a cell are
+ordered by a hash of the coordinates.
 
-Neighboring points share most of their features, so a forest nearly knows the neighbors of its samples: a score on them
-flatters, and a next pass trained on what it says there would trust what nobody knows elsewhere. So whole surveys or blocks
-of ground are held out in turn.
+Neighboring points share most of their features, so a forest nearly knows the neighbors of its
+samples: a score on them flatters, and a next pass that is trained on its votes there would trust
+votes that are worse elsewhere. So whole surveys or blocks of ground are held out in turn.
 """
 
 from __future__ import annotations
@@ -32,9 +34,11 @@ CELL = 0.5
 MOST = 5_000_000
 
 
-#: Side of a block in meters; where too few have samples it is halved down to the other.
-BLOCK, SMALLEST = 25.0, 0.02
-#: Fewer surveys than this are cut into blocks: else too little would be left to train the next pass on.
+#: Side of a block of ground held out, in meters: wider than the neighborhoods of features.
+BLOCK = 25.0
+#: Where too few blocks have samples the side is halved, but not below this many meters.
+SMALLEST_BLOCK = 0.02
+#: Fewer surveys than this are cut into blocks: else too little would be left to train on.
 SURVEYS = 3
 
 
@@ -53,24 +57,28 @@ class Samples:
         return len(self.row)
 
     def of_cloud(self, number: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """A cloud's samples: their places here, and their rows in the cloud, ascending."""
+        """Return the places of a cloud's samples here, and their rows in the cloud, ascending."""
         at = np.flatnonzero(self.cloud == number)
         at = at[np.argsort(self.row[at], kind="stable")]
         return at, self.row[at]
 
     def take(self, array_of: Callable[[int], npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """The samples' values, of one value or row per point of each cloud; called for clouds with samples alone."""
-        places, values = [], []
+        """Return the samples' values (m, ...) from an array of values for all points of each cloud.
+
+        `array_of` returns the array of a cloud by its number, and is called for clouds with samples
+        alone.
+        """
+        places, parts = [], []
         for number in np.unique(self.cloud).tolist():
             places.append(np.flatnonzero(self.cloud == number))
-            values.append(array_of(number)[self.row[places[-1]]])
-        made = np.concatenate(values)
-        out = np.empty_like(made)
-        out[np.concatenate(places)] = made
+            parts.append(array_of(number)[self.row[places[-1]]])
+        values = np.concatenate(parts)
+        out = np.empty_like(values)
+        out[np.concatenate(places)] = values
         return out
 
     def counts(self, position: int) -> dict[str, int]:
-        """Points available, different points drawn, and duplicates of one class."""
+        """Return the points available, different points drawn, and duplicates of one class."""
         weight = self.weight[self.label == position]
         return {
             "available": self.available[position],
@@ -112,40 +120,60 @@ def draw_samples(
         )
     if not random_order:
         count = min(count, int(available.max()))
-    alone = np.count_nonzero(there.any(axis=1)) == 1
+    is_alone = np.count_nonzero(there.any(axis=1)) == 1
     parts = []
     for position in range(n_classes):
         quota = share_out(there[:, position], count)
         for group in np.flatnonzero(quota):
-            random = (
-                [seed, position] if alone else [seed, position, crc32(str(names[group]).encode())]
-            )
-            limit = np.uint64(min(1.0, MOST / there[group, position]) * (2.0**64 - 2048.0))
-            keys, rows, where = [], [], []
-            for number in np.flatnonzero(of_cloud == group).tolist():
-                xyz, label = clouds[number]
-                mine = np.flatnonzero(label == position)
-                key = curve_keys(xyz[mine], seed)
-                keep = key["hash"] <= limit
-                keys.append(key[keep])
-                rows.append(mine[keep])
-                where.append(np.full(len(rows[-1]), number))
-                if progress is not None:
-                    progress.update(len(label))
-            found, row, cloud = np.concatenate(keys), np.concatenate(rows), np.concatenate(where)
-            cell = np.zeros_like(found["cell"]) if random_order else found["cell"]
-            order = np.lexsort((found["hash"], cell))
-            place, weight = spread(len(order), int(quota[group]), np.random.default_rng(random))
-            chosen = order[place]
-            parts.append(
-                (cloud[chosen], row[chosen], np.full(len(chosen), position, np.int16), weight)
-            )
+            state = [seed, position]
+            if not is_alone:
+                state.append(crc32(str(names[group]).encode()))
+            share = min(1.0, MOST / there[group, position])
+            numbers = np.flatnonzero(of_cloud == group).tolist()
+            keys, row, cloud = _keys_of_class(clouds, numbers, position, seed, share, progress)
+            cell = np.zeros_like(keys["cell"]) if random_order else keys["cell"]
+            order = np.lexsort((keys["hash"], cell))
+            place, weight = spread(len(order), int(quota[group]), np.random.default_rng(state))
+            drawn = order[place]
+            label = np.full(len(drawn), position, np.int16)
+            parts.append((cloud[drawn], row[drawn], label, weight))
     cloud, row, label, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Samples(cloud, row, label, weight, tuple(available.tolist()))
 
 
+def _keys_of_class(
+    clouds: Any,
+    numbers: Sequence[int],
+    position: int,
+    seed: int,
+    share: float,
+    progress: Progress | None,
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return keys (m,) of a share of a class's points in some clouds, their rows, and their clouds.
+
+    A point stays or goes by the hash of its key.
+    """
+    limit = np.uint64(share * (2.0**64 - 2048.0))
+    keys, rows, cloud = [], [], []
+    for number in numbers:
+        xyz, label = clouds[number]
+        members = np.flatnonzero(label == position)
+        key = curve_keys(xyz[members], seed)
+        keep = key["hash"] <= limit
+        keys.append(key[keep])
+        rows.append(members[keep])
+        cloud.append(np.full(len(rows[-1]), number))
+        if progress is not None:
+            progress.update(len(label))
+    return np.concatenate(keys), np.concatenate(rows), np.concatenate(cloud)
+
+
 def share_out(available: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
-    """How many of `count` samples each group gives: alike, as far as there are so many; else in proportion."""
+    """Return how many of `count` samples each group gives, from how many it has (groups,).
+
+    All give as many, as far as they have them; where there are fewer than `count` in all, each
+    gives its share, with copies.
+    """
     total = int(available.sum())
     if count >= total:  # all of them, the rest as copies
         exact = available * (count / total)
@@ -163,7 +191,7 @@ def share_out(available: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.in
 def spread(
     n: int, count: int, random: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """`count` of `n` places in a row, equally far apart from a random one on, and their weights."""
+    """Return `count` of `n` places in a row, equally far apart from a random one on, and weights."""
     share, rest = divmod(count, n)
     picks = np.floor((np.arange(rest) + random.random()) * (n / max(rest, 1))).astype(np.int64)
     picks = np.minimum(picks, n - 1)
@@ -200,14 +228,15 @@ def _spread_bits(value: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
 
 @dataclass(frozen=True, eq=False)
 class Folds:
-    """Which part of the training ground a point belongs to."""
+    """Parts of the training ground, of which each point belongs to one."""
 
     count: int
     surveys: dict[str, int]  #: fold of each, where whole surveys are folds
-    #: of blocks, meters; they are anchored to absolute coordinates, so that clouds that overlap share them
+    #: of blocks in meters, which are anchored to absolute coordinates: overlapping clouds share them
     side: float = BLOCK
-    #: (m,) number of each block that has samples, ascending, and its fold; others follow from their number
+    #: (m,) number of each block that has samples, ascending; other blocks are dealt by their number
     blocks: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    #: (m,) their folds
     fold: npt.NDArray[np.int16] = field(default_factory=lambda: np.zeros(0, np.int16))
 
     @classmethod
@@ -219,12 +248,15 @@ class Folds:
         folds: int,
         side: float,
     ) -> Folds:
-        """Blocks dealt out so that every fold has its share of each class of the samples, (n, 2) meters; `label` is their
-        class positions, `weight` how often they count."""
+        """Deal out blocks so that every fold has its share of each class of the samples.
+
+        `xy` (n, 2) are their places in meters, `label` (n,) their class positions, `weight` (n,)
+        how often they count.
+        """
         blocks, block = np.unique(_numbers(xy, side), return_inverse=True)
         if len(blocks) < folds:
             raise OptionError(
-                f"the samples cover {len(blocks)} block(s) of {side:g} m, fewer than the {folds} folds",
+                f"the samples cover {len(blocks)} block(s) of {side:g} m, fewer than the folds",
                 found=f"folds {folds}",
                 cure="Take smaller blocks, fewer folds, or more training data",
             )
@@ -247,13 +279,16 @@ class Folds:
         surveys: Sequence[str],
         folds: int,
     ) -> Folds:
-        """Whole surveys where there are enough, up to twice as many folds, else blocks as small as need be."""
+        """Hold out whole surveys where there are enough, else blocks as small as need be.
+
+        Of surveys there are up to twice as many folds.
+        """
         names = sorted(set(surveys))
         if len(names) >= SURVEYS:
             folds = min(2 * folds, len(names))
             return cls(folds, {name: number % folds for number, name in enumerate(names)})
         side = BLOCK
-        while side >= SMALLEST:
+        while side >= SMALLEST_BLOCK:
             try:
                 return cls.of_blocks(xy, label, weight, folds, side)
             except OptionError:
@@ -264,7 +299,7 @@ class Folds:
         )
 
     def points(self, xyz: npt.NDArray[np.float64], survey: str = "") -> npt.NDArray[np.int16]:
-        """The fold of each point of a cloud."""
+        """Return the fold (n,) of each point of a cloud."""
         if self.surveys:
             return np.full(len(xyz), self.surveys[survey], np.int16)
         number = _numbers(xyz, self.side)
@@ -273,7 +308,7 @@ class Folds:
 
 
 def _numbers(xyz: npt.NDArray[np.float64], side: float) -> npt.NDArray[np.int64]:
-    """The number of each point's block."""
+    """Return the number (n,) of each point's block."""
     cell = np.floor(xyz[:, :2] / side).astype(np.int64)
     return (cell[:, 0] << 32) + cell[:, 1]
 
@@ -281,7 +316,10 @@ def _numbers(xyz: npt.NDArray[np.float64], side: float) -> npt.NDArray[np.int64]
 def split(
     xy: npt.NDArray[np.float64], fold: npt.NDArray[Any], number: int, gap: float
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
-    """(training mask, rows held out) of one fold; none of the former is within `gap` meters of the latter."""
+    """Return the training mask (n,) and the rows held out (m,) of one fold.
+
+    Samples closer than `gap` meters to those held out are in neither.
+    """
     from scipy.spatial import cKDTree
 
     held = fold == number
@@ -296,11 +334,9 @@ def split(
 
 
 def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, Any]:
-    """The measures kept in a model file; rows of the matrix are the truth."""
+    """Return the measures kept in a model file; rows of the matrix are the truth."""
     accuracy = Accuracy.from_confusion(matrix, codes)
-    found = summary(accuracy)
-    del found["points"]
-    return {
-        **found,
-        "f1": {str(one.code): one.f1 if one.support else None for one in accuracy.per_class},
-    }
+    measures = summary(accuracy)
+    del measures["points"]
+    scores = {str(each.code): each.f1 if each.support else None for each in accuracy.per_class}
+    return {**measures, "f1": scores}
