@@ -36,9 +36,9 @@ class FromBefore(NamedTuple):
     ]  #: for each piece: rows and new values of dimensions, from the stages before it
 
 
-def left_name(tile: str) -> str:
-    """The name of the first round's result for a tile."""
-    return f"{tile}.first"
+def left_name(squares: TileGrid, square: tuple[int, int]) -> str:
+    """Return the name of the first round's result for a square."""
+    return f"{squares.name(square)}.first"
 
 
 def block_name(block: tuple[int, int]) -> str:
@@ -69,17 +69,14 @@ def make_block(
     return {"outputs": written([target])}
 
 
-def blocks_around(
-    context: RunContext, tile: tuple[int, int], around_m: float
-) -> list[tuple[int, int]]:
-    """The blocks that a tile touches with so many meters around it."""
+def blocks_around(context: RunContext, box: Box, around_m: float) -> list[tuple[int, int]]:
+    """Return the blocks that touch a box, in the unit of the coordinates, grown by some meters."""
     assert context.plan.first is not None
-    box = _box_m(context, tile, around_m)
-    return TileGrid(context.plan.first.blocks.side).covering(box)
+    return TileGrid(context.plan.first.blocks.side).covering(_box_m(context, box, around_m))
 
 
-def _box_m(context: RunContext, tile: tuple[int, int], around_m: float) -> Box:
-    x0, y0, x1, y1 = (side * context.unit for side in context.grid.box(tile))
+def _box_m(context: RunContext, box: Box, around_m: float) -> Box:
+    x0, y0, x1, y1 = (side * context.unit for side in box)
     return (x0 - around_m, y0 - around_m, x1 + around_m, y1 + around_m)
 
 
@@ -90,15 +87,15 @@ def from_before(
     first = context.plan.first
     assert first is not None
     around = read_m + first.blocks.around + first.blocks.spill
-    box = _box_m(context, tile, around)
-    blocks = map(block_name, blocks_around(context, tile, around))
+    own = context.grid.box(tile)
+    blocks = map(block_name, blocks_around(context, own, around))
     stage = stage_of(context.plan)
-    needed = stage.needed_of_blocks(box)
+    needed = stage.needed_of_blocks(_box_m(context, own, around))
     found = (
         load_arrays(path, needed) for path in _there(context.rasters, blocks)
     )  # others have no points
-    tiles = context.grid.covering(context.grid.box(tile, read_m / context.unit))
-    left = _there(context.rasters, [left_name(context.grid.name(each)) for each in tiles])
+    squares = context.squares.covering(context.grid.box(tile, read_m / context.unit))
+    left = _there(context.rasters, [left_name(context.squares, each) for each in squares])
     changed = _changed(first.kept or (), left, cuts)
     return FromBefore(stage.made_of_blocks(found), changed)
 

@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from ..pipeline.las_output import replaced
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
 from ..pipeline.stage_files import LAS_READERS, named_files
 from .checkpoint import fingerprint
-from .options import Density, Extent, TilingOptions, block_bytes, settled
+from .options import Density, Extent, TilingOptions, block_bytes, settled, tiles_per_square
 from .plan import TilePlan, outputs_for
 from .tile_grid import Box, TileGrid, check_number, touching, union
 
@@ -161,6 +161,7 @@ class CloudIndex:
     cells: NDArray[
         np.int64
     ]  #: (n, 4): column, row, index of the first point in the copy, number of points
+    grid: TileGrid  #: of the cells
     copy: str  #: the file with the points
     checksum: int  #: CRC-32 of the copy
     digest: str  #: SHA-256 of the input
@@ -172,7 +173,8 @@ class CloudIndex:
         cells = np.array(record["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in record["tiles"]]
         sums = int(record["checksum"]), str(record["digest"]), int(record["changed_ns"])
-        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, copy, *sums)
+        grid = TileGrid(*map(float, record["grid"]))
+        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, grid, copy, *sums)
 
     def is_of(self, path: str) -> bool:
         """Return whether the input still holds the bytes that were read.
@@ -192,7 +194,10 @@ IndexedSource = tuple[InputSource, CloudIndex | None]
 class Survey:
     """The inputs of a run, and its options with tile size and number of workers decided."""
 
-    def __init__(self, plan: TilePlan, options: TilingOptions) -> None:
+    def __init__(
+        self, plan: TilePlan, options: TilingOptions, earlier: Mapping[str, Any] | None = None
+    ) -> None:
+        """`earlier`: the :attr:`layout` of the run that this one resumes, where the user gives no tile size."""
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
         self.unreadable: dict[str, str] = {}  #: unreadable inputs by path, and why
@@ -223,11 +228,17 @@ class Survey:
         self.block_bytes = (
             block_bytes(plan.first.blocks, self.density.area * self.unit**2) if plan.first else 0.0
         )
-        self.options = settled(
-            options, self.density, self.halo_units, self.per == "file", self.block_bytes
+        sized = replace(options, tile=earlier["tile"]) if earlier else options
+        self.options, self.grid = settled(
+            sized, self.density, self.halo_units, self.per == "file", self.block_bytes
         )
-        assert self.options.tile is not None
-        self.grid = TileGrid(self.options.tile)
+        if earlier:
+            self.grid = TileGrid(self.grid.size, earlier["origin"])
+        square = 1
+        if plan.first is not None:
+            first_halo = plan.first.halo_m / self.unit
+            square = tiles_per_square(self.options, self.density, self.grid.size, first_halo)
+        self.squares = self.grid.scaled(earlier["square"] if earlier else square)
 
     def _read_headers(self) -> None:
         odd: list[str] = []
@@ -291,6 +302,12 @@ class Survey:
         x, y, _, _ = self.extents[source.path].box
         return reference_of(source.within((x, y, x + 1, y + 1)), horizontal)
 
+    @property
+    def layout(self) -> dict[str, float]:
+        """The grids of the run, for one that resumes it: the free memory may be another by then."""
+        square = round(self.squares.size / self.grid.size)
+        return {"tile": self.grid.size, "origin": self.grid.origin, "square": square}
+
     def place(self) -> None:
         """Collect the boxes of inputs from headers or indexes, as an array for fast comparison."""
         self.placed = [
@@ -321,7 +338,11 @@ class Survey:
 
     def near(self, tile: tuple[int, int], halo_units: float) -> list[InputSource]:
         """Inputs that may have points in a tile or its halo."""
-        return [self.placed[n] for n in touching(self._boxes, self.grid.box(tile, halo_units))]
+        return self.near_box(self.grid.box(tile, halo_units))
+
+    def near_box(self, box: Box) -> list[InputSource]:
+        """Return the inputs that may have points in a box."""
+        return [self.placed[n] for n in touching(self._boxes, box)]
 
     def readable(self, sources: list[InputSource]) -> list[IndexedSource]:
         """The readable ones, with the index of their points."""

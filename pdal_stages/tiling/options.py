@@ -14,7 +14,7 @@ from ..base.errors import OptionError
 from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..stages.first_round import Blocks
-from .tile_grid import Box, union
+from .tile_grid import Box, TileGrid, union
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
@@ -31,6 +31,8 @@ MOST_AT_ONCE = 4_000_000
 PARENT = 350 << 20
 #: Most points of a tile of automatic size: a failed tile is lost, and progress is counted in tiles.
 _MOST_OF_A_TILE = 3_000_000
+#: A square of the first round is as many times wider than its halo: what is read twice is then about a half.
+_HALOS_OF_A_SQUARE = 8
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 8,000,000.
 _SIDES = [
     mantissa * 10.0**power for power in range(7) for mantissa in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
@@ -132,13 +134,17 @@ class Density:
             around,
         )
 
-    def side_around(self) -> float | None:
-        """Return the smallest side of tiles of which one holds all inputs; None where the grid's lines cut them."""
-        x0, y0, x1, y1 = self.box
-        return next(
-            (s for s in _SIDES if x0 // s == x1 // s and y0 // s == y1 // s),
-            None,
-        )
+    def grid_around(self) -> TileGrid | None:
+        """Return the grid of the smallest tiles of which one holds all inputs, if any does.
+
+        Where the lines of a grid at zero cut the inputs, as coordinates on both sides of zero, the grid is shifted.
+        """
+        grids = (TileGrid(side, shift * side) for side in _SIDES for shift in (0.0, -0.5))
+        for grid in grids:
+            column, row = (grid.index(np.array(self.box[axis::2])) for axis in (0, 1))
+            if column[0] == column[1] and row[0] == row[1]:
+                return grid
+        return None
 
     def read_by(self, side: float, halo_units: float) -> int:
         """Points of a tile of this side with its surroundings."""
@@ -163,8 +169,8 @@ def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool
 
 def settled(
     options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
-) -> TilingOptions:
-    """The options with tile size and number of workers chosen to fit into memory; OptionError where no tile fits."""
+) -> tuple[TilingOptions, TileGrid]:
+    """Choose tiles and the number of workers so that they fit into memory; OptionError where no tile fits."""
     whole = options.memory or free_memory() // 2
     local = 0 if options.scheduler else options.local_workers
     fixed = options.workers is not None or local <= 1
@@ -177,11 +183,12 @@ def settled(
         return worker_bytes(density.read_by(side, halo_units), largest, block)
 
     # A small survey in one tile needs neither surroundings nor rounds before.
-    alone = density.side_around() if 0 < density.points <= _MOST_OF_A_TILE else None
+    alone = density.grid_around() if 0 < density.points <= _MOST_OF_A_TILE else None
     if options.tile is None and not options.scheduler and alone:
         free = whole - (PARENT if local else 0)
         if worker_bytes(density.points, density.largest if per_file else 0) <= free:
-            return replace(options, tile=alone, workers=min(local, 1) if not fixed else local)
+            workers = local if fixed else min(local, 1)
+            return replace(options, tile=alone.size, workers=workers), alone
     for workers in [local] if fixed else range(local, 0, -1):
         room = (whole - PARENT) / workers if workers else whole
         fitting = [side for side in sides if needed(side) <= room]
@@ -193,11 +200,10 @@ def settled(
             side = max([each for each in fitting if each <= few] or fitting[:1])
         # Most of a small tile is halo, which costs as much: rather fewer workers.
         if side >= halo_units or side == sides[-1] or fixed or workers == 1:
-            return replace(
-                options, tile=side, workers=options.workers if options.scheduler else workers
-            )
+            chosen = options.workers if options.scheduler else workers
+            return replace(options, tile=side, workers=chosen), TileGrid(side)
     if options.memory is None and options.tile is not None:
-        return options  # as it was asked for
+        return options, TileGrid(options.tile)
     least = needed(sides[0]) * max(1, local if fixed else 1) + (PARENT if local else 0)
     raise OptionError(
         "there is not enough memory for tiles" + ("" if options.tile is None else " of this size"),
@@ -205,3 +211,24 @@ def settled(
         cure="Give more with --memory, or fewer --workers"
         + (", or a smaller --tile" if options.tile else ""),
     )
+
+
+def tiles_per_square(
+    options: TilingOptions, density: Density, side: float, halo_units: float
+) -> int:
+    """Return how many tiles of a `side` make the side of a square of the first round.
+
+    Its halo is wide, so squares are eight times as wide where as many points fit into the memory as a tile may have.
+    """
+    workers = max(1, options.local_workers)
+    room = ((options.memory or free_memory() // 2) - PARENT) / workers - BASE - STAGES
+    most = min(_MOST_OF_A_TILE, room / TILE_POINT)
+    fair = math.sqrt(density.area / workers) if workers > 1 else math.inf  # one for each worker
+    square = 1
+    while (
+        square * side < _HALOS_OF_A_SQUARE * halo_units
+        and (square + 1) * side <= fair
+        and density.read_by((square + 1) * side, halo_units) <= most
+    ):
+        square += 1
+    return square

@@ -82,6 +82,7 @@ class RunContext:
 
     plan: TilePlan
     grid: TileGrid
+    squares: TileGrid  #: of the first round
     unit: float  #: meters per unit of the coordinates
     bounds: Box  #: of all inputs
     threads: int

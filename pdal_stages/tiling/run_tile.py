@@ -192,11 +192,11 @@ def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceRe
 
 
 def run_first_round(
-    context: RunContext, tile: tuple[int, int], sources: Sequence[IndexedSource], target: str
+    context: RunContext, square: tuple[int, int], sources: Sequence[IndexedSource], target: str
 ) -> dict[str, Any]:
-    """Save what the raster needs of a tile's own points, and the changes by earlier stages; returns a record.
+    """Save what the raster needs of a square's own points, and the changes by earlier stages; returns a record.
 
-    `sources` may have points in the tile or its halo.
+    `sources` may have points in the square or its halo.
     """
     plan, first = context.plan, context.plan.first
     assert first is not None
@@ -208,13 +208,14 @@ def run_first_round(
             left.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
 
     before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
+    context = replace(context, plan=before, grid=context.squares)
     head = HeadRun([])
     with TemporaryDirectory(
         prefix="first-", dir=context.scratch, ignore_cleanup_errors=True
     ) as folder:
-        cuts = cut_all(context.grid, tile, sources, first.halo_m / context.unit, folder)
+        cuts = cut_all(context.grid, square, sources, first.halo_m / context.unit, folder)
         if cuts:
-            head = run_head(replace(context, plan=before), tile, cuts, True, last=leave)
+            head = run_head(context, square, cuts, True, last=leave)
     arrays = {
         name: np.concatenate([one[name] for one in left if name in one])
         for name in {name for one in left for name in one}

@@ -67,7 +67,7 @@ def _copy_type(header: laspy.LasHeader) -> np.dtype:
 def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     """Read a file once, write its points into a sorted copy, and return their index (:class:`CloudIndex`)."""
     header = laspy_header(path)
-    dtype, cells = _copy_type(header), TileGrid(grid.size / _CELLS)
+    dtype, cells = _copy_type(header), grid.scaled(1 / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     found = [np.empty((0, 4), np.int64)]
     total = checksum = 0
@@ -100,7 +100,8 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     box = [*low.tolist(), *high.tolist()]
     return {
         **{"count": total, "box": box, "tiles": tiles.tolist(), "cells": held.tolist()},
-        **{"changed_ns": changed_ns, "digest": digest, "checksum": checksum},
+        **{"grid": [cells.size, cells.origin], "changed_ns": changed_ns},
+        **{"digest": digest, "checksum": checksum},
     }
 
 
@@ -131,14 +132,11 @@ def coordinates(
     return x, y
 
 
-def points_near(
-    path: str, index: CloudIndex, grid: TileGrid, box: Box
-) -> tuple[NDArray[np.int64], NDArray]:
+def points_near(path: str, index: CloudIndex, box: Box) -> tuple[NDArray[np.int64], NDArray]:
     """Numbers, ascending, and records of the points of a file that lie in a box, edges included."""
     header = laspy_header(path)
     (i0, j0), (i1, j1) = (
-        TileGrid(grid.size / _CELLS).index(np.array(corner)).tolist()
-        for corner in (box[:2], box[2:])
+        index.grid.index(np.array(corner)).tolist() for corner in (box[:2], box[2:])
     )
     i, j = index.cells[:, 0], index.cells[:, 1]
     near = index.cells[(i >= i0) & (i <= i1) & (j >= j0) & (j <= j1)]
@@ -201,7 +199,7 @@ def cut_all(
             records = np.concatenate([points.array for points in read_chunks(path)])
             numbers = np.arange(len(records))
         elif index is not None:
-            numbers, records = points_near(path, index, grid, box)
+            numbers, records = points_near(path, index, box)
         else:
             continue
         if not len(records):

@@ -20,9 +20,12 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Square tiles of one size; tile (i, j) holds ``i*size <= x < (i+1)*size``, likewise y."""
+    """Square tiles of one size; tile (i, j) holds ``i*size <= x - origin < (i+1)*size``, likewise y."""
 
     size: float  #: side of a tile, in the unit of the coordinates
+    #: A line of the grid, along either axis. Zero, so that tiles are the same in every run, but for a cloud that one tile
+    #: can hold.
+    origin: float = 0.0
 
     def index(self, coordinate: NDArray[np.float64]) -> NDArray[np.int64]:
         """Column or row of every coordinate.
@@ -31,30 +34,29 @@ class TileGrid:
         whatever the division rounds to, so each point has exactly one tile.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            where = np.floor(coordinate / self.size)
+            where = np.floor((coordinate - self.origin) / self.size)
         if where.size and not np.abs(where).max() < _FARTHEST:  # not finite too
             raise StageError(
                 "coordinates are too large for tiles of this size",
                 found=f"{coordinate[np.abs(where).argmax()]:g}, tiles of {self.size:g}",
                 cure="Take larger tiles, or repair the coordinates",
             )
-        where -= coordinate < where * self.size
-        where += coordinate >= (where + 1.0) * self.size
+        where -= coordinate < where * self.size + self.origin
+        where += coordinate >= (where + 1.0) * self.size + self.origin
         return where.astype(np.int64)
 
     def box(self, tile: tuple[int, int], halo_units: float = 0.0) -> Box:
         """(min x, min y, max x, max y) of a tile, grown by as much on each side."""
-        i, j = tile
-        return (
-            i * self.size - halo_units,
-            j * self.size - halo_units,
-            (i + 1) * self.size + halo_units,
-            (j + 1) * self.size + halo_units,
-        )
+        x0, y0, x1, y1 = (n * self.size + self.origin for n in (*tile, tile[0] + 1, tile[1] + 1))
+        return x0 - halo_units, y0 - halo_units, x1 + halo_units, y1 + halo_units
+
+    def scaled(self, by: float) -> TileGrid:
+        """Return a grid of the same origin whose tiles are larger by a factor."""
+        return TileGrid(self.size * by, self.origin)
 
     def name(self, tile: tuple[int, int]) -> str:
         """South-west corner, e.g. ``500000_5400500``."""
-        return "_".join(f"{n * self.size:.10g}" for n in tile)
+        return "_".join(f"{n * self.size + self.origin:.10g}" for n in tile)
 
     def covering(self, box: Box) -> list[tuple[int, int]]:
         """Every tile that a box touches, row by row; StageError for more than :data:`MOST_TILES`."""

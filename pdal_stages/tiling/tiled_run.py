@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -105,9 +105,9 @@ def run_plan(
     """
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
-    if chosen.resume and chosen.tile is None:  # the free memory may be another today
-        chosen = replace(chosen, tile=Store(folder).note("run").get("tile"))
-    survey = Survey(plan, chosen)
+    resumed = chosen.resume and chosen.tile is None
+    known = Store(folder).note("run") if resumed else {}
+    survey = Survey(plan, chosen, known if "square" in known else None)
     if survey.per == "tile":  # whose outputs have points of all readers
         files_with_flags_to_split([*plan.readers, *plan.tail])
     if source is not None:
@@ -124,7 +124,7 @@ def run_plan(
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
-        store.finish("run", "", {"tile": survey.grid.size})
+        store.finish("run", "", survey.layout)
         try:
             with _workers(survey.options, str(store.folder)) as workers:
                 run = _Run(plan, survey, store, workers, progress)
@@ -249,7 +249,7 @@ class _Run:
         for source in survey.sources:
             if source.kind != "las" or source.path in survey.unreadable:
                 continue
-            name = fingerprint(source.path, survey.stamps[source.path], survey.grid.size)
+            name = fingerprint(source.path, survey.stamps[source.path], vars(survey.grid))
             copy = store.path(name, ".points")
             # Without a valid record it is read again.
             with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
@@ -283,7 +283,7 @@ class _Run:
         far = self.farthest
         if first := self.plan.first:
             far += (self.plan.sees_m + first.blocks.side + first.blocks.reach) / self.survey.unit
-            far += self.survey.grid.size
+            far += self.survey.squares.size
         waiting = [job.tile for job in self.tiles if job.state == "waiting"]
         return {source.path for tile in waiting for source in self.survey.near(tile, far)}
 
@@ -300,7 +300,7 @@ class _Run:
         common = fingerprint(
             build(),
             [plan.head, survey.stamps_of(plan.head), plan.creates, plan.halo_m, sees],
-            [grid.size, survey.options.most_points],
+            [vars(grid), survey.options.most_points],
             tail if survey.per == "tile" else [],
         )
         for tile, points in survey.tiles().items():
@@ -355,7 +355,8 @@ class _Run:
             most = 1 << 62  # all points fit, however wide the halo
         plan = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
         threads, scratch = self.workers.threads, str(self.store.scratch)
-        return RunContext(plan, survey.grid, survey.unit, survey.bounds, threads, most, scratch)
+        grids = survey.grid, survey.squares
+        return RunContext(plan, *grids, survey.unit, survey.bounds, threads, most, scratch)
 
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
         """Run all waiting tiles, and outputs as soon as their last tile is done. `finished` is called with outputs."""
@@ -415,37 +416,44 @@ class _Run:
         first, survey, store = self.plan.first, self.survey, self.store
         if first is None or len(self.tiles) == 1:
             return
-        unit, context = survey.unit, self._context()
+        unit, context, squares = survey.unit, self._context(), survey.squares
         by_tile = {job.tile: job for job in self.tiles}
-        places = {b for tile in by_tile for b in blocks_around(context, tile, first.blocks.spill)}
+        points: Counter[tuple[int, int]] = Counter()  # of squares
+        factor = round(squares.size / survey.grid.size)
+        for (i, j), job in by_tile.items():
+            points[i // factor, j // factor] += job.points
+        boxes = {tile: survey.grid.box(tile) for tile in by_tile}
+        spill = first.blocks.spill
+        places = {b for box in boxes.values() for b in blocks_around(context, box, spill)}
         # Blocks and tiles left by an earlier run with other inputs must not be used.
         store.remove(".block.npz", [f"{block_name(block)}.npz" for block in places])
-        store.remove(".first.npz", [f"{left_name(job.name)}.npz" for job in self.tiles])
+        store.remove(".first.npz", [f"{left_name(squares, each)}.npz" for each in points])
         around = self.farthest * unit + first.blocks.around
         wanted = {
-            job.name: places.intersection(blocks_around(context, tile, around))
+            job.name: places.intersection(blocks_around(context, boxes[tile], around))
             for tile, job in by_tile.items()
             if job.state == "waiting"
         }
         near: dict[tuple[int, int], list[tuple[int, int]]] = {
             b: [] for b in sorted(set().union(*wanted.values()))
         }
-        for tile in by_tile:
-            for block in near.keys() & blocks_around(context, tile, first.blocks.reach):
-                near[block].append(tile)
+        for square in points:
+            box = squares.box(square)
+            for block in near.keys() & blocks_around(context, box, first.blocks.reach):
+                near[block].append(square)
         head = self.plan.head[: first.at + 1]
         common = [
             build(),
             head,
             survey.stamps_of(head),
-            survey.grid.size,
+            survey.layout,
             first.halo_m,
             unit,
             first.kept,
         ]
 
-        def sources(tile: tuple[int, int]) -> list[IndexedSource]:
-            return survey.readable(survey.near(tile, first.halo_m / unit))
+        def sources(square: tuple[int, int]) -> list[IndexedSource]:
+            return survey.readable(survey.near_box(squares.box(square, first.halo_m / unit)))
 
         def first_task(job: Job) -> Callable[[], Any]:
             return partial(
@@ -453,22 +461,21 @@ class _Run:
             )
 
         firsts: dict[tuple[int, int], Job] = {}
-        for tile in sorted({tile for tiles in near.values() for tile in tiles}):
-            of = by_tile[tile]
-            mark = fingerprint(common, tile, survey.seen([source for source, _ in sources(tile)]))
-            firsts[tile] = Job(left_name(of.name), of.points, tile, mark=mark)
+        for square in sorted({square for each in near.values() for square in each}):
+            mark = fingerprint(common, square, survey.seen([s for s, _ in sources(square)]))
+            firsts[square] = Job(left_name(squares, square), points[square], square, mark=mark)
         for job in self._do("lowest points of cells", self._unkept(firsts.values()), first_task):
             self.messages_before.append(job.record.get("messages", []))
 
         def block_task(job: Job) -> Callable[[], Any]:
-            left = [store.path(firsts[tile].name) for tile in near[job.tile]]
+            left = [store.path(firsts[square].name) for square in near[job.tile]]
             return partial(make_block, context.plan, job.tile, left, store.path(job.name))
 
         blocks: dict[tuple[int, int], Job] = {}
-        for block, tiles in near.items():
-            mark = fingerprint(common, block, [firsts[tile].mark for tile in tiles])
+        for block, around_it in near.items():
+            mark = fingerprint(common, block, [firsts[square].mark for square in around_it])
             job = blocks[block] = Job(block_name(block), 1, block, mark=mark)
-            job.fail_with(firsts[tile] for tile in tiles)
+            job.fail_with(firsts[square] for square in around_it)
         for _ in self._do("ground by blocks", self._unkept(blocks.values()), block_task):
             pass
         for job in self.tiles:
