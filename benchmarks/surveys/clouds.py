@@ -10,7 +10,7 @@ import laspy
 import numpy as np
 from surveys import GROUND, SURVEYS, TESTS, VEGETATION, LabeledSurvey
 
-from pdal_stages.base.hashing import hash_of
+from pdal_stages.base.hashing import hash_rows
 from pdal_stages.stages.preprocessing import PREPARATION
 from pdal_stages.terrain import filtered_ground
 
@@ -169,7 +169,7 @@ def thinned(cloud: Cloud, density: float) -> Cloud | None:
     share = density / cloud.density
     if share > 0.87:
         return None
-    kept = np.flatnonzero(hash_of(cloud.xyz.T, 0) < np.uint64(share * 2.0**64))
+    kept = np.flatnonzero(hash_rows(cloud.xyz.T, 0) < np.uint64(share * 2.0**64))
     return cloud.part(kept, f"{cloud.name}, {density:g} points per m2")
 
 

@@ -11,7 +11,7 @@ from clouds import Cloud, load, one_return, thinned, without_returns
 from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
-from pdal_stages.base.hashing import hash_of
+from pdal_stages.base.hashing import hash_rows
 from pdal_stages.features.voxels import represent
 from pdal_stages.stages.preprocessing import PREPARATION
 
@@ -72,7 +72,7 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
     if representatives is not None:
         cloud = cloud.taken(representatives.rows)
     cloud = cloud.taken(strip(cloud.xyz, MOST, number * GOLDEN % 1.0))
-    order = np.argsort(hash_of(cloud.xyz.T, 1), kind="stable")
+    order = np.argsort(hash_rows(cloud.xyz.T, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
     whole = TrainingCloud(
         cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, survey=cloud.survey

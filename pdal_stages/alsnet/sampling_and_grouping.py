@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from ..base.hashing import hash_of
+from ..base.hashing import hash_rows
 from ..base.jit import njit
 from .configuration import Configuration
 
@@ -144,7 +144,7 @@ def scramble(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
 
     A ball takes its first points by index: in this order that is a fair sample of it.
     """
-    mixed = hash_of(xyz.T, 0)
+    mixed = hash_rows(xyz.T, 0)
     return np.lexsort((xyz[:, 2], xyz[:, 1], xyz[:, 0], mixed))
 
 

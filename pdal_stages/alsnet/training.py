@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
 from ..base.files import CHECKPOINT, Output, write_whole
-from ..base.hashing import hash_of
+from ..base.hashing import hash_rows
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.class_map import ClassMap
@@ -300,7 +300,7 @@ class _Session:
         options["start_from"] = options["start_from"] and os.path.basename(options["start_from"])
         labels = [list(self.classes.codes), [list(part) for part in self.classes.labels]]
         values = (*self.xyz.T, *self.columns.T, self.position)
-        data = [*map(len, self.clouds), str(hash_of(values, 0).sum())]
+        data = [*map(len, self.clouds), str(hash_rows(values, 0).sum())]
         return json.dumps([FORMAT, options, self.seed, self.inputs, labels, data])
 
     def _save(self, path: str) -> None:

@@ -1,1 +1,1 @@
-"""What all other packages build on: errors, checks, files, LAS headers, threads, messages, units."""
+"""Basics of all rooms: errors, checks, files, LAS, the grid of cells, threads, messages, units."""

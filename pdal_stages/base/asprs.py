@@ -32,32 +32,35 @@ _CLASSES: dict[int, tuple[str, tuple[int, int, int]]] = {
 }
 NAMES = {code: name for code, (name, _) in _CLASSES.items()}
 
-#: Codes of noise points: below ground (7) and in the air (18).
+#: Codes of noise points: below the ground (7) and in the air (18).
 NOISE = (7, 18)
 #: Ground.
 GROUND = 2
-#: ASPRS codes of low, medium and high vegetation.
-LOW, MEDIUM, HIGH = 3, 4, 5
-#: Conductors, towers and bridge decks.
-WIRE, TOWER, BRIDGE = 14, 15, 17
+LOW = 3  #: low vegetation
+MEDIUM = 4  #: medium vegetation
+HIGH = 5  #: high vegetation
+WIRE = 14  #: conductors
+TOWER = 15  #: transmission towers
+BRIDGE = 17  #: bridge decks
 #: Codes that say nothing about the object: never classified, unclassified.
 UNLABELED = (0, 1)
 #: Overlap of strips, before LAS 1.4 had a flag for it.
 OVERLAP = 12
-#: Codes that say nothing about the object. They are neither trained on nor scored unless they are named.
+#: Codes that say nothing about the object. They are neither trained on nor scored unless they are
+#: named.
 UNINFORMATIVE = tuple(sorted((*UNLABELED, *NOISE, OVERLAP)))
 #: Largest code LAS 1.0-1.3 point formats (0-5) hold: five bits.
 LEGACY_LIMIT = 31
 
 
 def class_name(code: int) -> str:
-    """The class's name: the ASPRS name, ``Reserved`` up to 63, ``User class`` up to 255."""
+    """Return the ASPRS name of a class, ``Reserved`` up to 63, ``User class`` up to 255."""
     code = int(code)
     return NAMES.get(code, f"Reserved {code}" if code < 64 else f"User class {code}")
 
 
 def class_color(code: int) -> tuple[int, int, int]:
-    """An sRGB color (0-255) for maps; codes without an ASPRS class get a fixed color."""
+    """Return an sRGB color (0-255) for maps; codes without an ASPRS class get a fixed color."""
     code = int(code)
     if code in _CLASSES:
         return _CLASSES[code][1]
@@ -71,7 +74,10 @@ def by_height(
     height: NDArray,
     limits: tuple[float, float],
 ) -> None:
-    """Reclassify the chosen points of high vegetation as low or medium by height in meters, in place."""
+    """Reclassify the chosen points of high vegetation by height, in place.
+
+    Heights below ``limits[0]`` become low, below ``limits[1]`` medium vegetation; in meters.
+    """
     high = chosen & (codes == HIGH)
     low, medium = limits
     codes[high & (height < medium)] = MEDIUM

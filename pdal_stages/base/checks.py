@@ -1,4 +1,4 @@
-"""Checks of single values, worded alike: what was expected and what was found; and strict JSON."""
+"""Checks of single values with one wording: what was expected and what was found; strict JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .errors import OptionError, suggest
 def whole(
     what: str, value: Any, low: int | None = None, high: int | None = None, *, unit: str = ""
 ) -> int:
-    """A whole number within bounds, both included; 2.0 is one, too.
+    """Return a whole number within bounds, both included; 2.0 is one, too.
 
     Parameters
     ----------
@@ -27,12 +27,12 @@ def whole(
     OptionError
         Naming the bounds and what was found.
     """
-    found = finite(value)
-    if found is None or found != int(found) or not _within(found, low, high):
+    x = finite(value)
+    if x is None or x != int(x) or not _in_bounds(x, low, high):
         raise OptionError(
             f"{what} must be a whole number{bounds(low, high, unit=unit)}", found=_shown(value)
         )
-    return int(found)
+    return int(x)
 
 
 def number(
@@ -44,24 +44,24 @@ def number(
     above: bool = False,
     unit: str = "",
 ) -> float:
-    """A finite number within bounds, both included; the lower one not with `above`. See :func:`whole`."""
-    found = finite(value)
-    if found is None or not _within(found, low, high) or (above and found == low):
+    """Return a finite number in bounds, the lower one excluded with `above`; see :func:`whole`."""
+    x = finite(value)
+    if x is None or not _in_bounds(x, low, high) or (above and x == low):
         raise OptionError(
             f"{what} must be a number{bounds(low, high, above, unit)}", found=_shown(value)
         )
-    return float(found)
+    return float(x)
 
 
 def flag(what: str, value: Any) -> bool:
-    """True or false. See :func:`whole`."""
+    """Return a truth value; see :func:`whole`."""
     if not isinstance(value, bool | np.bool_):
         raise OptionError(f"{what} must be true or false", found=_shown(value))
     return bool(value)
 
 
 def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
-    """One of the given choices. See :func:`whole`."""
+    """Return a value that is one of the choices; see :func:`whole`."""
     known = list(choices)
     if not any(type(value) is type(choice) and value == choice for choice in known):
         raise OptionError(
@@ -73,17 +73,17 @@ def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
 
 
 def names(what: str, value: Any) -> tuple[str, ...]:
-    """Names without duplicates, from a list or from comma-separated text. See :func:`whole`."""
+    """Return names without duplicates, from a list or comma-separated text; see :func:`whole`."""
     if isinstance(value, str):
         value = [part.strip() for part in value.split(",") if part.strip()]
-    found = list(value) if isinstance(value, Iterable) else None
-    if found is None or not all(isinstance(name, str) for name in found):
+    items = list(value) if isinstance(value, Iterable) else None
+    if items is None or not all(isinstance(name, str) for name in items):
         raise OptionError(f"{what} must be a list of names", found=_shown(value))
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(items))
 
 
 def bounds(low: float | None, high: float | None, above: bool = False, unit: str = "") -> str:
-    """Bounds in words, to follow "a number"."""
+    """Return bounds in words, to follow "a number"."""
     unit = f" {unit}" if unit else ""
     if low is None:
         return "" if high is None else f" of at most {_plain(high)}{unit}"
@@ -95,18 +95,18 @@ def bounds(low: float | None, high: float | None, above: bool = False, unit: str
 
 
 def finite(value: Any) -> int | float | None:
-    """The value where it is a number that is finite as a double; None for anything else, booleans too."""
+    """Return a number that is finite as a double; None for anything else, booleans too."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
     try:
-        finite = math.isfinite(value)
+        is_finite = math.isfinite(value)
     except OverflowError:
         return None
     plain = value.item() if isinstance(value, np.generic) else value
-    return plain if finite else None
+    return plain if is_finite else None
 
 
-def _within(value: float, low: float | None, high: float | None) -> bool:
+def _in_bounds(value: float, low: float | None, high: float | None) -> bool:
     return (low is None or value >= low) and (high is None or value <= high)
 
 
@@ -120,7 +120,7 @@ def _shown(value: Any) -> str:
 
 
 def strict_json(text: str | bytes) -> Any:
-    """The value of a JSON text: no NaN, no number beyond a double (1e999), no duplicate keys.
+    """Parse a JSON text without NaN, numbers beyond a double (1e999) and duplicate keys.
 
     Raises
     ------

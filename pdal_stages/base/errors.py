@@ -34,6 +34,7 @@ class StageError(Exception):
         super().__init__(what)
 
     def __str__(self) -> str:
+        """Return place, problem, found value and cure as sentences."""
         # A file's name may hold line breaks, and must not pass for lines of its own.
         text = f"{self.where}: {self.what}".replace("\n", "\\n") if self.where else self.what
         if self.found is not None:
@@ -41,17 +42,18 @@ class StageError(Exception):
         return _sentence(text) + (f" {_sentence(self.cure)}" if self.cure else "")
 
     def at(self, where: str) -> StageError:
-        """The same error, with the place named unless it already names one."""
+        """Name the place of the error unless it already has one; return the error."""
         if self.where is None:
             self.where = where
         return self
 
-    def within(self, place: str) -> StageError:
-        """The same error, with the place put before what it names already."""
+    def prefixed(self, place: str) -> StageError:
+        """Put a place before the one that the error has; return the error."""
         self.where = f"{place}: {self.where}" if self.where else place
         return self
 
-    def __reduce__(self):  # keeps the keyword arguments across process borders (Dask)
+    def __reduce__(self):
+        """Keep the keyword arguments across process borders (Dask)."""
         return partial(
             type(self), self.what, where=self.where, found=self.found, cure=self.cure
         ), ()
@@ -79,7 +81,7 @@ class PipelineError(StageError):
 
 
 class InterruptedStage(StageError):
-    """Ctrl-C came while a stage ran inside PDAL; the runners turn it back into KeyboardInterrupt."""
+    """Ctrl-C came while a stage ran inside PDAL; the runners make it a KeyboardInterrupt again."""
 
 
 class NoTerrainError(StageError):
@@ -91,13 +93,13 @@ class DependencyError(StageError):
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """`` Did you mean 'x'?`` for the nearest known word, or an empty string."""
+    """Return ``Did you mean 'x'? `` for the nearest known word, or an empty string."""
     near = difflib.get_close_matches(str(word), list(known), n=1, cutoff=0.6)
     return f"Did you mean '{near[0]}'? " if near else ""
 
 
 def how_to_add(extra: str) -> str:
-    """The command that installs one of our extras."""
+    """Return the command that installs one of our extras."""
     root = Path(__file__).resolve().parents[2]
     if Path(sys.prefix) == root / ".venv" and (root / "scripts" / "setup").is_file():
         return f"{root}/scripts/setup {extra}"
@@ -105,7 +107,7 @@ def how_to_add(extra: str) -> str:
 
 
 def optional_import(module: str, extra: str, purpose: str):
-    """Import a heavy optional package, or say which of our extras installs it."""
+    """Import an optional package, or raise a DependencyError that names our extra with it."""
     import importlib
 
     try:

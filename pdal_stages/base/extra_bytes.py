@@ -1,7 +1,7 @@
-"""Extra bytes of LAS points: their descriptions (LAS 1.4 R15, table 24), and names that PDAL can give to dimensions.
+"""Extra bytes of LAS points: descriptions (LAS 1.4 R15, table 24) and names that PDAL can take.
 
-PDAL refuses names with spaces or signs, lets a name like ``Z`` overwrite the coordinates, and leaves out bytes of type 0
-and bytes that no record describes.
+PDAL refuses names with spaces or signs, lets a name like ``Z`` overwrite the coordinates, and
+leaves out bytes of type 0 and bytes that no record describes.
 """
 
 from __future__ import annotations
@@ -15,14 +15,17 @@ from dataclasses import dataclass
 from .errors import StageError
 from .las import POINT_BYTES, LasHeader, read_header, records_of
 
-#: Bytes of one description, and the most that one record holds (65,535 bytes).
-ENTRY, MOST_ENTRIES = 192, 65_535 // 192
-#: PDAL's names of the types of extra bytes, by number, 1 to 10; 11 to 20 are pairs, 21 to 30 triples of these.
+#: Bytes of one description.
+ENTRY = 192
+#: Most descriptions that one record holds.
+MOST_ENTRIES = 65_535 // ENTRY
+#: PDAL's names of the types of extra bytes, by number, 1 to 10; 11 to 20 are pairs, 21 to 30
+#: triples of these.
 _INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
 _TYPES = (*_INTEGERS, "float", "double")
 _BYTES = (1, 1, 2, 2, 4, 4, 8, 8, 4, 8)
-#: Dimensions that PDAL or laspy read from every point format, in lower case without underscores, and PDAL's other
-#: names of them; ``where`` is no name of a dimension.
+#: Dimensions that PDAL or laspy read from every point format, in lower case without underscores,
+#: and PDAL's other names of them; ``where`` is no name of a dimension.
 _OF_ALL_FORMATS = frozenset(
     (
         *("x", "y", "z", "intensity", "returnnumber", "numberofreturns", "scandirectionflag"),
@@ -36,8 +39,10 @@ _TIME = frozenset(["gpstime"])
 _COLORS = frozenset(["red", "green", "blue", "diffusered", "diffusegreen", "diffuseblue"])
 _INFRARED = frozenset(["infrared", "nearinfrared", "nir"])
 _COLORED = (2, 3, 5, 7, 8, 10)
-#: What a name that is taken begins with instead, and the name of bytes without a description.
-_PREFIX, _UNDESCRIBED = "Extra_", "Undescribed"
+#: What is put before a name that another dimension has.
+_PREFIX = "Extra_"
+#: Name of bytes without a description.
+_UNDESCRIBED = "Undescribed"
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,10 @@ def _taken(point_format: int) -> set[str]:
 
 
 def _plain(name: str) -> str:
-    """Return a name in lower case without underscores and spaces: PDAL ignores case, laspy writes ``gps_time``."""
+    """Return a name in lower case without underscores and spaces.
+
+    PDAL ignores case, and laspy writes ``gps_time``.
+    """
     return re.sub(r"[_ ]", "", name.lower())
 
 
@@ -78,7 +86,10 @@ def _elements(name: str, count: int) -> list[str]:
 
 
 def _valid_name(title: str, count: int, taken: set[str]) -> tuple[str, bool]:
-    """Return a name that PDAL accepts and that is not `taken`, and whether the title was; the name is taken then."""
+    """Return a name for a title that PDAL accepts and that is not `taken`; and if the title was.
+
+    The name is added to `taken`.
+    """
     name = re.sub(r"[^A-Za-z0-9_]", "_", title)
     name = name if re.match("[A-Za-z]", name) else f"{_PREFIX}{name}"
     clashes = not taken.isdisjoint(map(_plain, _elements(name, count)))
@@ -92,12 +103,12 @@ def _valid_name(title: str, count: int, taken: set[str]) -> tuple[str, bool]:
 
 
 def _described(header: LasHeader, data: bytes) -> list[tuple[str, bytes]]:
-    """Return the title of each description and the description; bytes without one are described one by one.
+    """Return the title and the description of all extra bytes, those without one byte by byte.
 
     StageError where the descriptions do not fit the points.
     """
     room = header.point_bytes - POINT_BYTES[header.point_format]
-    one_byte, found, bytes_there = struct.pack("<HBB188x", 0, 1, 0), [], 0
+    one_byte, entries, size = struct.pack("<HBB188x", 0, 1, 0), [], 0
     for entry in (data[at : at + ENTRY] for at in range(0, len(data) - ENTRY + 1, ENTRY)):
         kind, title = entry[2], _title(entry)
         if kind > 30:
@@ -105,28 +116,32 @@ def _described(header: LasHeader, data: bytes) -> list[tuple[str, bytes]]:
                 "the LAS file is damaged: its extra bytes are of no known type", found=kind
             )
         if kind:
-            found.append((title, entry))
-            bytes_there += ((kind - 1) // 10 + 1) * _BYTES[(kind - 1) % 10]
+            entries.append((title, entry))
+            size += ((kind - 1) // 10 + 1) * _BYTES[(kind - 1) % 10]
         else:  # of which the options are the number
-            found += [(f"{title or _UNDESCRIBED}_{n}", one_byte) for n in range(entry[3])]
-            bytes_there += entry[3]
-    if bytes_there > room:
-        what = "the LAS file is damaged: its points are shorter than the descriptions of their extra bytes"
-        raise StageError(what, found=f"{bytes_there:,} bytes described, {room:,} there")
-    found += [(f"{_UNDESCRIBED}_{n}", one_byte) for n in range(room - bytes_there)]
-    if len(found) > MOST_ENTRIES:
+            entries += [(f"{title or _UNDESCRIBED}_{n}", one_byte) for n in range(entry[3])]
+            size += entry[3]
+    if size > room:
+        raise StageError(
+            "the LAS file is damaged: its points are shorter than the descriptions of their "
+            "extra bytes",
+            found=f"{size:,} bytes described, {room:,} there",
+        )
+    entries += [(f"{_UNDESCRIBED}_{n}", one_byte) for n in range(room - size)]
+    if len(entries) > MOST_ENTRIES:
         raise StageError(
             "its points have more extra bytes than a record of LAS can describe",
             found=f"{room:,} bytes",
             cure="Write the file without them: pdal translate IN OUT",
         )
-    return found
+    return entries
 
 
 def fields_of(header: LasHeader, data: bytes) -> tuple[list[ExtraField], bytes]:
     """Return the dimensions of a file's extra bytes, and descriptions of them that PDAL can take.
 
-    `data` is the record of the file, empty where there is none. StageError where it does not fit the points.
+    `data` is the record of the file, empty where there is none. StageError where it does not fit
+    the points.
     """
     taken, fields, entries = _taken(header.point_format), [], []
     for title, entry in _described(header, data):
@@ -140,24 +155,27 @@ def fields_of(header: LasHeader, data: bytes) -> tuple[list[ExtraField], bytes]:
 
 
 def _renamed(entry: bytes, name: str) -> bytes:
+    """Return a description with another name."""
     return entry[:4] + name.encode().ljust(32, b"\0") + entry[36:]
 
 
 def overwritten(point_format: int, data: bytes) -> list[str]:
-    """Return the titles in a record by which PDAL overwrites dimensions of a point format with extra bytes."""
+    """Return the titles in a record that are dimensions of the format: PDAL overwrites these."""
     entries = (data[at : at + ENTRY] for at in range(0, len(data) - ENTRY + 1, ENTRY))
     titles = [_title(entry) for entry in entries]
     return [title for title in titles if _plain(title) in _taken(point_format)]
 
 
 def description(path: str | os.PathLike) -> bytes:
-    """Return the record that describes a file's extra bytes, empty where there is none; PDAL ignores later ones."""
-    found = (data for record, data in records_of(path, b"LASF_Spec") if record.number == 4)
-    return next(found, b"")
+    """Return the first record that describes a file's extra bytes, empty without any.
+
+    PDAL ignores later ones.
+    """
+    return next((data for r, data in records_of(path, b"LASF_Spec") if r.number == 4), b"")
 
 
 def extra_fields(path: str | os.PathLike) -> list[ExtraField]:
-    """Return the extra bytes of a LAS file as dimensions; empty where there are none, or the file cannot be read."""
+    """Return the extra bytes of a LAS file as dimensions; empty where the file cannot be read."""
     try:
         header = read_header(path)
         if header is None or header.point_format >= len(POINT_BYTES):
@@ -168,12 +186,12 @@ def extra_fields(path: str | os.PathLike) -> list[ExtraField]:
 
 
 def extra_dimensions(path: str | os.PathLike) -> dict[str, str]:
-    """Return the extra dimensions of a LAS file: name -> the type PDAL holds it in (scaled ones are ``double``)."""
+    """Return the extra dimensions of a LAS file: name -> PDAL's type, ``double`` if scaled."""
     return {field.name: field.kind for field in extra_fields(path)}
 
 
 def restore_titles(path: str | os.PathLike, sources: Iterable[str | os.PathLike]) -> None:
-    """Give extra dimensions of an output, in place, the names back that the sources have them under.
+    """Give extra dimensions of an output, in place, the names back that they have in the sources.
 
     Names that are those of other dimensions stay changed.
     """

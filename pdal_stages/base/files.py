@@ -1,7 +1,8 @@
 """Output files: checked against inputs and existing files, then written whole or not at all.
 
-They are written in a hidden folder beside their final place, then renamed. The folder has a random name, is private to its
-owner and locked while its writer runs, so what a killed writer left is recognized and removed by the next one.
+They are written in a hidden folder beside their final place, then renamed. The folder has a random
+name, is private to its owner and locked while its writer runs, so what a killed writer left is
+recognized and removed by the next one.
 
 * An existing file is replaced; the new one keeps its mode, and its owner where permitted.
 * A link is followed: its target is replaced, the link stays.
@@ -24,12 +25,16 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from .errors import StageError
 
-LAS, MODEL, CHECKPOINT = "a LAS or LAZ file", "a model file", "a training's checkpoint"
-JSON, HTML, PNG = "a JSON file", "an HTML page", "a PNG picture"
+LAS = "a LAS or LAZ file"
+MODEL = "a model file"
+CHECKPOINT = "a training's checkpoint"
+JSON = "a JSON file"
+HTML = "an HTML page"
+PNG = "a PNG picture"
 #: The first bytes of files that must not be replaced by another kind.
 _BEGINNINGS = {
     b"LASF": LAS,
@@ -48,7 +53,7 @@ _BEGINNINGS = {
 
 
 def kind_of(path: str | os.PathLike) -> str:
-    """The kind of a file, as messages say it; empty where there is no file, nothing in it, or it is not known."""
+    """Return the kind of a file in words; empty for an unknown kind, an empty or a missing file."""
     try:
         with open(path, "rb") as file:
             head = file.read(512)
@@ -83,57 +88,48 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     what : str
         What messages call it.
     kind : str
-        The kind of file it will be, one of :data:`LAS`, :data:`MODEL`, ... in this module, where that is known.
+        The kind of file it will be, one of :data:`LAS`, :data:`MODEL`, ... in this module, where
+        that is known.
 
     Raises
     ------
     StageError
-        If its folder is missing or read-only, its name is too long, or what exists there must not be replaced: a folder, a
-        write-protected file, a file of another kind.
+        If its folder is missing or read-only, its name is too long, or what exists there must not
+        be replaced: a folder, a write-protected file, a file of another kind.
     """
+
+    def refuse(problem: str, cure: str | None = None, found: str = str(path)) -> NoReturn:
+        raise StageError(problem.format(what), found=found, cure=cure)
+
     if not os.fspath(path) or "\0" in os.fspath(path):
-        raise StageError(
-            f"the {what} file has no name", found=ascii(path), cure="Is a shell variable unset?"
-        )
+        refuse("the {} file has no name", "Is a shell variable unset?", ascii(path))
     _refuse_foreign(path, what)
     if is_stream(path):
         mode = os.stat(path).st_mode
         if not os.access(path, os.W_OK) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
-            raise StageError(
-                f"the {what} file is a device that cannot be written to", found=str(path)
-            )
+            refuse("the {} file is a device that cannot be written to")
         return
     real = Path(os.path.realpath(path))
     if len(real.name.encode(errors="surrogateescape")) > _LONGEST_NAME:
-        raise StageError(
-            f"the name of the {what} file is longer than {_LONGEST_NAME} bytes", found=str(path)
-        )
+        refuse(f"the name of the {{}} file is longer than {_LONGEST_NAME} bytes")
     if not real.parent.is_dir():
-        found = str(real.parent)
-        raise StageError(
-            f"the folder of the {what} file does not exist", found=found, cure="Create it first"
-        )
+        refuse("the folder of the {} file does not exist", "Create it first", str(real.parent))
     if real.is_symlink():
-        raise StageError(f"the {what} file is a link that leads to itself", found=str(path))
+        refuse("the {} file is a link that leads to itself")
     if real.is_dir():
-        raise StageError(
-            f"the {what} file names a folder", found=str(path), cure="Give a file name"
-        )
+        refuse("the {} file names a folder", "Give a file name")
     if not os.access(real.parent, os.W_OK):
-        raise StageError(
-            f"the folder of the {what} file cannot be written to", found=str(real.parent)
-        )
+        refuse("the folder of the {} file cannot be written to", found=str(real.parent))
     if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
-        cure = "Give another name, or change its mode"
-        raise StageError(f"the {what} file is write-protected", found=str(path), cure=cure)
+        refuse("the {} file is write-protected", "Give another name, or change its mode")
     older = kind_of(real) if kind else ""
     if older and older != kind:
         cure = "Give another name, or remove that file first"
-        raise StageError(f"the {what} file would replace {older}", found=str(path), cure=cure)
+        refuse(f"the {{}} file would replace {older}", cure)
 
 
 def _trusted() -> set[int]:
-    """Return the users whose files may be code or lead elsewhere: this one, root, and the owner of the whole system."""
+    """Return the users whose files and links are trusted: this one, root, the system's owner."""
     return {0, os.geteuid(), os.stat("/").st_uid}
 
 
@@ -143,29 +139,29 @@ def _refuse_foreign(path: str | os.PathLike, what: str) -> None:
     for _ in range(_MOST_LINKS if hasattr(os, "geteuid") else 0):
         if not os.path.lexists(at):
             return
-        found, folder = os.lstat(at), os.path.dirname(at)
-        if not (stat.S_ISLNK(found.st_mode) or stat.S_ISFIFO(found.st_mode)):
+        status, folder = os.lstat(at), os.path.dirname(at)
+        if not (stat.S_ISLNK(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
             return
-        if found.st_uid not in _trusted() | {os.stat(folder).st_uid}:
+        if status.st_uid not in _trusted() | {os.stat(folder).st_uid}:
             raise StageError(
                 f"the {what} file is a link or pipe of another user",
                 found=at,
                 cure="Give another name",
             )
-        if stat.S_ISFIFO(found.st_mode):
+        if stat.S_ISFIFO(status.st_mode):
             return
         at = os.path.join(folder, os.readlink(at))
 
 
 def exposed_folder(folder: str) -> str:
-    """Return the first of a real folder and its parents that other users may change; empty if there is none.
+    """Return the first of a real folder and its parents that other users may change, or "".
 
     Members of a folder's group are trusted. Of a parent all may write to if it is sticky.
     """
     for at in (folder, *map(str, Path(folder).parents)) if hasattr(os, "geteuid") else ():
-        found = os.stat(at)
-        sticky = at != folder and found.st_mode & stat.S_ISVTX
-        if found.st_uid not in _trusted() or (found.st_mode & stat.S_IWOTH and not sticky):
+        status = os.stat(at)
+        sticky = at != folder and status.st_mode & stat.S_ISVTX
+        if status.st_uid not in _trusted() or (status.st_mode & stat.S_IWOTH and not sticky):
             return at
     return ""
 
@@ -173,7 +169,8 @@ def exposed_folder(folder: str) -> str:
 def make_own_folder(folder: Path) -> None:
     """Make a folder that its owner alone can enter, or check that an existing one is such a folder.
 
-    It must be like one that is made here now: file systems without users give all files one owner and mode.
+    It must be like one that is made here now: file systems without users give all files one owner
+    and mode.
 
     Raises
     ------
@@ -184,21 +181,22 @@ def make_own_folder(folder: Path) -> None:
         folder.mkdir(0o700)
         return
     probe = tempfile.mkdtemp(prefix=PREFIX, dir=folder.parent)
-    like, found = os.stat(probe), os.lstat(folder)
+    like, status = os.stat(probe), os.lstat(folder)
     os.rmdir(probe)
-    writable = found.st_mode & ~like.st_mode & 0o022
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != like.st_uid or writable:
+    writable = status.st_mode & ~like.st_mode & 0o022
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != like.st_uid or writable:
         raise StageError(
-            "the run's own folder beside the outputs is a link, a file, another user's or open to others",
+            "the run's own folder beside the outputs is a link, a file, another user's or open to "
+            "others",
             found=str(folder),
             cure="Remove it, or write to another folder",
         )
-    if found.st_mode != like.st_mode:
+    if status.st_mode != like.st_mode:
         os.chmod(folder, stat.S_IMODE(like.st_mode))
 
 
 def is_stream(path: str | os.PathLike) -> bool:
-    """Whether a path is written into, not replaced: a device, a pipe, or an open file of this process."""
+    """Return whether a path is written into, not replaced: a device, pipe or open file."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -217,10 +215,10 @@ class Output:
 
 
 def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]) -> None:
-    """Refuse outputs that cannot be written, that are read, that are one file, or that would replace another kind.
+    """Refuse outputs that cannot be written, are inputs, are one file or replace another kind.
 
-    Symbolic and hard links are recognized. The other parts of a shapefile, and all files in the folder of an EPT source,
-    are read with it.
+    Symbolic and hard links are recognized. The other parts of a shapefile, and all files in the
+    folder of an EPT source, are read with it.
 
     Raises
     ------
@@ -252,28 +250,29 @@ def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]
                 found=str(hit),
                 cure="Give it another name",
             )
-        one = identity or real
-        if one in seen:
+        key = identity or real
+        if key in seen:
             raise StageError(
-                f"the {output.what} file is the {seen[one].what} file too"
-                if output.what != seen[one].what
+                f"the {output.what} file is the {seen[key].what} file too"
+                if output.what != seen[key].what
                 else f"two {output.what} files are the same file",
                 found=output.path,
                 cure="Give each its own name",
             )
-        seen[one] = output
+        seen[key] = output
 
 
 def _identity(path: str | os.PathLike) -> tuple[int, int] | None:
+    """Return what tells a file from others, whatever links lead to it; None without a file."""
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except (OSError, ValueError):
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _numbered(output: Path, inputs: list[Path]) -> Path | None:
-    """The input that a numbered output might become."""
+    """Return the input that a numbered output might become."""
     if "#" not in output.name:
         return None
     before, _, after = output.name.partition("#")
@@ -291,7 +290,7 @@ _swept: set[str] = set()
 
 
 def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -> Path:
-    """Write a file so that it is either complete or absent; its path.
+    """Write a file so that it is either complete or absent; return its path.
 
     Raises
     ------
@@ -304,7 +303,7 @@ def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -
 
 
 def write_json(path: str | os.PathLike, value: Any, what: str = "output", indent: int = 1) -> Path:
-    """The same of a JSON file; what JSON does not have becomes text."""
+    """Write a JSON file whole or not at all; values that JSON does not have become text."""
     return write_whole(path, (json.dumps(value, indent=indent, default=str) + "\n").encode(), what)
 
 
@@ -319,13 +318,13 @@ def whole_files(
     Parameters
     ----------
     *paths : path
-        The final paths. A name with '#' may become any number of files, as PDAL's writers number them; files that a
-        writer creates beside its own are moved with it.
+        The final paths. A name with '#' may become any number of files, as PDAL's writers number
+        them; files that a writer creates beside its own are moved with it.
     what : str
         What messages call them.
     check : callable, optional
-        Called with each file that was written, the name it is to get and the number of the path it belongs to,
-        before any of them gets its name.
+        Called with each file that was written, the name it is to get and the number of the path it
+        belongs to, before any of them gets its name.
 
     Yields
     ------
@@ -335,7 +334,8 @@ def whole_files(
     Raises
     ------
     StageError
-        If a file cannot be written, or was not. Errors raised inside name the final path, not the hidden one.
+        If a file cannot be written, or was not. Errors raised inside name the final path, not the
+        hidden one.
     """
     places: list[_Place] = []
     inside = False
@@ -346,19 +346,15 @@ def whole_files(
         inside = True
         yield [place.partial for place in places]
         inside = False
-        moves = [(*move, number) for number, place in enumerate(places) for move in place.made()]
-        for made, target, number in moves:
-            check_writable(target, what, kind_of(made) or "a file of another kind")
+        moves = [(*move, number) for number, place in enumerate(places) for move in place.written()]
+        for partial, target, number in moves:
+            check_writable(target, what, kind_of(partial) or "a file of another kind")
             if check is not None:
-                check(made, target, number)
-        for made, target, _ in moves:
-            _give_name(made, target)
+                check(partial, target, number)
+        for partial, target, _ in moves:
+            _give_name(partial, target)
     except StageError as error:
-        for place in places:
-            if isinstance(error.found, str):
-                error.found = error.found.replace(str(place.partial), str(place.path))
-            if error.cure is None and disk_is_full(place.folder):
-                error.cure = f"The disk of {place.path} is full: make room"
+        _name_final_paths(error, places)
         raise
     except OSError as error:
         named = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else ""
@@ -377,7 +373,7 @@ def whole_files(
 
 @contextlib.contextmanager
 def work_folder(target: str | os.PathLike) -> Iterator[Path]:
-    """A hidden folder beside a file that is to be written, for what is made on the way; removed at the end."""
+    """Yield a hidden folder beside an output for intermediate files; it is removed at the end."""
     place = _Place(Path(target))
     try:
         yield place.folder
@@ -399,12 +395,12 @@ class _Place:
         self.folder, self._lock = _locked_folder(parent)
         self.partial = self.folder / path.name
 
-    def made(self) -> list[tuple[Path, Path]]:
-        """Files that were written, and the names they are to get."""
-        found = sorted(self.folder.iterdir())
-        if self.partial not in found and "#" not in self.path.name:
+    def written(self) -> list[tuple[Path, Path]]:
+        """Return the files that were written, and the names they are to get."""
+        files = sorted(self.folder.iterdir())
+        if self.partial not in files and "#" not in self.path.name:
             raise StageError("the writer wrote no file", found=str(self.path))
-        return [(f, self.path if f == self.partial else self.path.with_name(f.name)) for f in found]
+        return [(f, self.path if f == self.partial else self.path.with_name(f.name)) for f in files]
 
     def close(self) -> None:
         """Remove the folder and whatever it holds."""
@@ -413,10 +409,19 @@ class _Place:
             os.close(self._lock)
 
 
-def _give_name(made: Path, target: Path) -> None:
+def _name_final_paths(error: StageError, places: list[_Place]) -> None:
+    """Name final paths in an error in place of hidden ones; a full disk explains it."""
+    for place in places:
+        if isinstance(error.found, str):
+            error.found = error.found.replace(str(place.partial), str(place.path))
+        if error.cure is None and disk_is_full(place.folder):
+            error.cure = f"The disk of {place.path} is full: make room"
+
+
+def _give_name(partial: Path, target: Path) -> None:
     """Move a file to its final path, or write it into a device or pipe."""
     if is_stream(target):
-        with open(made, "rb") as file:
+        with open(partial, "rb") as file:
             _pour(file, target)
         return
     real = Path(os.path.realpath(target))
@@ -424,13 +429,13 @@ def _give_name(made: Path, target: Path) -> None:
         older = real.stat()
         if hasattr(os, "chown") and (older.st_uid, older.st_gid) != (os.geteuid(), os.getegid()):
             with contextlib.suppress(OSError):
-                os.chown(made, older.st_uid, older.st_gid)
-        os.chmod(made, stat.S_IMODE(older.st_mode))
-    os.replace(made, real)
+                os.chown(partial, older.st_uid, older.st_gid)
+        os.chmod(partial, stat.S_IMODE(older.st_mode))
+    os.replace(partial, real)
 
 
 def _pour(file: Any, target: Path) -> None:
-    """Copy a file into a device, a pipe, or an open file of this process, at its current position."""
+    """Copy a file into a device, a pipe, or an open file of this process at its position."""
     there = os.stat(target)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, OSError, ValueError):
@@ -444,7 +449,7 @@ def _pour(file: Any, target: Path) -> None:
 
 
 def _locked_folder(parent: Path) -> tuple[Path, int | None]:
-    """A new private folder, and the descriptor that locks it; None where folders cannot be locked."""
+    """Return a new private folder and the descriptor that locks it, None without locks."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
         try:
@@ -461,7 +466,7 @@ def _locked_folder(parent: Path) -> tuple[Path, int | None]:
 
 
 def sweep(folder: str | os.PathLike) -> None:
-    """Remove hidden folders of writers that were killed; those of running writers and other users stay."""
+    """Remove hidden folders of writers that were killed, but not those of running ones."""
     with contextlib.suppress(OSError):
         for left in Path(folder).glob(f"{PREFIX}*"):
             with contextlib.suppress(OSError):
@@ -469,6 +474,7 @@ def sweep(folder: str | os.PathLike) -> None:
 
 
 def _remove_dead(folder: Path) -> None:
+    """Remove a hidden folder unless its writer still runs or it is another user's."""
     lock = os.open(
         folder, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_DIRECTORY", 0)
     )
@@ -480,7 +486,7 @@ def _remove_dead(folder: Path) -> None:
 
 
 def try_lock(file: Any) -> bool:
-    """Lock an open file or its descriptor until it is closed or this process ends; False where another has it locked.
+    """Lock an open file or descriptor until it is closed; return False if another has the lock.
 
     Raises
     ------
@@ -505,7 +511,7 @@ def try_lock(file: Any) -> bool:
 
 
 def disk_is_full(path: str | os.PathLike) -> bool:
-    """Whether no room is left where a file is; False where the system does not say."""
+    """Return whether no room is left where a file is; False where the system does not report it."""
     try:
         return hasattr(os, "statvfs") and os.statvfs(path).f_bavail == 0
     except OSError:

@@ -1,9 +1,10 @@
 """How kernels are compiled: without the GIL, cached where the user can write.
 
-``njit`` here is numba's with the package's defaults, and numba itself is imported when a kernel is first called, so that
-commands that need none, and errors, come at once. numba keys cached code by its own source file only, so a changed *device
-function* in another module would leave stale code behind: the key here is a digest of the sources of the kernel and of all
-that it calls. Compiled code is cached at first use rather than shipped, because it is made for the processor it runs on.
+``njit`` here is numba's with the package's defaults, and numba itself is imported when a kernel is
+first called, so that commands that need none, and errors, come at once. numba keys cached code by
+its own source file only, so a changed *device function* in another module would leave stale code
+behind: the key here is a digest of the sources of the kernel and of all that it calls. Compiled
+code is cached at first use rather than shipped, because it is made for the processor it runs on.
 """
 
 from __future__ import annotations
@@ -47,13 +48,14 @@ class Kernel:
         _functions[self] = function
 
     def __call__(self, *arguments: Any) -> Any:
+        """Run the compiled function; a device function runs as it is written."""
         if "no_cpython_wrapper" in self._options:
             return self._function(*arguments)
         return (self._dispatcher or self.dispatcher)(*arguments)
 
     @property
     def dispatcher(self) -> Any:
-        """What numba makes of it."""
+        """The function as numba compiles it."""
         with _lock:
             if self._dispatcher is None:
                 numba = _numba()
@@ -63,12 +65,12 @@ class Kernel:
             return self._dispatcher
 
     def _cached(self, numba: Any) -> Any:
-        """Return the function with a cache of its code, or None where no folder is safe for that or can be written."""
+        """Return the function with a cache of its code; None if no folder is safe or writable."""
         try:
-            made = numba.njit(**self._options)(self._function)
+            dispatcher = numba.njit(**self._options)(self._function)
         except RuntimeError:  # no folder for the cache can be written
             return None
-        file: Any = getattr(getattr(made, "_cache", None), "_cache_file", None)
+        file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if hasattr(file, "_source_stamp"):
             folder = os.path.realpath(file._cache_path)
             if not Path(folder).is_relative_to(_PACKAGE) and (exposed := exposed_folder(folder)):
@@ -77,12 +79,13 @@ class Kernel:
             file._cache_path, file._index_path = folder, os.path.join(folder, file._index_name)
             file._source_stamp = "-".join(sorted(_sources(self)))
             file.load, file.save = (_careful(file, act) for act in (file.load, file.save))
-            made._cache.load_overload = partial(_load, made._cache, made._cache.load_overload)
-        return made
+            cache = dispatcher._cache
+            cache.load_overload = partial(_load, cache, cache.load_overload)
+        return dispatcher
 
     @property
     def _numba_type_(self) -> Any:
-        """By which numba knows what a kernel calls."""
+        """Type by which numba knows a kernel that another one calls."""
         return self.dispatcher._numba_type_
 
 
@@ -90,22 +93,16 @@ def njit(function: Callable | None = None, **options):
     """``numba.njit`` with the package's defaults. Use as ``@njit`` or ``@njit(...)``."""
     if function is None:
         return lambda f: njit(f, **options)
-    made = {
-        "nogil": True,
-        "cache": True,
-        "no_cfunc_wrapper": True,
-        "_nrt": True,
-        **_ERRORS,
-        **options,
-    }
-    return Kernel(function, made)
+    defaults = {"nogil": True, "cache": True, "no_cfunc_wrapper": True, "_nrt": True}
+    return Kernel(function, {**defaults, **_ERRORS, **options})
 
 
 def device(function: Callable | None = None, **options):
-    """For a function that kernels call: compiled into them, without an entry of its own for Python.
+    """Declare a function that kernels call: compiled into them, without an entry for Python.
 
-    That entry would take as long to compile as many a function. Where Python calls it, it runs as it is written. It
-    borrows arrays: counting who holds them was a tenth of a job. One that makes or returns some asks for ``_nrt=True``.
+    That entry would take as long to compile as many a function. Where Python calls it, it runs as
+    it is written. It borrows arrays: counting who holds them was a tenth of a job. One that makes
+    or returns some asks for ``_nrt=True``.
     """
     return njit(function, **{"cache": False, "no_cpython_wrapper": True, "_nrt": False, **options})
 
@@ -135,20 +132,23 @@ def _numba() -> Any:
 class _NoLinearAlgebra(NamedTuple):
     """A finder by which one thread does not find SciPy's linear algebra.
 
-    numba loads it to see whether it is there, a tenth of a small job, and asks that for ``np.correlate`` alone.
+    numba loads it to see whether it is there, a tenth of a small job, and asks that for
+    ``np.correlate`` alone.
     """
 
     thread: int
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
+        """Raise ImportError for SciPy's linear algebra in the thread; leave the rest to others."""
         if name == "scipy.linalg" and threading.get_ident() == self.thread:
             raise ImportError(name)
 
 
 def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:
-    """Load a kernel without what only compiling needs: before it loads one, numba imports all that it can compile.
+    """Load a kernel without what only compiling needs, a sixth of a small job.
 
-    Tried with numba 0.58, 0.61 and 0.68.
+    numba imports all that it can compile before it loads a kernel. Tried with numba 0.58, 0.61,
+    0.68.
     """
     from numba.core.runtime import rtsys
 
@@ -164,7 +164,10 @@ def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:
 
 
 def _library(codegen: Any, state: tuple[str, str, tuple[bytes, bytes]]) -> Any:
-    """A kernel's code; its intermediate code, which is larger, is read when a kernel that calls it is compiled."""
+    """Return the library of a kernel's compiled code.
+
+    Its intermediate code, which is larger, is read only when a kernel that calls it is compiled.
+    """
     from llvmlite.binding import parse_bitcode
 
     name, _, (code, intermediate) = state
@@ -179,25 +182,25 @@ def _library(codegen: Any, state: tuple[str, str, tuple[bytes, bytes]]) -> Any:
 
 
 def _careful(file: Any, act: Callable) -> Callable:
-    """What loads or saves code, so that damage or a full disk costs no more than making it again."""
+    """Wrap loading or saving of code: after damage or on a full disk it is compiled again."""
 
-    def done(*given: Any) -> Any:
+    def attempt(*arguments: Any) -> Any:
         try:
-            return act(*given)
+            return act(*arguments)
         except Exception:
             with contextlib.suppress(OSError):
                 file.flush()
 
-    return done
+    return attempt
 
 
 def _tell_uncached(folder: str) -> None:
-    """Warn, once in a process, that kernels are compiled at each start because other users could replace their code."""
+    """Warn, once in a process, that kernels are compiled at each start, and why."""
     if not _told_uncached:
         _told_uncached.add(folder)
         print_messages(
-            f"compiled code is not kept, as other users can write to {folder}: every start compiles again. "
-            "Set NUMBA_CACHE_DIR to a folder of your own"
+            f"compiled code is not kept, as other users can write to {folder}: every start "
+            "compiles again. Set NUMBA_CACHE_DIR to a folder of your own"
         )
 
 
@@ -210,7 +213,7 @@ def _file_digest(path: str) -> str:
 
 
 def _sources(kernel: Any) -> set[str]:
-    """Return digests of what a kernel's code is made of: its source, constants, and those of all that it calls.
+    """Return digests of a kernel's source and constants, and of those of all that it calls.
 
     Asked when the kernel is first called, since what it calls may stand below it.
     """
@@ -233,16 +236,16 @@ def _sources(kernel: Any) -> set[str]:
 
 @lru_cache(maxsize=1)
 def _tell_compiling(event: Any) -> None:
-    """Say on stderr how many functions were compiled so far, where that takes longer than two seconds."""
+    """Show how many functions were compiled, where that takes longer than two seconds."""
     bar = Progress(0, "compiling for this processor, once, a minute or two", "functions")
-    heard = {"on_start": lambda *_: None, "on_end": lambda *_: bar.update()}
-    event.register("numba:compile", type("Listener", (event.Listener,), heard)())
+    methods = {"on_start": lambda *_: None, "on_end": lambda *_: bar.update()}
+    event.register("numba:compile", type("Listener", (event.Listener,), methods)())
 
 
-def kept_kernels() -> int:
-    """How many kernels there is compiled code of, of whatever version, without asking numba."""
+def count_cached_kernels() -> int:
+    """Return how many kernels have compiled code, of whatever version, without importing numba."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     folders = [Path(named)] if named else [_PACKAGE, Path.home() / ".cache" / "numba"]
     # os.walk passes over what may not be entered
-    found = (names for folder in folders for _, _, names in os.walk(folder))
-    return sum(name.endswith(".nbi") for names in found for name in names)
+    names = (name for folder in folders for _, _, files in os.walk(folder) for name in files)
+    return sum(name.endswith(".nbi") for name in names)

@@ -1,7 +1,7 @@
-"""LAS: headers and records of LAS and LAZ files, and the class codes of ASPRS (LAS 1.4-R15, tables 9 and 17).
+"""Headers and records of LAS and LAZ files (LAS 1.4 R15).
 
-Not laspy's reader: its import takes 0.15 CPU seconds of every start, and it reads all records before their sizes are
-checked.
+Not laspy's reader: its import takes 0.15 CPU seconds of every start, and it reads all records
+before their sizes are checked.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class LasHeader:
 
 
 def named_las(path: str | os.PathLike) -> bool:
-    """Whether the name of a file ends as those of LAS, LAZ and COPC files do."""
+    """Return whether a file is named like a LAS, LAZ or COPC file."""
     return os.fspath(path).lower().endswith((".las", ".laz"))
 
 
 def named_copc(path: str | os.PathLike) -> bool:
-    """Whether the name of a file ends as those of COPC files do."""
+    """Return whether a file is named like a COPC file."""
     return os.fspath(path).lower().endswith(".copc.laz")
 
 
@@ -64,7 +64,7 @@ def refuse_pipe(path: str | os.PathLike) -> None:
 
 
 def read_header(path: str | os.PathLike) -> LasHeader | None:
-    """The header of a LAS or LAZ file; None where the file is too short for one, or is something else."""
+    """Return the header of a LAS or LAZ file; None for a short file or another format."""
     refuse_pipe(path)
     with open(path, "rb") as file:
         head = file.read(375)
@@ -85,7 +85,10 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
 
 
 def header_there(path: str | os.PathLike) -> LasHeader | None:
-    """The same; also None where the file cannot be read, which is reported when its points are read."""
+    """Return the header of a LAS or LAZ file; None also where the file cannot be read.
+
+    That is reported when its points are read.
+    """
     try:
         return read_header(path)
     except (OSError, ValueError):
@@ -93,7 +96,7 @@ def header_there(path: str | os.PathLike) -> LasHeader | None:
 
 
 def holds_flags(path: str | os.PathLike) -> bool:
-    """Whether a file is of LAS 1.0 to 1.3, whose flags (synthetic, key-point, withheld) share a byte with the class."""
+    """Return whether flags share a byte with the class in a file, as in point formats 0 to 5."""
     header = read_header(path)
     return header is not None and header.point_format <= 5
 
@@ -106,19 +109,19 @@ def source_id(path: str | os.PathLike) -> int:
 
 
 class Record(NamedTuple):
-    """A variable-length record: the offsets of its head and data, its user id, and whether it stands `after` the points."""
+    """A variable-length record."""
 
-    place: int
-    user: bytes
-    number: int
+    place: int  #: offset of its head in the file
+    user: bytes  #: user id, e.g. ``LASF_Spec``
+    number: int  #: record id
     title: bytes
-    data: int
-    length: int
-    after: bool
+    data: int  #: offset of its data in the file
+    length: int  #: bytes of its data
+    after: bool  #: whether it stands behind the points
 
 
 def records(file: BinaryIO, header: LasHeader) -> Iterator[Record]:
-    """The records of a file, up to the first that is cut short."""
+    """Yield the records of a file, up to the first that is cut short."""
     place = header.header_bytes
     for index in range(header.records + header.records_after):
         after = index >= header.records
@@ -142,12 +145,14 @@ def _text(field: bytes) -> bytes:
     return field.split(b"\0")[0]
 
 
-#: Most records that are searched, and the largest one that is read, in bytes.
-_MOST_RECORDS, LARGEST_RECORD = 10_000, 1 << 20
+#: Most records of a file that are searched.
+_MOST_RECORDS = 10_000
+#: Largest record that is read, in bytes.
+LARGEST_RECORD = 1 << 20
 
 
 def records_of(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, bytes]]:
-    """The records of a user id (``LASF_Spec``) in a file, with their data; none where it is not a LAS file."""
+    """Yield the records of a user id (``LASF_Spec``) in a LAS file with their data."""
     header = read_header(path)
     if header is None:
         return
@@ -167,15 +172,16 @@ def laszip_record(file: BinaryIO, header: LasHeader) -> bytes:
     return b""
 
 
-#: How the record begins where points are compressed one by one, without chunks and a table of them (LASzip 1).
+#: How the record begins where points are compressed one by one, without chunks and a table of them
+#: (LASzip 1).
 POINTWISE = b"\1\0"
 
 
 def supersede_copc(path: str | os.PathLike) -> None:
-    """Mark COPC records that do not describe this file; PDAL forwards them from a COPC input like any other.
+    """Mark COPC records that do not describe this file: PDAL forwards them from a COPC input.
 
-    Readers of COPC would look for an octree where there is none. The records get the id with which LAS 1.4 (R15,
-    section 2.5, "Superseded") negates a record in place.
+    Readers of COPC would look for an octree where there is none. The records get the id with which
+    LAS 1.4 (R15, section 2.5, "Superseded") negates a record in place.
     """
     if not named_las(path):
         return
@@ -194,7 +200,7 @@ def supersede_copc(path: str | os.PathLike) -> None:
 
 
 def projection(path: str | os.PathLike) -> str:
-    """A digest of the records that hold a file's spatial reference; empty where it has none.
+    """Return a digest of the records that hold a file's spatial reference; empty without any.
 
     Raises
     ------
@@ -202,19 +208,22 @@ def projection(path: str | os.PathLike) -> str:
         If the file cannot be read.
     """
     held = records_of(path, b"LASF_Projection")
-    found = [struct.pack("<HQ", record.number, record.length) + data for record, data in held]
-    return hashlib.sha256(b"".join(found)).hexdigest()[:16] if found else ""
+    parts = [struct.pack("<HQ", record.number, record.length) + data for record, data in held]
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16] if parts else ""
 
 
 def geotiff_code(path: str | os.PathLike) -> str:
-    """EPSG's code, ``EPSG:2154+5720``, in the GeoTIFF keys of LAS 1.4 in point formats 0 to 5; empty of other files."""
+    """Return EPSG's code in the GeoTIFF keys of LAS 1.4 in point formats 0 to 5, or an empty text.
+
+    Such as ``EPSG:2154+5720``; PDAL 2.2 does not read these keys.
+    """
     header = read_header(path)
     if header is None or header.minor < 4 or header.point_format > 5:
         return ""
     held = {record.number: data for record, data in records_of(path, b"LASF_Projection")}
     data = b"" if 2112 in held else held.get(34735, b"")
-    found = struct.iter_unpack("<4H", data[: len(data) // 8 * 8])
-    keys = {key: code for key, place, _, code in found if not place}
+    entries = struct.iter_unpack("<4H", data[: len(data) // 8 * 8])
+    keys = {key: code for key, place, _, code in entries if not place}
     across, upward = keys.get(3072) or keys.get(2048, 0), keys.get(4096, 0)
     height = f"+{upward}" * (0 < upward < 32767)  # which stands for a user's own
     return f"EPSG:{across}{height}" if 0 < across < 32767 else ""
@@ -254,5 +263,5 @@ def set_geotiff_unit(path: str | os.PathLike, unit: float) -> None:
 
 
 def number_type(kind: str) -> np.dtype:
-    """The NumPy type of a PDAL type: ``double``, ``float``, ``uint8`` or ``uint8_t``."""
+    """Return the NumPy type of a PDAL type: ``double``, ``float``, ``uint8`` or ``uint8_t``."""
     return np.dtype({"float": "f4", "double": "f8"}.get(kind, kind.removesuffix("_t")))

@@ -1,5 +1,7 @@
-"""LAS files as PDAL and laspy can read them: with extra bytes described and named so that both take them, and texts
-without accents: filters.python insists on UTF-8, laspy on ASCII. The points stay as they are.
+"""LAS files made readable for PDAL and laspy on the way in, with the points as they are.
+
+Extra bytes are described and named so that both take them, and texts lose their accents, since
+filters.python insists on UTF-8 and laspy on ASCII.
 """
 
 from __future__ import annotations
@@ -26,8 +28,11 @@ from .las import (
 
 #: A file whose points begin later is read as it is; its records are no usual ones.
 LARGEST_HEAD = 1 << 26
-#: Texts of a header, and of the head of a record before and after the points: offset and length in bytes.
-_HEADER_TEXTS, _RECORD_TEXTS = ((26, 32), (58, 32)), ((2, 16), (22, 32))
+#: Texts of a header: offset and length in bytes.
+_HEADER_TEXTS = ((26, 32), (58, 32))
+#: Texts in the head of a record before the points.
+_RECORD_TEXTS = ((2, 16), (22, 32))
+#: Texts in the head of a record after the points.
 _LATE_RECORD_TEXTS = ((2, 16), (28, 32))
 #: Records that hold a spatial reference as text: well-known text, and the texts of GeoTIFF keys.
 _REFERENCES = (2111, 2112, 34737)
@@ -42,23 +47,29 @@ class Corrected(io.RawIOBase):
         self._size = os.fstat(self._file.fileno()).st_size + shift
 
     def readable(self) -> bool:
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move to a position of the changed file; return it."""
         self._at = offset + (0, self._at, self._size)[whence]
         return self._at
 
     def tell(self) -> int:
+        """Return the position."""
         return self._at
 
     def close(self) -> None:
+        """Close the file underneath, too."""
         self._file.close()
         super().close()
 
     def readinto(self, buffer) -> int:
+        """Read from the new beginning, or from the file with its patches; return the bytes read."""
         data = bytearray(self._head[self._at : self._at + len(buffer)])
         if not data:
             begin = self._at - self._shift  # in the file
@@ -80,7 +91,8 @@ def corrected(path: str | os.PathLike, extra: bool = True) -> BinaryIO | None:
     path : path
         The file, which :func:`.las_check.check_readable` found to be whole.
     extra : bool
-        Whether extra bytes are corrected: PDAL reads those of LAS 1.0 to 1.3 only where it is asked to.
+        Whether extra bytes are corrected: PDAL reads those of LAS 1.0 to 1.3 only where it is
+        asked to.
 
     Raises
     ------
@@ -117,7 +129,7 @@ def corrected(path: str | os.PathLike, extra: bool = True) -> BinaryIO | None:
 def _with_texts(
     path: str, old: bytes, before: list[Record], after: list[Record]
 ) -> tuple[bytearray, dict[int, bytes]]:
-    """Return what stands before the points with plain texts, and such texts behind the points by their places."""
+    """Return what stands before the points with plain texts; and plain texts behind, by place."""
     head, patches = bytearray(old), {}
     places = [*_HEADER_TEXTS, *((r.place + at, n) for r in before for at, n in _RECORD_TEXTS)]
     references = (r for r in before if r.user == b"LASF_Projection" and r.number in _REFERENCES)
@@ -147,27 +159,27 @@ def _in_ascii(field: bytes) -> bytes:
 
 
 def restore_texts(path: str | os.PathLike, sources: Iterable[str | os.PathLike]) -> None:
-    """Give the header of an output, in place, the texts of the sources back that it has without accents."""
+    """Give the header of an output its texts with accents back, in place, from the sources."""
     for source in sources:
-        with open(source, "rb") as file, open(path, "r+b") as made:
+        with open(source, "rb") as file, open(path, "r+b") as output:
             for at, length in _HEADER_TEXTS:
                 file.seek(at)
-                made.seek(at)
-                text, now = file.read(length), made.read(length)
+                output.seek(at)
+                text, now = file.read(length), output.read(length)
                 if text != now and _in_ascii(text).split(b"\0")[0] == now.split(b"\0")[0]:
-                    made.seek(at)
-                    made.write(text)
+                    output.seek(at)
+                    output.write(text)
 
 
 def _describe_extra_bytes(head: bytearray, header: LasHeader, before: list[Record]) -> None:
-    """Describe and name all extra bytes so that PDAL takes them, in the records before the points."""
-    own = [r for r in before if (r.user, r.number) == (b"LASF_Spec", 4)]
-    for record in own[:1]:
+    """Describe and name all extra bytes so that PDAL takes them, in the head of the file."""
+    descriptions = [r for r in before if (r.user, r.number) == (b"LASF_Spec", 4)]
+    for record in descriptions[:1]:
         end = record.data + record.length
         _, described = fields_of(header, bytes(head[record.data : end]))
         head[record.data : end] = described
         struct.pack_into("<H", head, record.place + 20, len(described))
-    if not own and header.point_bytes > POINT_BYTES[header.point_format]:
+    if not descriptions and header.point_bytes > POINT_BYTES[header.point_format]:
         _, described = fields_of(header, b"")
         end = max((r.data + r.length for r in before), default=header.header_bytes)
         about = struct.pack("<H16sHH32s", 0, b"LASF_Spec", 4, len(described), b"Extra bytes")
@@ -185,7 +197,7 @@ def _move(head: bytearray, header: LasHeader, shift: int) -> None:
 
 
 def _moved_table(path: str, header: LasHeader, shift: int) -> dict[int, bytes]:
-    """Return the place of the table of chunks, by where it stands in the file; empty where there is no table."""
+    """Return the new place of the table of chunks, by where it stands; empty without a table."""
     with open(path, "rb") as file:
         if not header.compressed or laszip_record(file, header).startswith(POINTWISE):
             return {}

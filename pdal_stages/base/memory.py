@@ -13,14 +13,21 @@ import numpy as np
 
 from .errors import OptionError
 
-#: Assumed free memory where the system does not say.
-_UNKNOWN = 4 * 10**9
+#: Free memory in bytes that is assumed where the system does not report it.
+_ASSUMED_FREE = 4 * 10**9
 #: The least amount of memory that is accepted, in bytes.
-_FEWEST = 1e6
+_LEAST_SIZE = 1e6
+#: Limit and use of a control group, of version 2 and of version 1.
+_GROUP_FILES = (
+    ("memory.max", "memory.current"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+)
+#: A larger limit of a control group is none.
+_NO_LIMIT = 2**60
 
 
 def parse_size(text: str) -> int:
-    """Bytes of ``4GB``, ``500 MB``, ``4GiB`` or a plain number, which is large.
+    """Return the bytes of ``4GB``, ``500 MB``, ``4GiB`` or a plain number, which is large.
 
     Raises
     ------
@@ -30,10 +37,9 @@ def parse_size(text: str) -> int:
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
     size = 0.0
     if match is not None:
-        size = float(match[1]) * (1024 if match[3] else 1000) ** " KMGT".index(
-            match[2].upper() or " "
-        )
-    if size < _FEWEST:
+        power = " KMGT".index(match[2].upper() or " ")
+        size = float(match[1]) * (1024 if match[3] else 1000) ** power
+    if size < _LEAST_SIZE:
         raise OptionError(
             "an amount of memory is a number and a unit", found=text, cure="For example 4GB"
         )
@@ -41,16 +47,15 @@ def parse_size(text: str) -> int:
 
 
 def free_memory() -> int:
-    """Bytes available without swapping, within the limit of a container."""
-    found = [_available(), _left_in_container()]
-    known = [size for size in found if size]
-    return min(known) if known else _UNKNOWN
+    """Return the bytes available without swapping, within the limit of a container."""
+    return min(filter(None, (_available(), _left_in_container())), default=_ASSUMED_FREE)
 
 
-def give_back(array: np.ndarray) -> None:
-    """Return the memory of an array to the system; its values are lost, and its owner still has to free it.
+def release_pages(array: np.ndarray) -> None:
+    """Return the memory of an array to the system; its values are lost, its owner must free it.
 
-    For arrays that someone else holds longer than they are needed. Whole pages, on Linux; nothing happens elsewhere.
+    For arrays that someone else holds longer than they are needed. Whole pages, on Linux; nothing
+    happens elsewhere.
     """
     if sys.platform != "linux" or not array.flags.c_contiguous:
         return
@@ -65,29 +70,27 @@ def give_back(array: np.ndarray) -> None:
 
 
 def _available() -> int:
+    """Return the free bytes of the machine; half of all where free ones are not reported; or 0."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
     except (OSError, ValueError):
         pass
-    try:  # other systems than Linux: half of what there is
+    try:  # other systems than Linux
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     except (OSError, ValueError, AttributeError):
         return 0
 
 
 def _left_in_container() -> int:
-    """Of control groups, of either version; 0 where there is no limit."""
+    """Return the free bytes of the control group, of either version; 0 without a limit."""
     folder = Path("/sys/fs/cgroup")
-    for limit, used in (
-        (folder / "memory.max", folder / "memory.current"),
-        (folder / "memory/memory.limit_in_bytes", folder / "memory/memory.usage_in_bytes"),
-    ):
+    for limit, used in _GROUP_FILES:
         try:
-            most = int(limit.read_text())
-            if most < 2**60:
-                return max(1, most - int(used.read_text()))
+            most = int((folder / limit).read_text())
+            if most < _NO_LIMIT:
+                return max(1, most - int((folder / used).read_text()))
         except (OSError, ValueError):
             continue
     return 0

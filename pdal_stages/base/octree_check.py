@@ -1,7 +1,7 @@
 """Checks of octrees before PDAL walks them: of COPC files, and of local EPT sources.
 
-PDAL trusts them. Pages at wrong offsets or that contain themselves crash it or make it loop, and points that no page lists
-are silently left out. Layouts: COPC 1.0 (copc.io), EPT 1.1 (entwine.io).
+PDAL trusts them. Pages at wrong offsets or that contain themselves crash it or make it loop, and
+points that no page lists are silently left out. Layouts: COPC 1.0 (copc.io), EPT 1.1 (entwine.io).
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ Entries = Iterator[tuple[Key, int, Any]]
 
 #: Deeper nodes would be smaller than a step of the coordinates, which have 32 bits.
 _DEEPEST = 31
-_COPC_INFO, _COPC_ENTRY = struct.Struct("<5d2Q2d"), struct.Struct("<4iQ2i")
+#: Of a COPC file: middle and half side of its cube, spacing, place and bytes of the first page,
+#: times.
+_COPC_INFO = struct.Struct("<5d2Q2d")
+#: Entry of a page: level, x, y, z, offset, bytes, points.
+_COPC_ENTRY = struct.Struct("<4iQ2i")
 #: Bytes of an EPT description that are read.
 _LARGEST = 2**24
 #: Endings of the files of an EPT source, by their type.
@@ -35,7 +39,13 @@ _ENDINGS = {"binary": "bin", "laszip": "laz", "zstandard": "zst"}
 
 
 def check_copc(path: str | os.PathLike) -> None:
-    """Refuse a COPC file, readable as LAZ, whose octree does not hold each of its chunks once; StageError."""
+    """Refuse a COPC file, readable as LAZ, whose octree does not hold each of its chunks once.
+
+    Raises
+    ------
+    StageError
+        Naming what is wrong.
+    """
     header = read_header(path)
     about = [data for record, data in records_of(path, b"copc") if record.number == 1]
     if header is None or not about or len(about[0]) < 160:
@@ -43,7 +53,7 @@ def check_copc(path: str | os.PathLike) -> None:
     x, y, z, half, spacing, begin, length, _, _ = _COPC_INFO.unpack_from(about[0])
     try:
         # Its cube holds all points, but for what programs round.
-        beyond = [abs(one - middle) for one, middle in zip(header.box, (x, y, x, y), strict=True)]
+        beyond = [abs(end - middle) for end, middle in zip(header.box, (x, y, x, y), strict=True)]
         if not (half > 0 and max(beyond) <= 1.01 * half and math.isfinite(z) and spacing > 0):
             raise ValueError(
                 f"a cube of {2 * half:g} around {x:g}, {y:g}, {z:g}, points {spacing:g} apart"
@@ -85,39 +95,53 @@ def check_copc(path: str | os.PathLike) -> None:
 
 
 def read_ept(path: str) -> dict[str, Any]:
-    """The description of an EPT source, ``ept.json``, which may be an address; StageError."""
+    """Return the description of an EPT source, ``ept.json``, which may be an address.
+
+    Raises
+    ------
+    StageError
+        If it cannot be read or PDAL would not read all points of the source.
+    """
     import urllib.request
 
     try:
         with (
             urllib.request.urlopen(path, timeout=60) if "://" in path else open(path, "rb") as file
         ):
-            found = strict_json(file.read(_LARGEST))
-        x0, y0, _, x1, y1, _ = map(float, found["boundsConforming"])
-        left, low, _, right, high, _ = map(float, found["bounds"])
+            about = strict_json(file.read(_LARGEST))
+        x0, y0, _, x1, y1, _ = map(float, about["boundsConforming"])
+        left, low, _, right, high, _ = map(float, about["bounds"])
         # PDAL looks for points beyond the octree without end.
         there = left - 1 <= x0 <= x1 <= right + 1 and low - 1 <= y0 <= y1 <= high + 1
-        named = all(isinstance(dimension["name"], str) for dimension in found["schema"])
-        if int(found["points"]) < 0 or not there or not named:
+        named = all(isinstance(dimension["name"], str) for dimension in about["schema"])
+        if int(about["points"]) < 0 or not there or not named:
             raise ValueError("not a valid description, or its points lie outside its octree")
-        if found.get("dataType") != "laszip" and any(map(_is_rounded, found["schema"])):
+        if about.get("dataType") != "laszip" and any(map(_is_rounded, about["schema"])):
             raise ValueError("PDAL rounds its coordinates to whole numbers; build it as laszip")
-        return found
+        return about
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise StageError("the EPT source cannot be read", where=path, found=str(error)) from None
 
 
 def _is_rounded(dimension: dict[str, Any]) -> bool:
-    """Whether it is an axis of integers that stand for fractions: PDAL puts the scaled values back into integers."""
+    """Return whether a dimension is an axis of integers that stand for fractions.
+
+    PDAL puts the scaled values back into integers.
+    """
     if dimension["name"] not in ("X", "Y", "Z") or dimension["type"] == "float":
         return False
     return any(float(dimension.get(name) or 0) % 1 for name in ("scale", "offset"))
 
 
 def check_ept(path: str) -> dict[str, Any]:
-    """The description of an EPT source, after its hierarchy and files were held against each other; StageError.
+    """Check the hierarchy of an EPT source against its files; return its description.
 
-    Of one at an address only the description is looked at.
+    Of a source at an address only the description is checked.
+
+    Raises
+    ------
+    StageError
+        If the source is damaged.
     """
     described = read_ept(path)
     if "://" in path:
@@ -150,8 +174,8 @@ def check_ept(path: str) -> dict[str, Any]:
 
 
 def _walk(root: Any, entries: Callable[[Any], Entries]) -> Nodes:
-    """All nodes of an octree from its first page on; ValueError where they are none."""
-    found: Nodes = {}
+    """Return all nodes of an octree from its first page on; ValueError for a wrong one."""
+    nodes: Nodes = {}
     waiting: list[tuple[Key, Any]] = [((0, 0, 0, 0), root)]
     while waiting:  # not without end: a page that comes again has its nodes twice
         first, page = waiting.pop()
@@ -159,19 +183,19 @@ def _walk(root: Any, entries: Callable[[Any], Entries]) -> Nodes:
             level, *at = key
             if (
                 not 0 <= level <= _DEEPEST
-                or not all(0 <= one < 1 << level for one in at)
+                or not all(0 <= place < 1 << level for place in at)
                 or count < -1
             ):
                 raise ValueError(f"node {key} of {count:,} points")
             if count == -1:
                 waiting.append((key, place))
-            elif key in found:
+            elif key in nodes:
                 raise ValueError(f"node {key} is there twice")
             else:
-                found[key] = count, place
-        if first not in found:
+                nodes[key] = count, place
+        if first not in nodes:
             raise ValueError(f"node {first} is not in its page")
-    for level, *at in found:
-        if level and (level - 1, *(one >> 1 for one in at)) not in found:
+    for level, *at in nodes:
+        if level and (level - 1, *(place >> 1 for place in at)) not in nodes:
             raise ValueError(f"node {(level, *at)} is in no other")
-    return found
+    return nodes

@@ -1,4 +1,4 @@
-"""The log of a run: a file of timestamped lines, and a stream that writes to it."""
+"""The log of a run: a file of timestamped lines, and a stream whose lines also go to it."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class RunLog(logging.FileHandler):
         try:
             super().__init__(path, encoding="utf-8", errors="backslashreplace")
         except OSError as error:
-            found = f"{path}: {error.strerror}"
-            raise StageError("the log cannot be written", where="--log", found=found) from None
+            what = f"{path}: {error.strerror}"
+            raise StageError("the log cannot be written", where="--log", found=what) from None
         self.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
         self._stderr, self._failed, self._started = stderr, False, time.monotonic()
         self.add(f"pdal-stages {__version__}: {shlex.join(arguments)}")
@@ -55,7 +55,7 @@ class RunLog(logging.FileHandler):
             self.handle(logging.makeLogRecord({"msg": one_line(line.strip())}))
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Report it once; the run goes on without its log."""
+        """Report a failure to write once; the run goes on without its log."""
         self._failed = True
         self._stderr.write(
             f"pdal-stages: the log cannot be written any more: {sys.exc_info()[1]}\n"
@@ -71,6 +71,7 @@ class LoggedStream(PlainStream):
         self._begun = threading.local()  # a line may come in parts; those of threads are not mixed
 
     def write(self, text: str) -> int:
+        """Write the escaped text to the stream and its complete lines to the log."""
         *lines, self._begun.line = (getattr(self._begun, "line", "") + text).split("\n")
         for line in lines:  # first, so that the log has all that was shown, even after Ctrl-C
             self.log.add(line)

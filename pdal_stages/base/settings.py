@@ -1,4 +1,4 @@
-"""Settings: dataclass fields with a description and bounds, checked when an object is created."""
+"""Dataclass fields with a description and bounds, which are checked when an object is created."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from . import checks
 
 
 def setting(default: Any, kind: str, help: str, *bounds: float | None, **rule: Any) -> Any:
-    """Declare a field with a one-sentence description, also for help texts, and the `bounds` of a number.
+    """Declare a field with a description of one sentence and, for a number, its `bounds`.
 
-    `kind` and `rule` (``exclusive``, ``unit``, ``choices``) are those of an option of a stage; or `rule` has a ``check``,
-    a function of a name and the value that returns what the field holds. With MISSING as `default` it is required.
+    `kind` and `rule` (``exclusive``, ``unit``, ``choices``) are those of an option of a stage; or
+    `rule` has a ``check``, a function of a name and the value that returns what the field holds.
+    With MISSING as `default` it is required.
     """
     if bounds:
         rule |= {"minimum": bounds[0], "maximum": bounds[1]}
@@ -21,16 +22,17 @@ def setting(default: Any, kind: str, help: str, *bounds: float | None, **rule: A
 
 
 class Settings:
-    """Base of dataclasses with settings; OptionError where one does not fit. A default of None stays."""
+    """Base of dataclasses with settings."""
 
     def __post_init__(self) -> None:
-        for one in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, one.name)
-            if one.metadata and not (value is None and one.default is None):
-                object.__setattr__(self, one.name, _checked(f"'{one.name}'", value, one.metadata))
+        """Check all settings but those that keep a default of None; OptionError for a bad value."""
+        for each in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, each.name)
+            if each.metadata and not (value is None and each.default is None):
+                object.__setattr__(self, each.name, _check(f"'{each.name}'", value, each.metadata))
 
 
-def _checked(what: str, value: Any, rule: Mapping[str, Any]) -> Any:
+def _check(what: str, value: Any, rule: Mapping[str, Any]) -> Any:
     if "check" in rule:
         return rule["check"](what, value)
     if "choices" in rule:

@@ -1,7 +1,8 @@
-"""Resources of the machine: threads over blocks of work, and memory.
+"""Threads over blocks of work, and how many of them the machine allows.
 
-Kernels are compiled with ``nogil``, so plain Python threads use every core. numba's own parallel loops are not used: its
-portable threading layer aborts the process when two Python threads enter it together, and users do run pipelines in threads.
+Kernels are compiled with ``nogil``, so plain Python threads use every core. numba's own parallel
+loops are not used: its portable threading layer aborts the process when two Python threads enter
+it together, and users do run pipelines in threads.
 """
 
 from __future__ import annotations
@@ -18,16 +19,18 @@ from typing import Any
 
 from . import checks
 
-#: Where a cgroup of version 2, and one of version 1, says how many microseconds of CPU it may use in how many.
+#: Files of a control group, of version 2 and of version 1, with its quota of CPU and the period of
+#: that quota, both in microseconds.
 _QUOTAS = ("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")
 
-#: The environment variable with the number of cores of a worker, which joblib and so scikit-learn respect as well.
+#: The environment variable with the number of cores of a worker; joblib, and so scikit-learn,
+#: respect it as well.
 CORES = "LOKY_MAX_CPU_COUNT"
 
 
 @cache
 def available_threads() -> int:
-    """Cores this process may use: its CPU affinity, bounded by a cgroup quota and by :data:`CORES`."""
+    """Return the cores this process may use: affinity, bounded by a quota and :data:`CORES`."""
     bounds = [os.cpu_count() or 1, *_quota()]
     if hasattr(os, "sched_getaffinity"):
         bounds.append(len(os.sched_getaffinity(0)))
@@ -37,11 +40,10 @@ def available_threads() -> int:
 
 
 def _quota(folder: str = "/sys/fs/cgroup") -> Iterator[int]:
-    """The cores that a cgroup's quota is worth, where there is one."""
+    """Yield the cores that a control group's quota is worth, where there is one."""
     for files in _QUOTAS:
-        with contextlib.suppress(
-            OSError, ValueError, ArithmeticError
-        ):  # no such file; "max": no bound
+        # no such file; "max" for no bound
+        with contextlib.suppress(OSError, ValueError, ArithmeticError):
             quota, period = (
                 int(word) for file in files for word in Path(folder, file).read_text().split()
             )
@@ -50,7 +52,7 @@ def _quota(folder: str = "/sys/fs/cgroup") -> Iterator[int]:
 
 
 def resolve_threads(threads: int | None) -> int:
-    """``None`` or 0: every core on offer; a positive number: that many."""
+    """Return a number of threads: every core for ``None`` or 0, else the positive number itself."""
     if threads is None or (threads == 0 and not isinstance(threads, bool)):
         return available_threads()
     return checks.whole("'threads'", threads, 0)
@@ -62,10 +64,11 @@ def map_blocks(
     threads: int | None = None,
     ahead: int = 2,
 ) -> Iterator[Any]:
-    """Yield ``function(block)`` for every block, in order, computed by several `threads`; it should release the GIL.
+    """Yield ``function(block)`` for every block, in order, computed by several `threads`.
 
-    At most ``threads * ahead`` results wait unread, so memory stays bounded when the reader is slower than the workers. An
-    exception (Ctrl-C too) stops handing out blocks and is raised once the blocks in work are finished.
+    The function should release the GIL. At most ``threads * ahead`` results wait unread, so memory
+    stays bounded when the reader is slower than the workers. An exception (Ctrl-C too) stops
+    handing out blocks and is raised once the blocks in work are finished.
     """
     count = resolve_threads(threads)
     if count == 1 or len(blocks) <= 1:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import OptionError, StageError, suggest
+from .grid import cell_numbers
 
 #: Names users write, in meters.
 NAMED = {
@@ -25,8 +26,10 @@ NAMED = {
 }
 
 
-#: The smallest and largest plausible unit, in meters.
-_SMALLEST, _LARGEST = 1e-6, 1e6
+#: The smallest plausible unit, in meters.
+_SMALLEST = 1e-6
+#: The largest plausible unit, in meters.
+_LARGEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,10 @@ class Units:
 
 @dataclass(frozen=True)
 class UnitDoubts:
-    """Limits beyond which the unit of z is doubted: feet taken for meters make heights and slopes 3.28 times too large."""
+    """Limits beyond which the unit of z is doubted.
+
+    Feet taken for meters make heights and slopes 3.28 times too large.
+    """
 
     #: the tallest trees known are 116 m high; no wood has 1 % of its points above 100 m
     vegetation_m: float = 100.0
@@ -57,7 +63,7 @@ class UnitDoubts:
 
 
 def doubt_vertical_unit(height_m: NDArray, slope: float, vertical: float) -> str:
-    """Return a warning where vegetation is too high, or the ground too steep, to be true; else an empty text.
+    """Return a warning if vegetation is too high, or ground too steep, to be true, else "".
 
     Parameters
     ----------
@@ -83,21 +89,22 @@ def doubt_vertical_unit(height_m: NDArray, slope: float, vertical: float) -> str
     else:
         return ""
     return (
-        f"{what}, so the unit of z may be wrong (taken to be {vertical:.6g} m). Override it by a reference that names "
-        "the heights' system, such as --readers.las.override_srs=EPSG:26910+6360 (US survey feet), or by "
-        "'vertical_unit' of each stage"
+        f"{what}, so the unit of z may be wrong (taken to be {vertical:.6g} m). Override it by a "
+        "reference that names the heights' system, such as "
+        "--readers.las.override_srs=EPSG:26910+6360 (US survey feet), or by 'vertical_unit' of "
+        "each stage"
     )
 
 
 def median_slope(xyz_m: NDArray, height_m: NDArray, limits: UnitDoubts = UnitDoubts()) -> float:
-    """Return the median slope between the terrain's mean heights in neighboring cells; 0 where too few are neighbors.
+    """Return the median slope between mean heights of the terrain in neighboring cells.
 
-    `xyz_m` (n, 3) and `height_m` (n,), above the terrain, are in meters.
+    0 where too few cells are neighbors. `xyz_m` (n, 3) and `height_m` (n,), above the terrain, are in meters.
     """
-    some = slice(None, None, 1 + len(xyz_m) // limits.most_points)
-    column, row = np.floor(xyz_m[some, :2].T / limits.cell_m).astype(np.int64)
+    sample = slice(None, None, 1 + len(xyz_m) // limits.most_points)
+    column, row = cell_numbers(xyz_m[sample, :2].T, limits.cell_m)
     cells, inverse = np.unique(np.column_stack([column, row]), axis=0, return_inverse=True)
-    terrain = np.bincount(inverse, xyz_m[some, 2] - height_m[some]) / np.bincount(inverse)
+    terrain = np.bincount(inverse, xyz_m[sample, 2] - height_m[sample]) / np.bincount(inverse)
     by_place = dict(zip(map(tuple, cells.tolist()), terrain.tolist(), strict=True))
     slopes = [
         math.hypot(by_place[x + 1, y] - height, by_place[x, y + 1] - height) / limits.cell_m
@@ -108,7 +115,7 @@ def median_slope(xyz_m: NDArray, height_m: NDArray, limits: UnitDoubts = UnitDou
 
 
 def named_unit(name: str, option: str) -> float:
-    """Meters per unit of a unit's name; :class:`OptionError` where it is not known."""
+    """Return meters per unit of a unit's name; OptionError for an unknown one."""
     try:
         return NAMED[name.strip().lower()]
     except KeyError:
@@ -122,7 +129,7 @@ def named_unit(name: str, option: str) -> float:
 def units_of_wkt(
     wkt: str, *, horizontal: str = "", vertical: str = "", place: tuple[float, float] | None = None
 ) -> Units:
-    """The length units of a spatial reference in well-known text (WKT 1 or 2).
+    """Return the length units of a spatial reference in well-known text (WKT 1 or 2).
 
     Parameters
     ----------
@@ -182,14 +189,15 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
         if centered
         else "the coordinates are geographic (degrees); neighborhoods and grids need meters",
         found=root.name or wkt[:60],
-        cure=f'Add a reprojection before this stage, {{"type": "filters.reprojection", "out_srs": "{code}"}}, or '
+        cure="Add a reprojection before this stage, "
+        f'{{"type": "filters.reprojection", "out_srs": "{code}"}}, or '
         "reproject the files first, pdal translate IN OUT reprojection "
         f"--filters.reprojection.out_srs={code} ({what})",
     )
 
 
 def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float) -> None:
-    """Refuse points without a reference, a thousand or more, whose bounding box looks like degrees."""
+    """Refuse a thousand points or more without a reference whose extent looks like degrees."""
     if (
         count >= 1000
         and max(-x0, x1) <= 180.0
@@ -198,15 +206,20 @@ def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float
     ):
         code = utm_code(x0, y0) or "CODE"
         raise StageError(
-            "the coordinates look like degrees, and there is no spatial reference that says otherwise",
+            "the coordinates look like degrees, and there is no spatial reference that says "
+            "otherwise",
             found=f"x {x0:.6f} to {x1:.6f}, y {y0:.6f} to {y1:.6f}",
-            cure="Reproject the files first: pdal translate IN OUT reprojection --filters.reprojection.in_srs=EPSG:4326 "
+            cure="Reproject the files first: pdal translate IN OUT reprojection "
+            "--filters.reprojection.in_srs=EPSG:4326 "
             f"--filters.reprojection.out_srs=EPSG:{code}; if they are meters, set horizontal_unit",
         )
 
 
 def utm_code(longitude: float, latitude: float, name: str = "") -> int | None:
-    """The EPSG code of the UTM zone of a place, on ETRS89 or NAD83 where a reference's name says so, else WGS 84."""
+    """Return the EPSG code of the UTM zone of a place in degrees; None where there is no zone.
+
+    On ETRS89 or NAD83 where `name`, a reference's, says so, else on WGS 84.
+    """
     if not (-180.0 <= longitude <= 180.0 and -80.0 <= latitude <= 84.0):
         return None
     zone = min(60, int((longitude + 180.0) // 6.0) + 1)
@@ -229,16 +242,20 @@ class WktNode:
 
     @property
     def name(self) -> str:
+        """Name of the element; empty without one."""
         return self.values[0] if self.values else ""
 
     def find(self, *keywords: str) -> WktNode | None:
-        """The first element, this one included, with one of the keywords."""
+        """Return the first element, this one included, with one of the keywords."""
         if self.keyword in keywords:
             return self
-        return next((found for child in self.children if (found := child.find(*keywords))), None)
+        return next((hit for child in self.children if (hit := child.find(*keywords))), None)
 
     def unit(self) -> float | None:
-        """Meters per unit of this coordinate system: its own unit, or its first axis's, where WKT 2 may put it."""
+        """Return meters per unit of this coordinate system; None without a unit.
+
+        WKT 2 may put the unit on an axis.
+        """
         for child in self.children:
             if child.keyword in ("LENGTHUNIT", "UNIT"):
                 try:
@@ -250,7 +267,7 @@ class WktNode:
         return next((unit for unit in units if unit is not None), None)
 
     def code(self) -> str:
-        """The authority's code of this element, as ``EPSG:25832``; empty where it has none."""
+        """Return the authority's code of this element, as ``EPSG:25832``; empty without one."""
         codes = [
             c.values[:2] for c in self.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]
         ]
@@ -281,7 +298,7 @@ def parse_wkt(text: str) -> WktNode | None:
 
 
 def horizontal_part(wkt: str) -> str:
-    """Return the text of the horizontal system in that of a compound one, as vector files have it; others unchanged."""
+    """Return the horizontal system of a compound one in well-known text; others unchanged."""
     compound = re.match(
         r'\s*(?:COMPD_CS|COMPOUNDCRS)\s*[\[(]\s*"(?:[^"]|"")*"\s*,\s*', wkt, re.IGNORECASE
     )
@@ -294,7 +311,7 @@ def horizontal_part(wkt: str) -> str:
 
 
 def name_of_wkt(wkt: str) -> str:
-    """The name of a spatial reference in well-known text, with its authority's code; empty where it has none."""
+    """Return the name of a spatial reference in well-known text, with its authority's code."""
     root = parse_wkt(wkt)
     if root is None:
         return ""

@@ -57,8 +57,9 @@ def _linked(file: Path, folder: Path) -> str:
 def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
     """Call a function that uses the extra ``vector``, in its own process inside a program that is linked to GEOS or GDAL.
 
-    On Linux the libraries of the program itself come first for all that it loads. A Python package with a GEOS or GDAL of
-    its own would mix both and crash. So it is in the program `pdal`; Python is linked to neither.
+    On Linux the libraries of the program itself come first for all that it loads. A Python package
+    with a GEOS or GDAL of its own would mix both and crash. So it is in the program `pdal`; Python
+    is linked to neither.
     """
     linked = sys.platform.startswith("linux") and any(
         hasattr(ctypes.CDLL(None), name) for name in ("GEOSversion", "GDALVersionInfo")

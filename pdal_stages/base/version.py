@@ -11,7 +11,7 @@ __version__ = "0.2.0"
 
 @cache
 def build() -> str:
-    """The version and a digest of the package's code and models, which differ where results may."""
+    """Return the version and a digest of code and models, which differ where results may."""
     root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted([*root.rglob("*.py"), *root.glob("models/*.model")]):
         digest.update(

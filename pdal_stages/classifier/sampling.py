@@ -25,7 +25,7 @@ from ..accuracy.measures import Accuracy
 from ..accuracy.text import summary
 from ..base.errors import OptionError
 from ..base.grid import places_among
-from ..base.hashing import hash_of
+from ..base.hashing import hash_rows
 from ..base.progress import Progress
 
 #: Side of a cell of the curve in meters.
@@ -209,7 +209,7 @@ def curve_keys(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[Any]:
     cells = np.clip(np.floor(xyz[:, :2] / CELL) + 2**30, 0, 2**31 - 1).astype(np.uint64)
     keys = np.empty(len(xyz), dtype=[("cell", np.uint64), ("hash", np.uint64)])
     keys["cell"] = _spread_bits(cells[:, 0]) | (_spread_bits(cells[:, 1]) << np.uint64(1))
-    keys["hash"] = hash_of(xyz.T, seed)
+    keys["hash"] = hash_rows(xyz.T, seed)
     return keys
 
 

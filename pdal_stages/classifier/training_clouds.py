@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ..accuracy.labels import as_codes
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
-from ..base.hashing import hash_of
+from ..base.hashing import hash_rows
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..features.cell_means import density
@@ -104,7 +104,7 @@ def prepared(sources: Iterable[TrainingCloud], options: TrainingOptions) -> Iter
             if wanted < WORTH * there:
                 # A point stays or goes by a hash of its coordinates: the same ones in any order.
                 limit = np.uint64(wanted / there * (2.0**64 - 2048.0))
-                rows = np.flatnonzero(hash_of(cloud.xyz.T, options.seed) <= limit)
+                rows = np.flatnonzero(hash_rows(cloud.xyz.T, options.seed) <= limit)
                 if len(rows):
                     yield cloud.part(rows, f"thinned to {wanted:g} per m2")
 

@@ -19,7 +19,7 @@ from ..base.asprs import class_name
 from ..base.errors import OptionError, StageError
 from ..base.files import HTML, JSON, Output, write_json, write_whole
 from ..base.memory import parse_size
-from ..base.messages import counted, one_line, print_messages
+from ..base.messages import count_of, one_line, print_messages
 from ..pipeline.run import LEFT_ALONE
 from ..tiling.jobs import InterruptedRun, TiledRun
 from ..tiling.options import PER, TilingOptions
@@ -132,7 +132,7 @@ def _classify(options: argparse.Namespace) -> int:
     if options.metadata:
         write_json(options.metadata, written.metadata, indent=2)
     print_messages(*written.messages)
-    print(f"{counted(written.points, 'point')} written to {written.path}")
+    print(f"{count_of(written.points, 'point')} written to {written.path}")
     print_classes(written.classes, written.left_alone, names)
     if then is not None:
         then()
@@ -155,7 +155,7 @@ def _classify_tiles(
         ]
         said = f"; {', '.join(shares)}" if shares else ""
         print(
-            f"{job.outputs[0]}: {counted(job.record.get('written', 0), 'point')}{said}", flush=True
+            f"{job.outputs[0]}: {count_of(job.record.get('written', 0), 'point')}{said}", flush=True
         )
 
     run, interrupted = ran(lambda: task.run_tiles(dry_run=options.dry_run, finished=finished))
@@ -313,10 +313,10 @@ def end_run(options: argparse.Namespace, run: TiledRun, again: str) -> int:
         return 1 if run.failures else 0
     states = run.summary["states"]
     files = sum(out.state in ("done", "kept") for out in run.outputs)
-    written = f"{files:,} of {counted(len(run.outputs), 'file')} written, " if run.outputs else ""
+    written = f"{files:,} of {count_of(len(run.outputs), 'file')} written, " if run.outputs else ""
     print_messages(
         f"interrupted; nothing half-written was left. {written}{states['done'] + states['kept']:,} of "
-        f"{counted(len(run.tiles), 'tile')} done. For the rest: {again}"
+        f"{count_of(len(run.tiles), 'tile')} done. For the rest: {again}"
     )
     return 130
 
@@ -341,8 +341,8 @@ def print_run(run: TiledRun) -> None:
     lines = []
     if run.outputs:
         files = Counter(out.state for out in run.outputs)
-        lines.append(f"{counted(files['done'], 'file')} written{_others(files)}")
-    lines.append(f"{counted(s['states']['done'], 'tile')} done{_others(s['states'])}")
+        lines.append(f"{count_of(files['done'], 'file')} written{_others(files)}")
+    lines.append(f"{count_of(s['states']['done'], 'tile')} done{_others(s['states'])}")
     lines.append(
         f"{s['points']:,} points in {s['seconds']:.1f} s ({s['points_per_second']:,.0f} points/s)"
     )
@@ -376,10 +376,10 @@ def print_dry(run: TiledRun) -> None:
         s["workers"], f"each of {s['workers']} workers"
     )
     print(
-        f"{counted(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it"
+        f"{count_of(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it"
     )
     print(
-        f"{counted(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}"
+        f"{count_of(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}"
     )
     print(f"about {s['points_read_by_a_tile']:,} points read for a tile")
     print(

@@ -4,13 +4,14 @@ All are chosen among nested ones, made of a query's neighbors in the order of di
 moments are summed up once. The k nearest are the point and its k nearest: n = k + 1 members, as in
 Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest eigenentropy,
 ``rdim`` the radius with the lowest entropy of dimensionality. ``copt`` looks at the curvature
-(surface variation) of the sphere of 1 m first: where it is at least c_t the point is *scattered* and
-takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of
+(surface variation) of the sphere of 1 m first: where it is at least c_t the point is *scattered*
+and takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of
 0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
 
 A candidate needs members that do not all coincide, three of them, among radii
-``neighborhoods.LEAST_MEMBERS``. Where none qualifies (a lone point, copies of one point) the largest
-is taken; its eigen-features then say "no structure". The curvature of a sphere with fewer is 1/3.
+``neighborhoods.LEAST_MEMBERS``. Where none qualifies (a lone point, copies of one point) the
+largest is taken; its eigen-features then say "no structure". The curvature of a sphere with fewer
+is 1/3.
 """
 
 from __future__ import annotations
@@ -53,10 +54,12 @@ from .shape_distributions import Axes, shapes_of, write_shapes
 #: Members of a candidate among numbers of neighbors.
 LEAST = 3
 
-#: Radius of the sphere whose curvature is looked at, meters, and curvature where too few neighbors tell [H17].
+#: Radius of the sphere whose curvature is looked at, meters, and curvature where too few neighbors
+#: tell [H17].
 CURVATURE_RADIUS, SCATTERED = 1.0, 1.0 / 3.0
 
-#: ``copt``: first and last radius and step of regular points, meters; fewest and most neighbors of scattered ones [H17].
+#: ``copt``: first and last radius and step of regular points, meters; fewest and most neighbors of
+#: scattered ones [H17].
 COPT_RADII = (0.5, 2.0, 0.05)
 COPT_K = (10, 50)
 
@@ -77,9 +80,10 @@ def radii_of(first: float, last: float, step: float) -> np.ndarray:
 def curvature_threshold(curvatures: np.ndarray) -> float:
     """The curvature from which on a point is scattered [H17 eq. 1-3]; ValueError where there is no finite value (n,).
 
-    Two means, started at the smallest and the largest value, give the centers cur1 and cur2 of two groups of n1 and
-    n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are equal that is the value, and all points are
-    scattered, which needs no radius to hold enough points.
+    Two means, started at the smallest and the largest value, give the centers cur1 and cur2 of two
+    groups of n1 and n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are
+    equal that is the value, and all points are scattered, which needs no radius to hold enough
+    points.
     """
     values = np.sort(np.asarray(curvatures, dtype=np.float64).ravel())
     n = len(values)
@@ -202,10 +206,10 @@ class AdaptiveNeighborhoods:
     ) -> float:
         """Compute the columns of these neighborhoods in `out` (m, F) for a block of queries, neighbors at best.
 
-        Each query stands for so many `copies` of the user's. `bins` are needed where shapes are wanted, the threshold for
-        copt. For each neighborhood, `few` is raised by the number of queries with fewer than three points, and `far` by
-        that of queries whose result depends on points farther than the plan's halo. How far the farthest of all lie is
-        returned, meters.
+        Each query stands for so many `copies` of the user's. `bins` are needed where shapes are
+        wanted, the threshold for copt. For each neighborhood, `few` is raised by the number of
+        queries with fewer than three points, and `far` by that of queries whose result depends on
+        points farther than the plan's halo. How far the farthest of all lie is returned, meters.
         """
         reach = 0.0
         shapes = shapes_of(self.chosen, points, seed, bins) if self.shaped else None
@@ -242,7 +246,8 @@ class AdaptiveNeighborhoods:
         table = np.empty((len(numbers), ROWS, m))
         curvature = np.empty(m if search.curved else 0) if curvature is None else curvature
         least = int(search.choices[0, 2]) if len(numbers) else least
-        # Surfaces of neighbors are looked at only where features are written, by a search that finds AROUND of them.
+        # Surfaces of neighbors are looked at only where features are written, by a search that
+        # finds AROUND of them.
         looked = out is not None and len(numbers) > 0 and search.cap2 == math.inf
         surfaces = self._surfaces if looked else self._surfaces[:0]
         out = np.empty((m, 0), np.float32) if out is None else out
@@ -300,7 +305,8 @@ def adaptive_block(
     numbers, radii, ks, within2, cap2, choices, curved
         See :class:`Search`.
     least, threshold : int, float
-        Members a sphere needs to have a curvature, and the curvature from which on a point is scattered.
+        Members a sphere needs to have a curvature, and the curvature from which on a point is
+        scattered.
     surfaces : (n, SURFACE) float32 array
         Of the cloud's points, n = 0 where none are wanted.
     surface_columns : (k, 4) int64 array
@@ -308,7 +314,8 @@ def adaptive_block(
     shapes : Shapes or None
         None compiles to a kernel without them.
     table : (numbers, ROWS, m) float64 array
-        Out: moments about the query, radius, and how far away points matter, infinite where there are too few.
+        Out: moments about the query, radius, and how far away points matter, infinite where there
+        are too few.
     curvature : (m,) float64 array
         Out: the curvature where `curved`.
     """

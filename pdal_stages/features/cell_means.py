@@ -1,14 +1,15 @@
 """Cells of an absolute grid: means over them and those around them, one point for each, how many points they hold.
 
-Means are of probabilities and of return flags: values are counted in 65535ths and added as whole numbers over a point's own
-cell and the cells around it, then divided by the number of points there. So a mean has the same bits for any order of
-points, number of threads, and in any tile that holds those cells; and a point costs as much in a dense cloud as in a sparse
-one.
+Means are of probabilities and of return flags: values are counted in 65535ths and added as whole
+numbers over a point's own cell and the cells around it, then divided by the number of points
+there. So a mean has the same bits for any order of points, number of threads, and in any tile that
+holds those cells; and a point costs as much in a dense cloud as in a sparse one.
 
-One point for each voxel bounds the cost of a point, and evens out how clouds are sampled. A sphere of 5 m holds 100,000
-points of a drone's cloud, and 50 nearest neighbors there are a hand's breadth: features take long and mean something else
-than in the clouds a model was trained on. So each voxel is represented by one of its points, and the others take its
-result. Which one it is follows from the points' own coordinates and values: the same in any order and in any tile that
+One point for each voxel bounds the cost of a point, and evens out how clouds are sampled. A sphere
+of 5 m holds 100,000 points of a drone's cloud, and 50 nearest neighbors there are a hand's
+breadth: features take long and mean something else than in the clouds a model was trained on. So
+each voxel is represented by one of its points, and the others take its result. Which one it is
+follows from the points' own coordinates and values: the same in any order and in any tile that
 holds whole voxels.
 """
 
@@ -34,8 +35,9 @@ def cell_means(
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """(cell of each point, means (cells, columns) over each cell and those around it).
 
-    Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in meters. `shares` (n, columns)
-    are in 65535ths; with `votes` the largest column of each point counts alone, as a whole.
+    Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in
+    meters. `shares` (n, columns) are in 65535ths; with `votes` the largest column of each point
+    counts alone, as a whole.
     """
     keys, offsets = compact_keys(coordinates, side)
     order = np.argsort(keys)
@@ -64,7 +66,8 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
     return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
 
 
-# ---- kernels --------------------------------------------------------------------------------------------
+# ---- kernels
+# --------------------------------------------------------------------------------------------
 
 
 @njit

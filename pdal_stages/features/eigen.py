@@ -1,13 +1,13 @@
 """Eigenvalues of 3x3 covariance matrices and the features made of them, for scalar and vectorized use.
 
-Every function here is branch-free apart from selections, and is inlined where it is called, so a loop over
-arrays of moments is vectorized by LLVM; no fast-math flag is set, so a value does not depend on its place in
-the array or on the loop it is called from.
+Every function here is branch-free apart from selections, and is inlined where it is called, so a
+loop over arrays of moments is vectorized by LLVM; no fast-math flag is set, so a value does not
+depend on its place in the array or on the loop it is called from.
 
-The method is Jacobi's: unlike the closed form with arc cosines it keeps full accuracy where two eigenvalues
-nearly coincide (thin lines and planes, where the closed form loses half of the digits), it gives
-the eigenvector of the smallest eigenvalue at the cost of a few products, and square roots and divisions are
-vector instructions where arc cosines are not.
+The method is Jacobi's: unlike the closed form with arc cosines it keeps full accuracy where two
+eigenvalues nearly coincide (thin lines and planes, where the closed form loses half of the
+digits), it gives the eigenvector of the smallest eigenvalue at the cost of a few products, and
+square roots and divisions are vector instructions where arc cosines are not.
 """
 
 from __future__ import annotations
@@ -126,11 +126,13 @@ def _sweep(xx, xy, xz, yy, yz, zz, ax, ay, az, bx, by, bz, cx, cy, cz):
 def eigen3(xx, xy, xz, yy, yz, zz):
     """Eigenvalues l1 >= l2 >= l3 >= 0 of a symmetric positive semidefinite matrix and the unit eigenvector of l3.
 
-    Four cyclic Jacobi sweeps; absolute error about 1e-15 of l1, negative rounding leftovers become 0. The eigenvector is of
-    either sign; of points on a line (l2 below 1e-12 of l1) it is the steepest perpendicular, so that a horizontal line has
-    verticality 0 and a vertical one 1: (1, 0, 0) where the line is vertical.
+    Four cyclic Jacobi sweeps; absolute error about 1e-15 of l1, negative rounding leftovers become
+    0. The eigenvector is of either sign; of points on a line (l2 below 1e-12 of l1) it is the
+    steepest perpendicular, so that a horizontal line has verticality 0 and a vertical one 1: (1,
+    0, 0) where the line is vertical.
     """
-    # No loop: LLVM leaves one of this length rolled up, and then does not vectorize the loop around it.
+    # No loop: LLVM leaves one of this length rolled up, and then does not vectorize the loop
+    # around it.
     m = _sweep(xx, xy, xz, yy, yz, zz, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     m = _sweep(*_sweep(*_sweep(*m)))
     xx, _, _, yy, _, zz, ax, ay, az, bx, by, bz, cx, cy, cz = m

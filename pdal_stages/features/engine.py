@@ -31,7 +31,8 @@ MOST_ROWS = 4096
 #: Bytes of a row besides its features, and for each neighborhood.
 ROW_BYTES, NEIGHBORHOOD_BYTES = 200, 130
 
-#: The queries' own dimensions: (m,) values each, or what gives those of a block's queries, named by their indices.
+#: The queries' own dimensions: (m,) values each, or what gives those of a block's queries, named
+#: by their indices.
 Given = Mapping[str, npt.ArrayLike] | Callable[[np.ndarray], Mapping[str, np.ndarray]] | None
 
 #: What a block counted: by kind, then by neighborhood.
@@ -62,9 +63,9 @@ class FeatureEngine:
     bins, copt_threshold
         As given or fitted.
     report : Report
-        So far: ``points`` of the cloud, ``queries`` computed, ``fewer_than_three`` (by neighborhood, queries
-        whose neighborhood had fewer than three points, so that eigen-features are 0); and, beyond ``plan.halo_m``,
-        queries whose k nearest reach farther.
+        So far: ``points`` of the cloud, ``queries`` computed, ``fewer_than_three`` (by
+        neighborhood, queries whose neighborhood had fewer than three points, so that
+        eigen-features are 0); and, beyond ``plan.halo_m``, queries whose k nearest reach farther.
 
     Raises
     ------
@@ -73,11 +74,13 @@ class FeatureEngine:
 
     Notes
     -----
-    A result is the same to the last bit for any order of the points, any queries asked beside it, any number of
-    threads, any block size, and in a tile whose halo is ``plan.halo_m`` meters or more.
+    A result is the same to the last bit for any order of the points, any queries asked beside it,
+    any number of threads, any block size, and in a tile whose halo is ``plan.halo_m`` meters or
+    more.
 
-    Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being sorted), about 10 more with
-    neighborhoods of k points, 21 more with their surfaces, and the block budget of :meth:`blocks`.
+    Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being
+    sorted), about 10 more with neighborhoods of k points, 21 more with their surfaces, and the
+    block budget of :meth:`blocks`.
     """
 
     def __init__(
@@ -113,14 +116,15 @@ class FeatureEngine:
     def __len__(self) -> int:
         return len(self.grid)
 
-    # ---- fitting -------------------------------------------------------------------------------------------
+    # ---- fitting
+    # -------------------------------------------------------------------------------------------
 
     def fit(self) -> FeatureEngine:
         """Fit what the plan needs and was not given: shape thresholds and the threshold of copt.
 
-        Samples are the 500 points with the smallest hash of (seed, coordinates), so they do not depend on the
-        order of the points. Called by :meth:`blocks` when needed; a second call does nothing. For several clouds see
-        :func:`fit_clouds`.
+        Samples are the 500 points with the smallest hash of (seed, coordinates), so they do not
+        depend on the order of the points. Called by :meth:`blocks` when needed; a second call does
+        nothing. For several clouds see :func:`fit_clouds`.
 
         Raises
         ------
@@ -178,7 +182,8 @@ class FeatureEngine:
                 self._parts = FixedRadius(self.grid, self.plan), adaptive
             return self._parts
 
-    # ---- computing -----------------------------------------------------------------------------------------
+    # ---- computing
+    # -----------------------------------------------------------------------------------------
 
     def blocks(
         self,
@@ -195,10 +200,12 @@ class FeatureEngine:
         Parameters
         ----------
         queries : array, optional
-            ``None``: every point of the cloud; an array of indices into the cloud; or (m, 3) coordinates.
+            ``None``: every point of the cloud; an array of indices into the cloud; or (m, 3)
+            coordinates.
         dimensions : mapping of str to (m,) array, or function
-            One value per query for each of ``plan.dimensions``. X, Y and Z need not be given. A function is called in the
-            worker's thread with a block's `rows` and gives their values: no copy of all is needed.
+            One value per query for each of ``plan.dimensions``. X, Y and Z need not be given. A
+            function is called in the worker's thread with a block's `rows` and gives their values:
+            no copy of all is needed.
         threads : int, optional
             The engine's where not given.
         memory_mb : float
@@ -206,14 +213,16 @@ class FeatureEngine:
         progress : Progress or bool, optional
             A progress to update, or ``True`` for one of its own.
         apply : callable, optional
-            ``apply(values, rows)`` is called in the worker's thread, and its result is yielded in place of the
-            values: how a classifier predicts on every core without ever holding the whole matrix.
+            ``apply(values, rows)`` is called in the worker's thread, and its result is yielded in
+            place of the values: how a classifier predicts on every core without ever holding the
+            whole matrix.
 
         Yields
         ------
         rows : (b,) int64 array
-            Where the queries are points of the cloud (``None`` or indices): their indices in the cloud.
-            Where they are coordinates: their row numbers. Every query comes once, in the order of the grid.
+            Where the queries are points of the cloud (``None`` or indices): their indices in the
+            cloud. Where they are coordinates: their row numbers. Every query comes once, in the
+            order of the grid.
         values : (b, len(plan.names)) float32 array, C-contiguous
             Or what `apply` made of it.
 
@@ -276,7 +285,8 @@ class Run:
         new = np.ones(count, np.bool_)
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
         self.distinct = np.append(np.flatnonzero(new), count)
-        # Two results per thread may wait (map_blocks) and one is being made; copies of points double a block.
+        # Two results per thread may wait (map_blocks) and one is being made; copies of points
+        # double a block.
         row = (
             8 * len(self.plan.names) + ROW_BYTES + NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods)
         )
@@ -428,14 +438,17 @@ def compute_features(
     xyz : (n, 3) array
         The cloud, float64, in meters.
     queries : array, optional
-        Whose features: ``None`` for every point, an array of indices into the cloud, or (m, 3) coordinates.
+        Whose features: ``None`` for every point, an array of indices into the cloud, or (m, 3)
+        coordinates.
     neighborhoods : str or list of str
         Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
     feature_set : str or list of str
-        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` .. ``D4``) or single
-        features. The defaults of both are those of ``filters.multiscalefeatures``.
+        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` ..
+        ``D4``) or single features. The defaults of both are those of
+        ``filters.multiscalefeatures``.
     dimensions : mapping of str to (m,) array
-        The queries' own dimensions that the plan uses as features (HeightAboveGround for weinmann2018).
+        The queries' own dimensions that the plan uses as features (HeightAboveGround for
+        weinmann2018).
     bins, copt_threshold, seed, threads
         See :class:`FeatureEngine`.
     memory_mb : float
@@ -467,10 +480,11 @@ def fit_clouds(
 ) -> tuple[ShapeBins | None, float | None]:
     """Shape thresholds and the threshold of copt, fitted to several clouds as if to one.
 
-    Curvatures of all points of all clouds are parted together [H17 eq. 3], and the 500 sample neighborhoods
-    [B16 3.2.2] are those round the points with the smallest hashes of all. A neighborhood lies within its own cloud. Of
-    one cloud the result is :meth:`FeatureEngine.fit`'s; the order of the clouds (n, 3), in meters, does not matter. None
-    where the plan has no shapes, or no copt.
+    Curvatures of all points of all clouds are parted together [H17 eq. 3], and the 500 sample
+    neighborhoods [B16 3.2.2] are those round the points with the smallest hashes of all. A
+    neighborhood lies within its own cloud. Of one cloud the result is :meth:`FeatureEngine.fit`'s;
+    the order of the clouds (n, 3), in meters, does not matter. None where the plan has no shapes,
+    or no copt.
     """
     if not (plan.shapes or plan.copt):
         return None, None

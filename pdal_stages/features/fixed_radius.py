@@ -1,7 +1,8 @@
 """Cylinders and spheres of fixed radii: masked sums over the points of the cells that a neighborhood can touch.
 
-All queries of a cell share these candidates, whose list depends on (cloud, cell, radius) only: rows of cells ascend, then
-columns, then the coordinates of the points. Members are the points where the squared distance is ``<= r * r``.
+All queries of a cell share these candidates, whose list depends on (cloud, cell, radius) only:
+rows of cells ascend, then columns, then the coordinates of the points. Members are the points
+where the squared distance is ``<= r * r``.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from .registry import MOMENT_FEATURES
 from .shape_bins import ShapeBins
 from .shape_distributions import Axes, shapes_of, write_shapes
 
-#: Candidates are filled up to a multiple of so many, by points so far away, meters: a vector loop leaves none over.
+#: Candidates are filled up to a multiple of so many, by points so far away, meters: a vector loop
+#: leaves none over.
 LANES, FAR = 8, 1e150
 
 
@@ -62,8 +64,8 @@ class FixedRadius:
     ) -> None:
         """Compute the columns of these neighborhoods in `out` (m, F) for queries, those of one cell one after the other.
 
-        Each stands for so many `copies` of the user's. `few` (neighborhoods,) is raised by the number with fewer than three
-        points. `bins` are needed where shapes are wanted.
+        Each stands for so many `copies` of the user's. `few` (neighborhoods,) is raised by the
+        number with fewer than three points. `bins` are needed where shapes are wanted.
         """
         shapes = shapes_of(self.chosen, points, seed, bins) if self.shaped else None
         table = self._run(points, shapes, out)
@@ -83,8 +85,9 @@ class FixedRadius:
 def widths_of(radii: np.ndarray, cell: float) -> np.ndarray:
     """Cells a neighborhood of each radius can touch, (radii, 2 R + 1) int64.
 
-    For the rows -R..R of cells round a query's own, the largest column offset that some query in the cell may reach; -1:
-    none. A cell is half open, so one whose nearest border is the radius away holds no member.
+    For the rows -R..R of cells round a query's own, the largest column offset that some query in
+    the cell may reach; -1: none. A cell is half open, so one whose nearest border is the radius
+    away holds no member.
     """
     reach = int(np.ceil(radii.max(initial=0.0) / cell)) + 1
     away = (
@@ -168,7 +171,8 @@ def fixed_block(grid, cell, qx, qy, qz, radii, spherical, widths, shapes, table,
 def move_window(cell_ix, row_iy, row_start, iy, ix, widths, on, window):
     """Fill `window` (k, rows, 2) with the first cell round (iy, ix) in each row, by the radius, and with the end of them.
 
-    Where it goes `on`, from a cell to the left, cells are followed from those that were found there.
+    Where it goes `on`, from a cell to the left, cells are followed from those that were found
+    there.
     """
     reach = widths.shape[1] // 2
     row = np.searchsorted(row_iy, iy - reach)

@@ -180,7 +180,8 @@ def enough2(tree, box, need):
 def gather(tree, box, reach2, copies, limit, stack, cx, cy, cz, ci):
     """Collect the points within sqrt(`reach2`) of `box` into cx, cy, cz, ci; how many, or -1 for more than `limit`.
 
-    Of points that all coincide at most about `copies` are taken, a leaf's worth more where they share leaves with others.
+    Of points that all coincide at most about `copies` are taken, a leaf's worth more where they
+    share leaves with others.
     """
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     x0, y0, z0, x1, y1, z1 = box

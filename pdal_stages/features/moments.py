@@ -11,8 +11,9 @@ from .eigen import bits_of, cbrt_fast, eigen3, entropy_term, from_bits
 from .neighborhoods import LEAST_RADIUS
 from .registry import MOMENT_FEATURES, rows_of
 
-#: Rows of a table of moments about the queries: count, sums, products, lowest and highest height; and, where it is chosen
-#: query by query, the radius (meters) and how far away points matter to the choice.
+#: Rows of a table of moments about the queries: count, sums, products, lowest and highest height;
+#: and, where it is chosen query by query, the radius (meters) and how far away points matter to
+#: the choice.
 N, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ, LOW, HIGH, RADIUS, REACH = range(14)
 MOMENTS, ROWS = 12, 14
 
@@ -20,12 +21,13 @@ MOMENTS, ROWS = 12, 14
 ROW = rows_of(*MOMENT_FEATURES, "NormalX", "NormalY", "NormalZ")
 FEATURES = len(ROW)
 
-#: Queries finished at a time: small enough for the second-level cache. And columns of their scratch: not a power of two,
-#: whose rows would compete for the same cache lines.
+#: Queries finished at a time: small enough for the second-level cache. And columns of their
+#: scratch: not a power of two, whose rows would compete for the same cache lines.
 BATCH = 256
 WIDTH = BATCH + 8
 
-#: A variance below this part of the mean squared distance to the query is rounding: the points coincide.
+#: A variance below this part of the mean squared distance to the query is rounding: the points
+#: coincide.
 COINCIDENT = 1e-13
 
 _MOST = np.int64(2**63 - 1)
@@ -53,7 +55,8 @@ def distance2(dx, dy, dz, spherical):
 def sums_within(px, py, pz, keys, count, qx, qy, qz, spherical, r2, out, j):
     """Moments about (qx, qy, qz) of the first `count` candidates within sqrt(r2) of it, into ``out[:, j]``.
 
-    `spherical` is 1 for a sphere and 0 for a cylinder. The order of the sums follows from `count` alone.
+    `spherical` is 1 for a sphere and 0 for a cylinder. The order of the sums follows from `count`
+    alone.
     """
     n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
     low, high = _MOST, -_MOST
@@ -84,8 +87,8 @@ def sums_within(px, py, pz, keys, count, qx, qy, qz, spherical, r2, out, j):
 def write_eigen_features(made, j, n, l1, l2, l3, nz):
     """Write the features of eigenvalues l1 >= l2 >= l3 of `n` points to column `j` of `made`, rows as of :data:`ROW`.
 
-    `nz` is the height of the unit eigenvector of l3. With fewer than three points, or points that all coincide, features are
-    0 and the surface variation is 1/3 [H17].
+    `nz` is the height of the unit eigenvector of l3. With fewer than three points, or points that
+    all coincide, features are 0 and the surface variation is 1/3 [H17].
     """
     total = l1 + l2 + l3
     real = (n >= 3) & (total > 0.0)
@@ -109,14 +112,16 @@ def write_eigen_features(made, j, n, l1, l2, l3, nz):
 def finish(table, volume, heights, few, copies, columns, out):
     """Write the features made of moments.
 
-    With fewer than three points, or points that all coincide, eigen-features and Verticality are 0 and SurfaceVariation is
-    1/3 [H17]; heights are those of the points there are; with none (queries that are not points of the cloud) 0.
+    With fewer than three points, or points that all coincide, eigen-features and Verticality are 0
+    and SurfaceVariation is 1/3 [H17]; heights are those of the points there are; with none
+    (queries that are not points of the cloud) 0.
 
     Parameters
     ----------
     table : (ROWS, m) float64 array
     volume : float
-        Area of the cylinder's base or volume of the sphere: what Density divides by; 0 where the table holds the radii.
+        Area of the cylinder's base or volume of the sphere: what Density divides by; 0 where the
+        table holds the radii.
     heights : (m,) float64 array
         z of the queries.
     few : (1,) int64 array
@@ -124,8 +129,8 @@ def finish(table, volume, heights, few, copies, columns, out):
     copies : (m,) int64 array
         How many queries each column stands for.
     columns : (up to FEATURES,) int64 array
-        Column of `out` (m, F) float32 for each row of :data:`ROW`; -1: not wanted. The normal is (0, 0, 0) where there is
-        none.
+        Column of `out` (m, F) float32 for each row of :data:`ROW`; -1: not wanted. The normal is
+        (0, 0, 0) where there is none.
     """
     # Of constant shapes: rows known not to overlap let the loops be vectorized.
     made, m = np.empty((FEATURES, WIDTH)), np.empty((7, WIDTH))

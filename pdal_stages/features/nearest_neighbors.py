@@ -1,11 +1,12 @@
 """Neighbors of queries, exact and in one well-defined order: by (squared distance, x, y, z).
 
-Squared distances are those of float64 differences, so the answer is a function of the cloud as a set: neither the order of
-the points, nor the tile, nor which queries are searched together changes it. Points with equal coordinates are
-interchangeable.
+Squared distances are those of float64 differences, so the answer is a function of the cloud as a
+set: neither the order of the points, nor the tile, nor which queries are searched together changes
+it. Points with equal coordinates are interchangeable.
 
-Eight queries that lie together share the candidates within a reach, guessed from the queries before; each sorts those
-within its own. In the plane the squared distance is uniformly distributed, so a counting sort by it fills its bins evenly.
+Eight queries that lie together share the candidates within a reach, guessed from the queries
+before; each sorts those within its own. In the plane the squared distance is uniformly
+distributed, so a counting sort by it fills its bins evenly.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ GROUP = 8
 #: Bins of squared distance; behind them what lies beyond the reach.
 BINS = 64
 
-#: First guess of the squared reach, the least, and by how much the next is larger than what the last needed.
+#: First guess of the squared reach, the least, and by how much the next is larger than what the
+#: last needed.
 FIRST2, LEAST2, MORE = 1.0, 1e-6, 1.2
 
 #: A search for `need` neighbors that meets more than CROWD * need + ROOM candidates looks closer.
@@ -88,7 +90,8 @@ def make_groups(qx, qy, qz):
 def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, near):
     """Candidates of the queries order[lo:hi], or of the first alone where they are too many or lie too far apart.
 
-    At least the points within `within2` (squared meters) are wanted, at least `need` of those within `cap2`.
+    At least the points within `within2` (squared meters) are wanted, at least `need` of those
+    within `cap2`.
 
     Returns
     -------

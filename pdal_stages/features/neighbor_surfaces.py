@@ -1,11 +1,12 @@
 """Features of features: how the points of a neighborhood agree on the surface they lie on.
 
-A point of the cloud gets what its 10 nearest neighbors make of it: the unit normal (eigenvector of l3) and the surface
-variation (e3), 20 bytes a point. A neighborhood is then summed up by the mean |n . n'| of its points' normals with the
-query's own, and by lowest, mean and standard deviation of their surface variations: a roof's points agree, those of a crown
-do not, however flat any one of them may look. So a result reaches as far as the neighbors' neighbors may lie. Without three
-points that do not all coincide there is no normal: it agrees with none, not even its own (0), and the surface variation is
-1/3, as everywhere.
+A point of the cloud gets what its 10 nearest neighbors make of it: the unit normal (eigenvector of
+l3) and the surface variation (e3), 20 bytes a point. A neighborhood is then summed up by the mean
+|n . n'| of its points' normals with the query's own, and by lowest, mean and standard deviation of
+their surface variations: a roof's points agree, those of a crown do not, however flat any one of
+them may look. So a result reaches as far as the neighbors' neighbors may lie. Without three points
+that do not all coincide there is no normal: it agrees with none, not even its own (0), and the
+surface variation is 1/3, as everywhere.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from .moments import FEATURES
 from .moments import ROW as MOMENT_ROW
 from .registry import SURFACE_FEATURES, rows_of
 
-#: Columns of the table of surfaces, float32: unit normal, surface variation, distance to the farthest of the 10 (infinite
-#: where there are fewer).
+#: Columns of the table of surfaces, float32: unit normal, surface variation, distance to the
+#: farthest of the 10 (infinite where there are fewer).
 NX, NY, NZ, VARIATION, FAR = range(5)
 SURFACE = 5
 
@@ -47,8 +48,8 @@ def _write(out, column, value):
 def agreement(surfaces, near, count, own, columns, out):
     """Write features of the first `count` neighbors of a query whose surface is `own`.
 
-    `columns` has the column of `out` for each of :data:`ROW`; -1: not wanted. Returns the distance in meters from the query
-    to the farthest point that the features depend on.
+    `columns` has the column of `out` for each of :data:`ROW`; -1: not wanted. Returns the distance
+    in meters from the query to the farthest point that the features depend on.
     """
     wanted = False
     for row in range(len(columns)):

@@ -1,7 +1,7 @@
 """Neighborhood tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``copt``) and presets, parsed and checked.
 
-One token is used alike in options, dimension suffixes, model files and documents. Sources:
-[B16] Blomley, Jutzi, Weinmann 2016, doi:10.5194/isprsannals-III-3-169-2016; [W18] Weinmann, Blomley,
+One token is used alike in options, dimension suffixes, model files and documents. Sources: [B16]
+Blomley, Jutzi, Weinmann 2016, doi:10.5194/isprsannals-III-3-169-2016; [W18] Weinmann, Blomley,
 Weinmann, Jutzi 2018 (DGPF); [H17] He, Chen, Wang, Liu 2017, ISPRS Archives XLII-2/W7.
 """
 
@@ -28,18 +28,19 @@ PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 KOPT_DEFAULT = (10.0, 100.0)  # k_min, k_max [B16]
 ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in meters [H17]
-#: Kinds that choose a radius: by the lowest eigenentropy, or by the lowest entropy of dimensionality
-#: (Demantke et al. 2011, which [H17] cites).
+#: Kinds that choose a radius: by the lowest eigenentropy, or by the lowest entropy of
+#: dimensionality (Demantke et al. 2011, which [H17] cites).
 BY_RADIUS = ("ropt", "rdim")
 #: Kinds whose size is chosen point by point.
 ADAPTIVE = ("kopt", *BY_RADIUS, "copt")
-#: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with fewer are not
-#: candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t of 0.03 and the counts of its
-#: Table 1 come out (docs/papers.md), with three they do not.
+#: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with
+#: fewer are not candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t
+#: of 0.03 and the counts of its Table 1 come out (docs/papers.md), with three they do not.
 LEAST_MEMBERS = 10
 COPT_REACH = 3.0  # meters: the cap of the scattered branch, the largest radius copt looks at [H17]
 MAX_K = 10_000
-#: Nearest neighbors whose surface a point is given, where neighbors are summed up by their surfaces.
+#: Nearest neighbors whose surface a point is given, where neighbors are summed up by their
+#: surfaces.
 AROUND = 10
 #: Density takes smaller radii as this, meters: copies of one point lie at a distance of 0.
 LEAST_RADIUS = 0.001
@@ -47,7 +48,8 @@ MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # meters
 #: Neighborhoods of one plan: a model file of a few kB must not ask for hours of work.
 MOST = 64
 
-#: Sides of cells of an absolute grid that can be asked for, meters: powers of two, so that corners are exact.
+#: Sides of cells of an absolute grid that can be asked for, meters: powers of two, so that corners
+#: are exact.
 SIDES = tuple(2.0**k for k in range(-3, 7))
 
 _KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "rdim", "copt", *PRESETS)

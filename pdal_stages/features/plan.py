@@ -127,12 +127,14 @@ class FeaturePlan:
         neighborhoods : str or iterable of str
             Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
         feature_set : str or iterable of str
-            Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` .. ``D4``), features
-            (``Linearity``) or features of one neighborhood (``Linearity_c1``). Only what is named is computed; columns
-            come in the order of the registry, neighborhood by neighborhood.
+            Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``,
+            ``D1`` .. ``D4``), features (``Linearity``) or features of one neighborhood
+            (``Linearity_c1``). Only what is named is computed; columns come in the order of the
+            registry, neighborhood by neighborhood.
         dimensions : str or iterable of str
-            Dimensions of the points to use as features besides those that a preset brings. A preset brings
-            its own (``HeightAboveGround``, ``Z``) with the groups ``all`` and ``geometric``.
+            Dimensions of the points to use as features besides those that a preset brings. A
+            preset brings its own (``HeightAboveGround``, ``Z``) with the groups ``all`` and
+            ``geometric``.
 
         Raises
         ------
@@ -212,10 +214,11 @@ class FeaturePlan:
     def halo_m(self) -> float:
         """Meters of surroundings a tile needs for the same result as the whole cloud.
 
-        The largest reach and one cell. ``k50`` and ``kopt`` reach as far as their points lie, which no number
-        bounds; for them at least 15 m are asked for, enough for 100 neighbors down to 0.15 points a square
-        meter; neighbors' surfaces take a second step from there, by 10 more. How many queries had to look farther is
-        counted in ``FeatureEngine.report.beyond_halo``.
+        The largest reach and one cell. ``k50`` and ``kopt`` reach as far as their points lie,
+        which no number bounds; for them at least 15 m are asked for, enough for 100 neighbors down
+        to 0.15 points a square meter; neighbors' surfaces take a second step from there, by 10
+        more. How many queries had to look farther is counted in
+        ``FeatureEngine.report.beyond_halo``.
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
         reach = max(reach, return_features.reach(self.dimensions))
@@ -281,7 +284,8 @@ def _features_of(neighborhoods: Sequence[Neighborhood]) -> dict[str, tuple[Neigh
 def _expand(neighborhoods: Sequence[Neighborhood], words: Sequence[str]) -> tuple[str, ...]:
     """Return the full names of the features that words name, in the order of the columns.
 
-    Words are groups, features, or features of one neighborhood. OptionError where no neighborhood has one of these.
+    Words are groups, features, or features of one neighborhood. OptionError where no neighborhood
+    has one of these.
     """
     known = _features_of(neighborhoods)
     wanted = {name for word in words for name in GROUPS.get(word, (word,))}

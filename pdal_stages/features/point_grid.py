@@ -2,16 +2,18 @@
 
 The grid: a cloud sorted once, by cell and then by coordinates, and a sparse table of its cells.
 
-Cells are anchored to absolute coordinates (``floor(x / cell)``) and their size follows from the neighborhoods
-alone, never from the cloud, so every tile of a cloud sees the same cells with the same points in the same
-order. That order is what makes sums the same to the last bit however the points were stored.
+Cells are anchored to absolute coordinates (``floor(x / cell)``) and their size follows from the
+neighborhoods alone, never from the cloud, so every tile of a cloud sees the same cells with the
+same points in the same order. That order is what makes sums the same to the last bit however the
+points were stored.
 
 Only occupied cells are kept, so one stray point a million kilometers away costs one cell.
 
-The tree: balanced, for searches whose cost does not depend on how points lie: facades, strays, copies. Every node halves its
-points along the longest side of their bounding box. Only a permutation (4 bytes a point) and the nodes' boxes (about 6 bytes
-a point) are stored. A box is skipped only if the distance computed to it is larger than the reach, and computed distances
-are monotone in the coordinates: which points are gathered never depends on rounding.
+The tree: balanced, for searches whose cost does not depend on how points lie: facades, strays,
+copies. Every node halves its points along the longest side of their bounding box. Only a
+permutation (4 bytes a point) and the nodes' boxes (about 6 bytes a point) are stored. A box is
+skipped only if the distance computed to it is larger than the reach, and computed distances are
+monotone in the coordinates: which points are gathered never depends on rounding.
 """
 
 from __future__ import annotations
@@ -36,11 +38,14 @@ class CellGrid:
 
     #: Edge of a cell in meters, a power of two (so that cell corners are exact).
     cell: float
-    #: (n,) int32 or int64: ``order[i]`` is the index, in the cloud as it was given, of the i-th sorted point.
+    #: (n,) int32 or int64: ``order[i]`` is the index, in the cloud as it was given, of the i-th
+    #: sorted point.
     order: np.ndarray
-    #: (3, n + SPARE): sorted coordinates; kernels that copy whole vectors may read (and ignore) what lies behind the last.
+    #: (3, n + SPARE): sorted coordinates; kernels that copy whole vectors may read (and ignore)
+    #: what lies behind the last.
     xyz: np.ndarray
-    #: Column number of each occupied cell (m,) and its first point (m + 1,); cells ascend by row, then column.
+    #: Column number of each occupied cell (m,) and its first point (m + 1,); cells ascend by row,
+    #: then column.
     cell_ix: np.ndarray
     cell_start: np.ndarray
     #: Row number of each occupied row (r,) and its first cell (r + 1,).
@@ -79,8 +84,9 @@ class CellGrid:
 def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
     """`xyz` as an (n, 3) float64 array, or a StageError that says what is wrong with it.
 
-    No copy is made of an array that already is one. NaN, infinite and absurdly large (beyond 1e12 m)
-    coordinates are refused and counted, and so is float32 too coarse for the size of its numbers.
+    No copy is made of an array that already is one. NaN, infinite and absurdly large (beyond 1e12
+    m) coordinates are refused and counted, and so is float32 too coarse for the size of its
+    numbers.
     """
     try:
         array = np.asarray(xyz)

@@ -1,7 +1,8 @@
 """The registry of features: names, groups, units and definitions, in the order of the columns.
 
-A new eigen-feature is one entry here and one line in ``moments.write_eigen_features``. Columns, groups, kernel rows and the
-table of docs/features.md follow. Model files name their features one by one, so none of them needs to be trained again.
+A new eigen-feature is one entry here and one line in ``moments.write_eigen_features``. Columns,
+groups, kernel rows and the table of docs/features.md follow. Model files name their features one
+by one, so none of them needs to be trained again.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Any
 
 from .neighborhoods import ADAPTIVE
 
-#: Raise it when values of existing features change: models that were trained with another version then warn.
+#: Raise it when values of existing features change: models that were trained with another version
+#: then warn.
 ALGORITHM_VERSION = 1
 #: Bins of a shape distribution's histogram.
 SHAPE_BINS = 10
@@ -41,8 +43,8 @@ SHAPES = {
     "D4": "cube root of the volume of four pulled points",
 }
 
-#: Every feature, in the order of the columns. e1 >= e2 >= e3 are the eigenvalues l1, l2, l3 divided by their sum, n is the
-#: unit eigenvector of l3.
+#: Every feature, in the order of the columns. e1 >= e2 >= e3 are the eigenvalues l1, l2, l3
+#: divided by their sum, n is the unit eigenvector of l3.
 FEATURES = (
     Feature("Linearity", "covariance", "1", "(e1 - e2) / e1"),
     Feature("Planarity", "covariance", "1", "(e2 - e3) / e1"),
@@ -84,7 +86,8 @@ MOMENT_FEATURES = _names(*_OF_MOMENTS)
 SHAPE_FEATURES = _names("shapes")
 SURFACE_FEATURES = _names("surfaces")
 
-#: Words for several features at once. "all" is what the papers have: neither relative features nor surfaces.
+#: Words for several features at once. "all" is what the papers have: neither relative features nor
+#: surfaces.
 GROUPS: dict[str, tuple[str, ...]] = {
     "all": _names("covariance", "geometric", "shapes"),
     **{group: _names(group) for group in ("covariance", "geometric", "shapes", "surfaces")},

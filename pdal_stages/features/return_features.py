@@ -1,9 +1,10 @@
 """What return numbers say of a point and of its surroundings: how often pulses go through.
 
-A pulse that meets a roof gives one return, one that meets a tree several. Two flags say so of a point: it is one of
-several returns (`MultipleReturn`), or not the last of its pulse (`EarlierReturn`). Their means over cells of an
-absolute grid and those around them say so of its surroundings: ``MultipleReturn_box2`` over 3 x 3 x 3 cells of 2 m,
-``MultipleReturn_column2`` over 3 x 3 columns of any height. All are 0 where a cloud has no return numbers.
+A pulse that meets a roof gives one return, one that meets a tree several. Two flags say so of a
+point: it is one of several returns (`MultipleReturn`), or not the last of its pulse
+(`EarlierReturn`). Their means over cells of an absolute grid and those around them say so of its
+surroundings: ``MultipleReturn_box2`` over 3 x 3 x 3 cells of 2 m, ``MultipleReturn_column2`` over
+3 x 3 columns of any height. All are 0 where a cloud has no return numbers.
 """
 
 from __future__ import annotations
@@ -78,7 +79,8 @@ def return_features(
 ) -> dict[str, npt.NDArray[Any]]:
     """Those of `names` that are return features, for every point of a cloud: (n,) each, 0 to 1, whole numbers or float32.
 
-    Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all is 0.
+    Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all
+    is 0.
     """
     wanted = {name: one for name in names if (one := parse(name)) is not None}
     if not wanted:

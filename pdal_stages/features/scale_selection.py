@@ -1,8 +1,9 @@
 """The best of nested neighborhoods: the one with the lowest eigenentropy [B16 eq. 1-2].
 
-It is found in two steps. A vectorized closed form estimates all entropies to 1e-7; those within ``MARGIN`` of the lowest are
-computed again by the exact method of the features. Entropies that then lie within ``TIE`` of each other count as equal, and
-the smallest neighborhood wins: in a perfect plane or line rounding noise would decide otherwise.
+It is found in two steps. A vectorized closed form estimates all entropies to 1e-7; those within
+``MARGIN`` of the lowest are computed again by the exact method of the features. Entropies that
+then lie within ``TIE`` of each other count as equal, and the smallest neighborhood wins: in a
+perfect plane or line rounding noise would decide otherwise.
 """
 
 from __future__ import annotations
@@ -67,9 +68,9 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
 
     ``NEVER`` where the trace is not above `noise`.
 
-    With unit trace, the eigenvalues are 1/3 + 2 p cos(phi + 2 pi i / 3), cos(3 phi) = r. For r >= 0 the
-    squared sine of phi is (1 - r) times a smooth function of r, here a polynomial of degree 8 (fitted at
-    Chebyshev nodes, error 7e-10); r < 0 is its mirror image.
+    With unit trace, the eigenvalues are 1/3 + 2 p cos(phi + 2 pi i / 3), cos(3 phi) = r. For r >=
+    0 the squared sine of phi is (1 - r) times a smooth function of r, here a polynomial of degree
+    8 (fitted at Chebyshev nodes, error 7e-10); r < 0 is its mirror image.
     """
     trace = xx + yy + zz
     some = trace > noise
@@ -139,7 +140,8 @@ def lowest_entropy(s, first, last, least_members):
     Parameters
     ----------
     s : (MOMENTS + 1, candidates) float64 array
-        Moments of the candidates about the query, in ascending size; n > 0. The last row is scratch.
+        Moments of the candidates about the query, in ascending size; n > 0. The last row is
+        scratch.
     least_members : int
         Members a candidate needs.
     """
@@ -182,7 +184,8 @@ def lowest_dimensionality(s, first, last, least_members):
     """Return the candidate with the lowest entropy of dimensionality; see :func:`lowest_entropy`.
 
     That is the entropy of (s1 - s2, s2 - s3, s3) / s1, where s are the roots of the eigenvalues
-    (Demantke et al. 2011): it is lowest where a neighborhood is clearly a line, a plane or a volume.
+    (Demantke et al. 2011): it is lowest where a neighborhood is clearly a line, a plane or a
+    volume.
     """
     best, least = last - 1, NEVER
     for j in range(first, last):

@@ -22,18 +22,20 @@ _CURE = "Fit the thresholds again, or take them from the model file as it was wr
 class ShapeBins:
     """Bins of A3 (radians) and D1, D2, D3, D4 (meters) for each neighborhood.
 
-    Bin i holds the values with ``threshold[i - 1] < value <= threshold[i]``; the first and the last bin are
-    open.
+    Bin i holds the values with ``threshold[i - 1] < value <= threshold[i]``; the first and the
+    last bin are open.
 
     Parameters
     ----------
     thresholds : mapping of str to (5, 9) array
-        Neighborhood token -> ascending inner thresholds of A3, D1, D2, D3, D4, in radians and meters.
+        Neighborhood token -> ascending inner thresholds of A3, D1, D2, D3, D4, in radians and
+        meters.
 
     Raises
     ------
     OptionError
-        Where thresholds are not 5 x 9 finite, ascending numbers, angles outside 0..pi or lengths below 0.
+        Where thresholds are not 5 x 9 finite, ascending numbers, angles outside 0..pi or lengths
+        below 0.
     """
 
     def __init__(self, thresholds: Mapping[str, Any]) -> None:
@@ -45,10 +47,11 @@ class ShapeBins:
     def fit(cls, values: Mapping[str, np.ndarray]) -> ShapeBins:
         """Thresholds at the 10 %, 20 %, ... 90 % quantiles of sample values.
 
-        A threshold is one of the values, so values that often repeat (areas of 0 on a line) make equal
-        thresholds and empty bins, and nothing else does. `values` are the pulls (m, 5, 255) of m sample neighborhoods by
-        neighborhood token, in the comparable form of :func:`shape_distributions.shape_values`. NaN
-        (neighborhoods without points) is left out; where nothing is left, the thresholds are 0.
+        A threshold is one of the values, so values that often repeat (areas of 0 on a line) make
+        equal thresholds and empty bins, and nothing else does. `values` are the pulls (m, 5, 255)
+        of m sample neighborhoods by neighborhood token, in the comparable form of
+        :func:`shape_distributions.shape_values`. NaN (neighborhoods without points) is left out;
+        where nothing is left, the thresholds are 0.
         """
         result = {}
         for token, sample in values.items():

@@ -10,17 +10,18 @@ D3   square root of the area of the triangle a b c       meters
 D4   cube root of the volume of the tetrahedron a b c d  meters
 ==== =================================================== ===================
 
-Each metric's distribution is what separate pulls would give; only the metrics of one neighborhood share
-their chance, for a third of the memory traffic. Where members run out (n < 4) the first drawn ones take the
-empty places: c, d = a, b for two members, d = a for three, so areas or volumes are 0, as they are. The angle
-is 0 where b or c coincides with a.
+Each metric's distribution is what separate pulls would give; only the metrics of one neighborhood
+share their chance, for a third of the memory traffic. Where members run out (n < 4) the first
+drawn ones take the empty places: c, d = a, b for two members, d = a for three, so areas or volumes
+are 0, as they are. The angle is 0 where b or c coincides with a.
 
 **No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's float64
-coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the same bits
-for any order of points, tile or number of threads.
+coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the
+same bits for any order of points, tile or number of threads.
 
 **No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 4 area^2 (D3: 4 t^4),
-as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3); all ascend with the metric.
+as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3); all ascend with the
+metric.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.hashing import GOLDEN, finalise
+from ..base.hashing import GOLDEN, finalize
 from ..base.jit import device, njit
 from .plan import Columns, columns_of
 from .registry import SHAPE_FEATURES
@@ -48,7 +49,8 @@ ROOM = 256
 
 BINS = 10
 
-#: Sample neighborhoods to which bins are fitted [B16 3.2.2], and points hashed at a time to choose them.
+#: Sample neighborhoods to which bins are fitted [B16 3.2.2], and points hashed at a time to choose
+#: them.
 SAMPLES, _TOGETHER = 500, 1_000_000
 
 #: Product of two squared lengths (m^4) below which an angle is not defined, and 0.
@@ -119,9 +121,9 @@ def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: s
         int.from_bytes(hashlib.sha256(f"{int(seed)}:{token}".encode()).digest()[:8], "little")
     )
     bits = [(np.ascontiguousarray(v, dtype=np.float64) + 0.0).view(np.uint64) for v in (x, y, z)]
-    h = finalise(h + bits[0])
-    h = finalise(h + GOLDEN + bits[1])
-    return finalise(h + GOLDEN + bits[2])
+    h = finalize(h + bits[0])
+    h = finalize(h + GOLDEN + bits[1])
+    return finalize(h + GOLDEN + bits[2])
 
 
 def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -293,7 +295,8 @@ def shape_counts(record, n, gx, gy, gz, seed, thresholds, work, out):
     Parameters
     ----------
     record : ndarray of float32, shape (at least n, 4)
-        Offsets x, y, z of the members from the query, in canonical order; the fourth column is not used.
+        Offsets x, y, z of the members from the query, in canonical order; the fourth column is not
+        used.
     n : int
         Members, at least 1.
     gx, gy, gz : float32

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..base.grid import compact_keys
-from ..base.hashing import hash_of
+from ..base.hashing import hash_rows
 from ..base.jit import njit
 
 #: Smallest and largest side of voxels, meters.
@@ -31,7 +31,8 @@ class Representatives:
 
     #: The representatives' rows in the cloud, ascending.
     rows: npt.NDArray[Any]
-    #: Those of them, by their place in `rows`, ascending, that stand for a point that was asked for; None: all.
+    #: Those of them, by their place in `rows`, ascending, that stand for a point that was asked
+    #: for; None: all.
     wanted: npt.NDArray[np.int64] | None
     _members: npt.NDArray[Any]  # points asked for, by representative
     _start: npt.NDArray[Any]
@@ -56,10 +57,10 @@ def represent(
 ) -> Representatives | None:
     """Representatives of a cloud's points, or None where each stands for itself.
 
-    `side` is a voxel's, in meters as `xyz`; 0 for none. `values` (n,) are what else is known of the points,
-    and decide between points of the same coordinates. `rows` (m,) are the points asked for; the others are represented
-    too, but are not listed. `there` (k,) are the points that are there at all, `rows` among them (default: all n).
-    Both ascend.
+    `side` is a voxel's, in meters as `xyz`; 0 for none. `values` (n,) are what else is known of
+    the points, and decide between points of the same coordinates. `rows` (m,) are the points asked
+    for; the others are represented too, but are not listed. `there` (k,) are the points that are
+    there at all, `rows` among them (default: all n). Both ascend.
     """
     check_side(side)
     small = np.int32 if len(xyz) < 2**31 else np.int64
@@ -101,7 +102,7 @@ def _one_each(
     else:
         order = there[np.argsort(keys[there])]
     by = np.arange(len(xyz), dtype=np.int32 if len(xyz) < 2**31 else np.int64)
-    single = choose_one_each(order, keys[order], hash_of([*xyz.T, *values], 0), by)
+    single = choose_one_each(order, keys[order], hash_rows([*xyz.T, *values], 0), by)
     return None if single else by
 
 

@@ -71,7 +71,7 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
             taken = stage_type(type_name).from_pipeline(stage, stages[:index])
             expanded = expand_stage({**taken, **stage}, index, len(out.stages))
         except StageError as error:
-            raise error.within(places[index]) from None
+            raise error.prefixed(places[index]) from None
         out.ours.append(expanded)
         out.stages.append(expanded.plain)
     _follow_preparations(out)

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 from ..base.errors import PipelineError, StageError, how_to_add
-from ..base.jit import kept_kernels
+from ..base.jit import count_cached_kernels
 from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..base.version import __version__
@@ -150,7 +150,7 @@ def _machine() -> Iterator[Finding]:
     free = free_memory()
     cure = "" if free >= _LITTLE_MEMORY else "Work in tiles (--tile), or close other programs"
     yield Finding("free memory", f"{free / 2**30:.1f} GB", cure, needed=False)
-    count = kept_kernels()
+    count = count_cached_kernels()
     cure = (
         "" if count else "pdal-stages warmup, once; otherwise the first job waits for the compiler"
     )

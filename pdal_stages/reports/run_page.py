@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.asprs import class_name
-from ..base.messages import counted, duration
+from ..base.messages import count_of, duration
 from .page import render
 
 #: Most rows of the table of times.
@@ -39,7 +39,7 @@ def run_page(run: Mapping[str, Any]) -> str:
     return render(
         "run.html",
         title="Run in tiles",
-        subtitle=f"{pipeline}{counted(len(run['tiles']), 'tile')} of {run['tile']:g}",
+        subtitle=f"{pipeline}{count_of(len(run['tiles']), 'tile')} of {run['tile']:g}",
         run=run,
         figures=_figures(run),
         what=_what(run),
@@ -68,7 +68,7 @@ def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     size, unit = (f"{points:,}", "") if points < 10_000_000 else (f"{points / 1e6:,.1f}", "million")
     out = [("Tiles", tiles, "", rest), ("Points", size, unit, "; ".join(details))]
     if "seconds" in run:
-        out.append(("Time", duration(run["seconds"]), "", counted(run["workers"], "worker")))
+        out.append(("Time", duration(run["seconds"]), "", count_of(run["workers"], "worker")))
         out.append(("Speed", f"{run['points_per_second']:,.0f}", "points/s", ""))
         out.append(("Most memory of a worker", f"{run['peak_mb_of_a_worker']:,.0f}", "MB", ""))
     return out

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.files import HTML, JSON, Output, check_outputs, whole_files
-from ..base.messages import counted, duration, one_line
+from ..base.messages import count_of, duration, one_line
 from ..base.vector import vector
 from ..classifier.model_file import STANDARD, find
 from ..pipeline.inputs_outputs import input_files
@@ -105,7 +105,7 @@ def review_page(review: Review) -> str:
     return render(
         "review.html",
         title="Where to look",
-        subtitle=counted(len(found["tiles"]), "file"),
+        subtitle=count_of(len(found["tiles"]), "file"),
         figures=figures,
         tiles=found["tiles"][:_ROWS],
         hidden=max(0, len(found["tiles"]) - _ROWS),

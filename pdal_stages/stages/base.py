@@ -115,7 +115,7 @@ class Stage(ABC):
             for output in self.outputs():
                 check_writable(output.path, output.what, output.kind)
         except StageError as error:
-            raise error.within(self.place) from None
+            raise error.prefixed(self.place) from None
 
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
-from ..base.hashing import hash_of
+from ..base.hashing import hash_rows
 from ..base.report import Report
 from ..classifier.input_dimensions import CHECKED
 from .points import class_counts
@@ -71,7 +71,7 @@ class CheckedChoice:
         out = looked.wanted.copy()
         for code, share in self._shares.items():
             mine = np.flatnonzero(looked.sure & (looked.codes == code))
-            out[mine[hash_of(xyz[mine].T, self._seed) / 2.0**64 < share]] = True
+            out[mine[hash_rows(xyz[mine].T, self._seed) / 2.0**64 < share]] = True
         return out
 
     def report_to(self, report: Report) -> None:

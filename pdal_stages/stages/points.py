@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.memory import give_back
+from ..base.memory import release_pages
 from ..base.report import Report
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .selection import Expression, Selection
@@ -151,7 +151,7 @@ class Points:
         # PDAL makes these arrays for this one call, and frees them after it.
         for name in self.lent_by_pdal - kept:
             if lent[name] is not self.own:
-                give_back(lent[name])
+                release_pages(lent[name])
 
     def take_xyz(self) -> NDArray[np.float64]:
         """:attr:`xyz`, not kept here: who takes it may let go of it."""

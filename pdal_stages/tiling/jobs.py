@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..base.messages import counted
+from ..base.messages import count_of
 from ..base.version import __version__
 from ..pipeline.run import LEFT_ALONE
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
@@ -106,7 +106,7 @@ class TiledRun:
         if not tiles and not outputs:
             return ""
         return (
-            f" ({counted(tiles, 'tile')} and {counted(outputs, 'output')} depend on it and are not made. Remove it from "
+            f" ({count_of(tiles, 'tile')} and {count_of(outputs, 'output')} depend on it and are not made. Remove it from "
             "the inputs to make them without it)"
         )
 
@@ -181,10 +181,12 @@ def messages_on_folders(
     }
     told = []
     if (replaced := names & there) and not resumed:
-        told.append(f"{counted(len(replaced), 'existing output file')} replaced: {_some(replaced)}")
+        told.append(
+            f"{count_of(len(replaced), 'existing output file')} replaced: {_some(replaced)}"
+        )
     if others := there - known:
         told.append(
-            f"{counted(len(others), 'LAS or LAZ file')} in the folder of the outputs not written by this run, left as "
+            f"{count_of(len(others), 'LAS or LAZ file')} in the folder of the outputs not written by this run, left as "
             f"before: {_some(others)}"
         )
     return told
@@ -209,7 +211,7 @@ def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> 
     # Messages of one stage that several stages report, too.
     for text in [text for text in found if text.partition(": ")[2] in found]:
         del found[text]
-    told = [f"{text} ({counted(n, 'tile')})" for text, n in found.most_common(_MOST_MESSAGES)]
+    told = [f"{text} ({count_of(n, 'tile')})" for text, n in found.most_common(_MOST_MESSAGES)]
     if len(found) > _MOST_MESSAGES:
         told.append(f"and {len(found) - _MOST_MESSAGES} more; see --report")
     if short := [job.name for job in done if job.record.get("short")]:

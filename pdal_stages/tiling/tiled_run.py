@@ -15,7 +15,7 @@ from typing import Any
 from ..base import las_check
 from ..base.errors import DependencyError, StageError
 from ..base.files import sweep
-from ..base.jit import kept_kernels
+from ..base.jit import count_cached_kernels
 from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
@@ -118,7 +118,7 @@ def run_plan(
         raise StageError(
             "the folder of the output does not exist", found=str(folder), cure="Create it first"
         )
-    if plan.makes and progress is not False and not chosen.scheduler and not kept_kernels():
+    if plan.makes and progress is not False and not chosen.scheduler and not count_cached_kernels():
         print_messages("compiling for this processor first, once: it takes a minute or two")
     folders = {folder, *(Path(path).parent for paths in survey.outputs for path in paths)}
     with Store(folder) as store:
