@@ -93,8 +93,7 @@ def test_averages_equal_a_hand_computation():
     xyz, _, dimensions = scene(1500, 20.0)
     net = net_with()
     request = PredictRequest(xyz, dimensions, variance=True)
-    ((_, made),) = net.predict(request, lambda p: {"mean": p})
-    found, variance = made["mean"], made["variance"]
+    ((_, mean, variance),) = net.predict(request)
     columns = scaled(xyz, dimensions, net.inputs, net.mean, net.scale)
     np.testing.assert_allclose(
         columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5
@@ -108,7 +107,7 @@ def test_averages_equal_a_hand_computation():
             each[row].append(p)
     assert [len(part) for part in each] == coverage(circles).tolist()
     for i, part in enumerate(each):
-        np.testing.assert_allclose(found[i], np.mean(part, axis=0), rtol=1e-9)
+        np.testing.assert_allclose(mean[i], np.mean(part, axis=0), rtol=1e-9)
         np.testing.assert_allclose(variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
     assert request.report.figures["batches"] == len(circles)
     assert request.report.figures["batches_per_point"]["least"] == coverage(circles).min()
@@ -166,11 +165,7 @@ def test_absurd_weights_give_an_error_not_nan():
     weights = {name: array * np.float32(1e30) for name, array in net.weights.items()}
     xyz, _, dimensions = scene(300, 8.0)
     with np.errstate(all="ignore"), pytest.raises(ModelError, match="not numbers"):
-        next(
-            dataclasses.replace(net, weights=weights).predict(
-                PredictRequest(xyz, dimensions), lambda p: p
-            )
-        )
+        next(dataclasses.replace(net, weights=weights).predict(PredictRequest(xyz, dimensions)))
 
 
 # ---- files ------------------------------------------------------------------------------------------------

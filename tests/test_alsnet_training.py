@@ -170,10 +170,10 @@ def test_a_device_for_applying(device):
     request = PredictRequest(xyz, values, device=device)
     if device == "cuda":
         with pytest.raises(DependencyError, match="no CUDA device"):
-            list(net.predict(request, lambda p: p))
+            list(net.predict(request))
         return
-    ((_, found),) = net.predict(request, lambda p: p)
-    ((_, expected),) = net.predict(PredictRequest(xyz, values), lambda p: p)
+    ((_, found, _),) = net.predict(request)
+    ((_, expected, _),) = net.predict(PredictRequest(xyz, values))
     assert np.array_equal(found, expected)
 
 

@@ -9,7 +9,7 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import auto_context
 from pdal_stages.classifier.auto_context import PassRun, WeightedPass
 from pdal_stages.classifier.context_features import OWN, WHOLE, Context, around, count_shares
-from pdal_stages.classifier.interface import PredictRequest
+from pdal_stages.classifier.interface import Block, PredictRequest
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
@@ -57,20 +57,20 @@ def test_equals_the_reference(seed, n, kind):
     context = Context(TOKENS)
     rows = np.flatnonzero(np.random.default_rng(seed).random(n) < 0.5)
     assert np.array_equal(
-        context.columns_of(xyz, shares, 2)(rows), reference(xyz, shares, rows, context)
+        context.cell_means(xyz, shares, 2).columns(rows), reference(xyz, shares, rows, context)
     )
 
 
-class Said:
-    """A first pass that hands over probabilities in blocks in any order; or a last one that reads context alone."""
+class FirstPass:
+    """A first pass that yields probabilities in blocks in any order."""
 
-    features = None
+    features = context = None
 
-    def __init__(self, context=None, blocks=()):
-        self.context, self.blocks = context, blocks
+    def __init__(self, blocks):
+        self.blocks = blocks
 
-    def predict(self, request, finish):
-        return ((rows, finish(p)) for rows, p in self.blocks)
+    def predict(self, request):
+        return iter(self.blocks)
 
 
 @settings(max_examples=10, deadline=None)
@@ -82,15 +82,13 @@ def test_band_by_band_is_the_same(seed, kind, size):
     wanted = None if seed % 3 == 0 else np.flatnonzero(random.random(300) < 0.3)
     coming = around(xyz, wanted, context)
     order = random.permutation(300 if coming is None else coming)
-    blocks = [(part, shares[part] / WHOLE) for part in np.array_split(order, 5)]
+    blocks = [Block(part, shares[part] / WHOLE) for part in np.array_split(order, 5)]
     request = PredictRequest(xyz, {}, wanted, 2)
     got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto_context, "BAND", size)
-        run = PassRun(
-            [WeightedPass(Said(blocks=blocks), 3), WeightedPass(Said(context), 3)], request
-        )
-        for rows, columns in run.blocks(lambda columns, rows: columns):
+        run = PassRun([WeightedPass(FirstPass(blocks), 3)], request, context)
+        for rows, columns in run.blocks():
             seen[rows] += 1
             got[rows] = columns
     rows = np.arange(300) if wanted is None else wanted
@@ -109,12 +107,13 @@ def test_what_is_around_is_all_that_matters(seed, kind):
     near = np.arange(400) if near is None else near
     expected = reference(xyz, shares, rows, context)
     assert np.array_equal(
-        context.columns_of(xyz[near], shares[near])(np.searchsorted(near, rows)), expected
+        context.cell_means(xyz[near], shares[near]).columns(np.searchsorted(near, rows)), expected
     )
     far = np.abs(xyz[:, None, :2] - xyz[None, rows, :2]).max(axis=2).min(axis=1) >= context.reach
     alone = np.flatnonzero(~far)  # a tile with that halo
     assert np.array_equal(
-        context.columns_of(xyz[alone], shares[alone])(np.searchsorted(alone, rows)), expected
+        context.cell_means(xyz[alone], shares[alone]).columns(np.searchsorted(alone, rows)),
+        expected,
     )
 
 

@@ -10,6 +10,7 @@ from test_classifier_training import SMALL, scene
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import auto_context, model_file, train_forest
+from pdal_stages.classifier.interface import Block
 from pdal_stages.classifier.training_options import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 
@@ -187,7 +188,7 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
 
 def test_a_pass_may_come_from_elsewhere(two, other):
     """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.classifier.auto_context import WeightedPass, predict
+    from pdal_stages.classifier.auto_context import WeightedPass, classify
 
     first = two.passes[0]
 
@@ -195,13 +196,13 @@ def test_a_pass_may_come_from_elsewhere(two, other):
         plan = first.plan
         features = context = None
 
-        def predict(self, request, finish):
+        def predict(self, request):
             p = np.zeros((len(request.xyz), 3))
-            for found, result in predict([WeightedPass(first, 3)], request, lambda p: p):
-                p[found] = result
-            rows = slice(None) if request.rows is None else request.rows
+            for block in classify([WeightedPass(first, 3)], request):
+                p[block.rows] = block.probabilities
+            rows = np.arange(len(p)) if request.rows is None else request.rows
             request.report.figures["batches"] = 1
-            yield rows, finish(p[rows])
+            yield Block(rows, p[rows])
 
     xyz, _, dimensions = other
     model = type(two)((Whole(), two.passes[1]), two.classes, two.info)

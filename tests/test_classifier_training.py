@@ -6,7 +6,7 @@ import pytest
 from pdal_stages import Model, TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError
 from pdal_stages.classifier import train_forest
-from pdal_stages.classifier.interface import Prediction
+from pdal_stages.classifier.prediction import Prediction
 
 SMALL = {
     "neighborhoods": "c1,s2,kopt(5,20)",

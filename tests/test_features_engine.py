@@ -241,31 +241,19 @@ def test_blocks_cover_every_query_once(cloud, whole):
     assert np.array_equal(np.sort(rows), np.arange(50))  # coordinates: rows of the queries
 
 
-def test_apply_runs_in_the_workers(cloud):
-    main = threading.get_ident()
+def test_blocks_are_computed_in_the_workers(cloud):
+    large = np.vstack([cloud + np.array([30.0 * i, 0, 0]) for i in range(20)])
+    run = FeatureEngine(large, FeaturePlan.parse("c1,c3,s3", MOMENTS)).run(threads=2, memory_mb=16)
+    computed = run.compute
     threads = set()
 
-    def mean(values, rows):
+    def compute(block):
         threads.add(threading.get_ident())
-        assert len(values) == len(rows)
-        return values.mean(axis=1)
+        return computed(block)
 
-    large = np.vstack([cloud + np.array([30.0 * i, 0, 0]) for i in range(20)])
-    engine = FeatureEngine(large, FeaturePlan.parse("c1,c3,s3", MOMENTS))
-    parts = list(engine.blocks(apply=mean, threads=2, memory_mb=16))
-    assert len(parts) > 1 and main not in threads
-    assert sum(len(rows) for rows, _ in parts) == len(large)
-    assert all(result.shape == rows.shape for rows, result in parts)
-
-
-def test_an_error_in_apply_stops_everything(cloud):
-    engine = FeatureEngine(cloud, FeaturePlan.parse("c1", "Density"))
-
-    def fail(values, rows):
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        list(engine.blocks(apply=fail, threads=2))
+    run.compute = compute
+    assert sum(len(block.rows) for block in run.computed()) == len(large)
+    assert len(run.ranges) > 1 and threading.get_ident() not in threads
 
 
 def test_a_reader_may_stop_early(cloud):

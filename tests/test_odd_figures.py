@@ -7,7 +7,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.classifier.interface import PredictionOptions
+from pdal_stages.classifier.prediction import PredictionOptions
 
 
 def test_figures_that_mean_nothing():

@@ -17,10 +17,10 @@ import pdal_stages as ps
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError, StageError
 from pdal_stages.classifier import model_file, train_forest
-from pdal_stages.classifier.auto_context import predict
+from pdal_stages.classifier.auto_context import classify
 from pdal_stages.classifier.context_features import count_shares
-from pdal_stages.classifier.feature_forest import EVEN, Blend, trust, weighed
-from pdal_stages.classifier.interface import PredictRequest
+from pdal_stages.classifier.interface import PredictRequest, weigh
+from pdal_stages.classifier.refinement import EVEN, Blend, trust
 from pdal_stages.classifier.training_clouds import label_classes
 from pdal_stages.features import FeatureEngine
 from pdal_stages.features.cell_means import WHOLE
@@ -290,10 +290,8 @@ def of_the_base(base, xyz, dimensions):
     """What a base hands on of every point of a cloud without voxels, as it is counted."""
     out = np.empty((len(xyz), len(base.classes)), np.uint16)
     request = PredictRequest(xyz, dimensions)
-    for rows, shares in predict(
-        base.weighted_passes, request, lambda p: count_shares(weighed(p, base.factors))
-    ):
-        out[rows] = shares
+    for block in classify(base.weighted_passes, request):
+        out[block.rows] = count_shares(block.probabilities)
     return out
 
 
@@ -321,7 +319,7 @@ def test_two_passes_equal_the_passes_by_hand(base):
     shares = count_shares(by_hand(own, grown, first.blend.before, labeled, first.blend.trusted))
     rows = np.arange(0, len(xyz), 9)
     columns = reference(xyz, shares, rows, second.context)
-    grown = weighed(
+    grown = weigh(
         second.forest.predict_proba(np.hstack([values[rows], columns])),
         np.array(second.blend.factors),
     )

@@ -21,9 +21,10 @@ from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud
 from pdal_stages.classifier.context_features import Context, count_shares
-from pdal_stages.classifier.feature_forest import CloudFeatures, FeatureForest, Features
+from pdal_stages.classifier.feature_forest import FeatureForest
+from pdal_stages.classifier.fitted_features import CloudFeatures, Features
 from pdal_stages.classifier.interface import PredictRequest
-from pdal_stages.classifier.model import load_model
+from pdal_stages.classifier.load_model import load_model
 from pdal_stages.classifier.random_forest import Forest, grow_forest
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import FOLD_TREES, feature_plan
@@ -47,9 +48,8 @@ def compute_features(cloud: TrainingCloud, folder: Path) -> npt.NDArray[np.float
     if not path.exists():
         out = np.empty((len(cloud.xyz), len(FEATURES.plan.names)), np.float32)
         request = PredictRequest(cloud.xyz, cloud.dimensions)
-        blocks = CloudFeatures(FEATURES, request).blocks(None, lambda values, rows: values)
-        for rows, values in blocks:
-            out[rows] = values
+        for block in CloudFeatures(FEATURES, request).blocks(None):
+            out[block.rows] = block.values
         np.save(path, out)
     return np.load(path, mmap_mode="r")
 
@@ -129,7 +129,7 @@ class GroupsLeftOut:
         self, number: int, shares: npt.NDArray[np.uint16], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float32]:
         """Return the context (m, columns) of some of a cloud's points."""
-        return CONTEXT.columns_of(self.clouds[number].xyz, shares)(rows)
+        return CONTEXT.cell_means(self.clouds[number].xyz, shares).columns(rows)
 
     def _training(self, without: str) -> dict[str, Any]:
         """Return what a model file stores about its training."""

@@ -14,7 +14,7 @@ from ..base import checks
 from ..base.errors import ModelError, StageError
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.input_dimensions import add_return_features, take_dimensions
-from ..classifier.interface import ArrayRule, Column, InputPlan, PredictRequest
+from ..classifier.interface import ArrayRule, Block, Column, InputPlan, PredictRequest
 from .batches import Circles, halo_m
 from .configuration import Configuration, parse_configuration
 from .network import Folded, Weights, check
@@ -127,10 +127,8 @@ class AlsNet:
         """The network, ready to apply."""
         return Folded(self.weights, self.configuration)
 
-    def predict(
-        self, request: PredictRequest, finish: Callable[[npt.NDArray[np.float64]], Any]
-    ) -> Iterator[tuple[Any, Any]]:
-        """Mean probabilities over all batches a point is in [WM19], through `finish`, in one block.
+    def predict(self, request: PredictRequest) -> Iterator[Block]:
+        """Yield the mean probabilities over all batches a point is in [WM19 3], in one block.
 
         Batches are computed side by side, as many as fit into the memory, at least one.
         """
@@ -139,14 +137,11 @@ class AlsNet:
             add_return_features(self.inputs, request.xyz, request.dimensions, request.threads),
             len(request.xyz),
         )
-        figures = request.report.figures
         if request.count:
-            mean, variance, counted = self._means(request, values)
-            figures.update(counted)
-            made = finish(mean)
-            if request.variance:
-                made["variance"] = variance
-            yield slice(None) if request.rows is None else request.rows, made
+            mean, variance, counts = self._means(request, values)
+            request.report.figures.update(counts)
+            rows = np.arange(len(request.xyz)) if request.rows is None else request.rows
+            yield Block(rows, mean, variance)
 
     def _apply_on(self, device: str) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
         """Return what gives a batch's probabilities: NumPy, or PyTorch where a GPU is asked for."""

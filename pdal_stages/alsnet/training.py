@@ -22,7 +22,8 @@ from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.class_map import ClassMap
 from ..classifier.input_dimensions import add_return_features, take_dimensions
-from ..classifier.model import Model, load_model
+from ..classifier.load_model import load_model
+from ..classifier.model import Model
 from ..classifier.sampling import figures
 from ..classifier.training_clouds import TrainingCloud, label_classes
 from ..classifier.training_options import TrainingOptions

@@ -1,14 +1,16 @@
-"""Passes over one cloud: each reads, beside its features, what the one before said around a point.
+"""Auto-context [TB10]: each pass reads, beside its features, the probabilities of the pass before around a point.
 
 The cloud is worked on in bands from south to north. A pass works on a band as soon as the pass before has done that band
 and the next one, so the features of a few bands are held, and those of a band serve all passes that read the same ones.
+
+[TB10] Tu and Bai 2010, Auto-context and its application to high-level vision tasks and 3D brain image segmentation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +19,11 @@ import numpy.typing as npt
 from ..base.grid import begins_run, cell_numbers
 from ..base.threads import map_blocks
 from ..features import FeaturePlan
-from .context_features import Context, around, count_shares
-from .feature_forest import CloudFeatures, FeatureForest, weighed
-from .interface import InputPlan, PredictRequest
+from ..features.engine import FeatureBlock, Run
+from .context_features import CellContext, Context, around, count_shares
+from .feature_forest import FeatureForest
+from .fitted_features import CloudFeatures, Features
+from .interface import Block, InputPlan, PredictRequest, weigh
 
 #: Points of a band at most, but for a band of one strip.
 BAND = 75_000
@@ -71,162 +75,212 @@ class FoldForests:
 class WeightedPass(NamedTuple):
     """A pass, and what its probabilities are weighted by."""
 
-    #: It has `features` (None where it reads context alone), `context` (None for the first), and
-    #: ``probabilities(read, rows)``, (b, classes) of points by their features and then their context, side by side.
-    #: A first one without features is applied by its own ``predict``.
+    #: a FeatureClassifier, or as the first a CloudClassifier
     classifier: Any
     classes: int
-    #: (classes,) what these probabilities are multiplied by before they are handed on
+    #: (classes,) what the probabilities are multiplied by before they are handed on
     factors: npt.NDArray[np.float64] | None = None
 
 
-def predict(
-    passes: Sequence[WeightedPass],
-    request: PredictRequest,
-    finish: Callable[[npt.NDArray[np.float64]], Any],
-) -> Iterator[tuple[Any, Any]]:
-    """Classify by some passes: (rows, what `finish` made of them) block by block.
-
-    `finish` makes the results of the (b, classes) float64 probabilities of a block, which it may change, in a worker's
-    thread where there are any.
-    """
-    last = passes[-1].classifier
-    if len(passes) == 1 and last.features is None:
-        yield from last.predict(request, finish)
+def classify(passes: Sequence[WeightedPass], request: PredictRequest) -> Iterator[Block]:
+    """Yield the weighted probabilities of the last pass for all points wanted, block by block."""
+    last = passes[-1]
+    if len(passes) == 1 and last.classifier.features is None:
+        yield from _predict(last, request)
         return
-    yield from PassRun(passes, request).blocks(
-        lambda read, rows: finish(last.probabilities(read, rows))
-    )
+    for rows, probabilities in PassRun(passes, request).blocks():
+        yield Block(rows, probabilities)
 
 
 def sample_context(
     passes: Sequence[WeightedPass], request: PredictRequest, context: Context
 ) -> npt.NDArray[np.float32]:
-    """(m, columns): the context that some passes give the m points asked for, ascending."""
-    asked: Any = request.rows
-    out = np.empty((len(asked), len(context.tokens) * passes[-1].classes), np.float32)
-    last = WeightedPass(SimpleNamespace(context=context, features=None), 0)
-    for rows, columns in PassRun([*passes, last], request).blocks(lambda columns, rows: columns):
-        out[np.searchsorted(asked, rows)] = columns
+    """Return the context (m, columns) that a further pass would read at the m rows wanted, which ascend."""
+    assert request.rows is not None
+    out = np.empty((len(request.rows), len(context.tokens) * passes[-1].classes), np.float32)
+    for rows, columns in PassRun(passes, request, context).blocks():
+        out[np.searchsorted(request.rows, rows)] = columns
     return out
 
 
+def _predict(one: WeightedPass, request: PredictRequest) -> Iterator[Block]:
+    """Yield the weighted probabilities of a first pass that reads points instead of features."""
+    for block in one.classifier.predict(request):
+        yield block._replace(probabilities=weigh(block.probabilities, one.factors))
+
+
 class PassRun:
-    """Passes at work on one cloud; of the last only its features and context are looked at."""
+    """Auto-context passes at work on one cloud, band by band.
 
-    def __init__(self, passes: Sequence[WeightedPass], request: PredictRequest) -> None:
-        members = [each.classifier for each in passes]
-        self._members, self._request, self._factors = (
-            members,
-            request,
-            [each.factors for each in passes],
-        )
-        wanted = [request.rows]  # of each pass
-        for one in members[:0:-1]:
-            wanted.insert(0, around(request.xyz, wanted[0], one.context))
+    Parameters
+    ----------
+    passes : sequence of WeightedPass
+        The first may read points instead of features; all others read the context of the one before.
+    request : PredictRequest
+    context : Context, optional
+        With it the run gives the columns of this context, after the last pass, instead of probabilities.
+    """
+
+    def __init__(
+        self,
+        passes: Sequence[WeightedPass],
+        request: PredictRequest,
+        context: Context | None = None,
+    ) -> None:
+        self._passes, self._request = passes, request
+        read = [one.classifier.features for one in passes]
+        #: What each step reads of the pass before; the last step may be the context alone.
+        self._contexts = [None, *(one.classifier.context for one in passes[1:])]
+        if context is not None:
+            self._contexts.append(context)
+            read.append(None)
+        self._last = len(read) - 1
+        wanted = [request.rows]  # of each step
+        for one in self._contexts[:0:-1]:
+            wanted.insert(0, around(request.xyz, wanted[0], one))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
-        width = max((one.context.strip for one in members[1:]), default=0.0) or 8.0
+        width = max((one.strip for one in self._contexts[1:]), default=0.0) or 8.0
         self._strips = Strips(request.xyz, wanted[0], width)
-        self._shares = [np.zeros((len(self._strips), n), np.uint16) for _, n, _ in passes[:-1]]
-        self._features: list[CloudFeatures | None] = []
-        for one in members:
-            # One for passes that read the same features, so that these are computed once.
-            same = (
-                f
-                for f in self._features
-                if f is not None and f.features.to_dict() == one.features.to_dict()
-            )
-            found = None if one.features is None else next(same, None)
-            if found is None and one.features is not None:
-                found = CloudFeatures(one.features, request)
-            self._features.append(found)
+        n = len(self._strips)
+        #: (n, classes) of each step but the last, in the order of the strips
+        self._shares = [np.zeros((n, one.classes), np.uint16) for one in passes[: self._last]]
+        self._features = _share_sources(read, request)
 
-    def blocks(
-        self, last: Callable[[npt.NDArray[np.float32], npt.NDArray[np.int64]], Any]
-    ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
-        """Yield (rows, ``last(read, rows)``) for all points asked for; called in workers' threads."""
+    def blocks(self) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any]]]:
+        """Yield (rows in the request's cloud, probabilities or columns of the context) for all rows wanted."""
         if not self._request.count:
             return
-        strips, number, progress = self._strips, len(self._members), self._request.progress
-        bands = strips.bands()
+        bands = self._strips.bands()
         first = 0
         if self._features[0] is None:
-            self._ask_algorithm()
+            self._fill_first_shares()
             first = 1
-        held: dict[
-            int, dict[Any, list[Any]]
-        ] = {}  # band -> features -> (rows, values) of its blocks
-        for step in range(len(bands) + number):
-            for place in range(first, number):
-                if not 0 <= step - place < len(bands):
+        #: by band: features that a later step reads as well -> their blocks
+        held: dict[int, dict[CloudFeatures, list[FeatureBlock]]] = {}
+        for lead in range(len(bands) + self._last + 1):
+            for step in range(first, self._last + 1):
+                number = lead - step
+                if not 0 <= number < len(bands):
                     continue
-                there = held.setdefault(step - place, {})
-                finish = last if place == number - 1 else self._handing_on(place)
-                for rows, result in self._work(place, bands[step - place], there, finish):
-                    if place < number - 1:
-                        self._shares[place][strips.places(rows)] = result
+                for rows, result in self._work(step, bands[number], held.setdefault(number, {})):
+                    if step < self._last:
+                        self._shares[step][self._strips.places(rows)] = result
                         continue
-                    if progress is not None:
-                        progress.update(len(rows))
+                    if self._request.progress is not None:
+                        self._request.progress.update(len(rows))
                     yield rows, result
-            held.pop(step - number + 1, None)
+            held.pop(lead - self._last, None)
 
-    def _ask_algorithm(self) -> None:
-        """Let a first pass of another kind, which has its own way through a cloud, say its probabilities."""
-        factors = self._factors[0]
-        rows = None if self._wanted[0] is None else np.flatnonzero(self._wanted[0])
-        inner = replace(self._request, rows=rows, progress=None, grid=None)
-        every = np.arange(len(inner.xyz))
-        for rows, result in self._members[0].predict(
-            inner, lambda p: count_shares(weighed(p, factors))
+    def _fill_first_shares(self) -> None:
+        """Let a first pass that reads points instead of features classify the whole cloud."""
+        mask = self._wanted[0]
+        rows = None if mask is None else np.flatnonzero(mask)
+        for block in _predict(
+            self._passes[0], replace(self._request, rows=rows, progress=None, grid=None)
         ):
-            self._shares[0][self._strips.places(every[rows])] = result
-
-    def _handing_on(self, place: int) -> Callable[..., npt.NDArray[np.uint16]]:
-        """What a pass makes of a block for the next one."""
-        one, factors = self._members[place], self._factors[place]
-        return lambda read, rows: count_shares(weighed(one.probabilities(read, rows), factors))
+            places = self._strips.places(block.rows)
+            self._shares[0][places] = count_shares(block.probabilities)
 
     def _work(
-        self, place: int, band: Band, held: dict[Any, list[Any]], finish: Callable[..., Any]
-    ) -> Iterator[tuple[npt.NDArray[np.int64], Any]]:
-        """Yield (rows, what `finish` makes of them) of a band's points that the pass `place` is to look at."""
-        features, mask = self._features[place], self._wanted[place]
-        later = features in self._features[place + 1 :]
-        context = self._context_at(place, band) if place else None
+        self, step: int, band: Band, held: dict[CloudFeatures, list[FeatureBlock]]
+    ) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any]]]:
+        """Yield (rows, result of the step) for the rows of a band that the step must look at."""
+        features, mask = self._features[step], self._wanted[step]
         rows = self._strips.rows(band[0])
         rows = rows if mask is None else rows[mask[rows]]
-
-        def result(values: Any, rows: npt.NDArray[np.int64]) -> Any:
-            parts = [values, None if context is None else context(rows)]
-            there = [part for part in parts if part is not None]
-            return finish(there[0] if len(there) == 1 else np.concatenate(there, axis=1), rows)
-
-        def again(block: Any) -> tuple[npt.NDArray[np.int64], Any]:
-            mine = slice(None) if mask is None else mask[block[0]]
-            rows, values = (part[mine] for part in block)
-            return rows, result(values, rows) if len(rows) else None
-
+        work = self._on_band(step, band)
+        threads = self._request.threads
         if features in held:
-            for some, made in map_blocks(again, held[features], self._request.threads):
+            for some, result in map_blocks(work.classify, held[features], threads):
                 if len(some):
-                    yield some, made
-        elif features is not None:
+                    yield some, result
+        elif features is not None and len(rows):
             held[features] = []
-            both = features.blocks(rows, lambda values, some: (values, result(values, some)), 0.5)
-            for some, (values, made) in both:
-                if later:
-                    held[features].append((some, values))
-                yield some, made
+            run = features.run(rows, memory_share=0.5)
+            on_blocks = replace(work, run=run, keep=features in self._features[step + 1 :])
+            for block, result in map_blocks(on_blocks.compute, run.ranges, threads):
+                features.count(run, block)
+                if on_blocks.keep:
+                    held[features].append(block)
+                yield block.rows, result
         elif len(rows):
-            yield rows, result(None, rows)
+            yield rows, work.result(rows, None)
 
-    def _context_at(self, place: int, band: Band) -> Callable[..., npt.NDArray[np.float32]]:
-        """What gives the context of rows of a band, by what the pass before said of it and the strips beside it."""
-        context, shares = self._members[place].context, self._shares[place - 1]
-        xyz = self._request.xyz[self._strips.rows(band[1])]
-        columns = context.columns_of(xyz, shares[band[1]], self._request.threads)
-        return lambda rows: columns(self._strips.places(rows) - band[1].start)
+    def _on_band(self, step: int, band: Band) -> _StepOnBand:
+        """Return what a step does with the blocks of a band, by the shares of the band and the strips beside it."""
+        columns = None
+        if context := self._contexts[step]:
+            xyz = self._request.xyz[self._strips.rows(band[1])]
+            shares = self._shares[step - 1][band[1]]
+            columns = context.cell_means(xyz, shares, self._request.threads)
+        one = self._passes[step] if step < len(self._passes) else None
+        return _StepOnBand(
+            one, step < self._last, columns, self._strips, band[1].start, self._wanted[step]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _StepOnBand:
+    """What one step does with the blocks of one band; :meth:`compute` and :meth:`classify` are called in worker threads."""
+
+    weighted_pass: WeightedPass | None  #: None where the columns of the context are the result
+    hands_on: bool  #: whether the result is shares for the next pass
+    context: CellContext | None  #: of the band and the strips beside it
+    strips: Strips
+    first_place: int  #: of the points of `context`, among the strips
+    mask: (
+        npt.NDArray[np.bool_] | None
+    )  #: of rows in the request's cloud: those that the step must look at; None: all
+    run: Run | None = None  #: that computes the features
+    keep: bool = False  #: whether a later step needs the features
+
+    def compute(self, part: tuple[int, int]) -> tuple[FeatureBlock, npt.NDArray[Any]]:
+        """Return a block of features, empty where no later step needs them, and what the step makes of it."""
+        assert self.run is not None
+        block = self.run.compute(part)
+        result = self.result(block.rows, block.values)
+        return (block if self.keep else block._replace(values=block.values[:0].copy())), result
+
+    def classify(
+        self, block: FeatureBlock
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any] | None]:
+        """Return the rows of a block that are wanted, and what the step makes of their features."""
+        rows, values = block.rows, block.values
+        if self.mask is not None:
+            wanted = self.mask[rows]
+            rows, values = rows[wanted], values[wanted]
+        return rows, self.result(rows, values) if len(rows) else None
+
+    def result(
+        self, rows: npt.NDArray[np.int64], values: npt.NDArray[np.float32] | None
+    ) -> npt.NDArray[Any]:
+        """Return shares (b, classes) for the next pass, probabilities, or columns, from features (b, f) and context."""
+        parts = [] if values is None else [values]
+        if self.context is not None:
+            parts.append(self.context.columns(self.strips.places(rows) - self.first_place))
+        read = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        if self.weighted_pass is None:
+            return read
+        classifier, _, factors = self.weighted_pass
+        p = weigh(classifier.probabilities(read, rows), factors)
+        return count_shares(p) if self.hands_on else p
+
+
+def _share_sources(
+    read: Sequence[Features | None], request: PredictRequest
+) -> list[CloudFeatures | None]:
+    """Return what computes the features of each step; steps that read the same features share it."""
+    sources: dict[str, CloudFeatures] = {}
+    out: list[CloudFeatures | None] = []
+    for features in read:
+        if features is None:
+            out.append(None)
+            continue
+        key = json.dumps(features.to_dict())
+        if key not in sources:
+            sources[key] = CloudFeatures(features, request)
+        out.append(sources[key])
+    return out
 
 
 #: Places of the points of a band, and of these and the strips beside it.

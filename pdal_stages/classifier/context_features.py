@@ -9,7 +9,7 @@ costs as much in a dense cloud as in a sparse one.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -83,47 +83,58 @@ class Context:
             for code in codes
         )
 
-    def columns_of(
+    def cell_means(
         self,
         xyz: npt.NDArray[np.float64],
         shares: npt.NDArray[np.uint16],
         threads: int | None = None,
-    ) -> Callable[[npt.NDArray[np.int64]], npt.NDArray[np.float32]]:
-        """A function that gives the columns of some of these points.
+    ) -> CellContext:
+        """Return the mean shares of all cells.
 
         Parameters
         ----------
         xyz : (n, 3) float64
-            Meters. Cells that points at hand lie in must be complete, and so must those around them.
+            Meters. Cells of points whose columns will be wanted must be complete, and so must those around them.
         shares : (n, classes) uint16
             Of each point; see :func:`count_shares`.
         """
-
-        def means(scale: tuple[float, int, bool]):
-            side, axes, votes = scale
-            return cell_means(xyz[:, :axes], shares, side, votes)
-
-        found = map_blocks(means, list(self.scales.values()), threads)
-        cells, classes = dict(zip(self.scales, found, strict=True)), shares.shape[1]
-
-        def columns(points: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
-            out = np.empty((len(points), len(self.tokens) * classes), np.float32)
-            for k, token in enumerate(self.tokens):
-                part = out[:, k * classes : (k + 1) * classes]
-                if token == OWN:
-                    part[:] = shares[points] / WHOLE
-                else:
-                    cell, mean = cells[token]
-                    part[:] = mean[cell[points]]
-            return out
-
-        return columns
+        jobs = [(xyz[:, :axes], shares, side, votes) for side, axes, votes in self.scales.values()]
+        means = map_blocks(_cell_means, jobs, threads)
+        return CellContext(self.tokens, shares, dict(zip(self.scales, means, strict=True)))
 
     def own(self, columns: npt.NDArray[np.float32], classes: int) -> npt.NDArray[np.float64]:
         """(n, classes) of these columns: the point's own probabilities."""
         first = self.tokens.index(OWN) * classes
         said = columns[:, first : first + classes].astype(np.float64)
         return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class CellContext:
+    """Context of the n points of some ground."""
+
+    tokens: tuple[str, ...]
+    shares: npt.NDArray[np.uint16]  #: (n, classes) of the points themselves
+    #: of the tokens that have cells: (n,) the cell of each point, (cells, classes) the means around each cell
+    cells: Mapping[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]]
+
+    def columns(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+        """Return the columns (b, tokens * classes) of some of the points."""
+        classes = self.shares.shape[1]
+        out = np.empty((len(rows), len(self.tokens) * classes), np.float32)
+        for k, token in enumerate(self.tokens):
+            part = out[:, k * classes : (k + 1) * classes]
+            if token == OWN:
+                part[:] = self.shares[rows] / WHOLE
+            else:
+                cell, mean = self.cells[token]
+                part[:] = mean[cell[rows]]
+        return out
+
+
+def _cell_means(job: tuple[Any, ...]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Call :func:`cell_means` in a worker thread."""
+    return cell_means(*job)
 
 
 def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.report import Report
-from ..base.settings import Settings, setting
 from ..features import FeaturePlan
 from ..features.point_grid import CellGrid
 
@@ -52,7 +51,7 @@ class PredictRequest:
     memory_mb: float = 256.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
-    #: whether a network adds "variance", (b,) float64, to the mapping that `finish` makes
+    #: whether the variance over a network's batches is wanted
     variance: bool = False
     device: str = "cpu"  #: where a network is applied
     report: Report = field(
@@ -66,11 +65,7 @@ class PredictRequest:
 
 
 class PassClassifier(Protocol):
-    """Classifier that is one pass of a model; each kind is a class of its own.
-
-    A kind that reads features also has ``probabilities(values, rows)``; one that does not has
-    ``predict(request, finish)``, which yields (rows, what `finish` made of their probabilities) block by block.
-    """
+    """Classifier that is one pass of a model; each kind is a class of its own, and either of the two below."""
 
     #: arrays that the kind stores in a model file; a name that ends in ``*`` stands for many
     rules: ClassVar[Mapping[str, ArrayRule]]
@@ -107,42 +102,37 @@ class PassClassifier(Protocol):
         """Return its inputs, in order."""
 
 
-@dataclass(frozen=True)
-class PredictionOptions(Settings):
-    """How a cloud is classified."""
+class FeatureClassifier(PassClassifier, Protocol):
+    """Classifier of points by their features, and the context of the pass before."""
 
-    threads: int | None = None
-    memory_mb: float = setting(256.0, "number", "Memory for blocks of points", 1, None, unit="MB")
-    probabilities: bool = False  #: whether to return them
-    margin: bool = False
-    variance: bool = False  #: of the probabilities over a network's batches
-    device: str = setting(
-        "cpu",
-        "string",
-        "Where a network is applied: cpu (NumPy, the same bits everywhere), cuda, or auto",
-        choices=("cpu", "cuda", "auto"),
-    )
-    #: points less reliable do not get the winning class, and are counted
-    reject_below: float | None = setting(
-        None, "number", "Points with a lower Reliability are rejected", 0, 1
-    )
-    rejected_code: int | None = setting(
-        None, "integer", "Class code for rejected points; by default they keep theirs", 0, 255
-    )
-    #: as `reject_below`, for points of each class; the larger one counts
-    limits: Mapping[int, float] | None = None
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """Return probabilities (b, classes) from features and context (b, inputs) of the points at `rows`."""
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Classes given to a cloud's points, in its order; numbers are 0 for points that were not classified."""
+class CloudClassifier(PassClassifier, Protocol):
+    """Classifier that reads points themselves; it can only be the first pass."""
 
-    classification: npt.NDArray[np.uint8]  #: (n,) ASPRS codes
-    reliability: npt.NDArray[np.float32]  #: (n,) probability of the winning class
-    unsure: npt.NDArray[np.int64]  #: (m,) points that were not reliable enough, and so rejected
-    report: Report  #: counts, notes and warnings for the metadata
-    margin: npt.NDArray[np.float32] | None = None  #: (n,) winning minus second probability
-    #: (n,) variance of a class's probability over a network's batches, mean over the classes
-    variance: npt.NDArray[np.float32] | None = None
-    #: (n, classes) in the order of ``Model.classes``
-    probabilities: npt.NDArray[np.float32] | None = None
+    def predict(self, request: PredictRequest) -> Iterator[Block]:
+        """Yield the probabilities of all rows wanted, block by block, each row once."""
+
+
+class Block(NamedTuple):
+    """Probabilities of some points."""
+
+    rows: npt.NDArray[np.int64]  #: (b,) rows in the request's cloud
+    probabilities: npt.NDArray[np.float64]  #: (b, classes)
+    #: (b,) variance of a class's probability over a network's batches, mean over the classes
+    variance: npt.NDArray[np.float64] | None = None
+
+
+def weigh(
+    p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None
+) -> npt.NDArray[np.float64]:
+    """Multiply the probabilities (b, classes) of each class by its factor; None leaves them as they are."""
+    if factors is None:
+        return p
+    p = p * factors
+    p /= p.sum(axis=1, keepdims=True)
+    return p

@@ -5,30 +5,37 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.asprs import GROUND
-from ..base.errors import DimensionError, ModelError, OptionError, suggest
+from ..base.errors import DimensionError, OptionError
 from ..base.report import Report
 from ..features import FeaturePlan
 from ..features.cell_means import density
-from ..features.point_grid import build_grid, check_xyz
+from ..features.point_grid import check_xyz
 from ..features.registry import ALGORITHM_VERSION
-from ..features.voxels import check_side, represent
+from ..features.voxels import represent
 from . import model_description, model_file
-from .auto_context import WeightedPass, plan_of, predict
-from .feature_forest import weighed
+from .auto_context import WeightedPass, classify, plan_of
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
-from .interface import InputPlan, Prediction, PredictionOptions, PredictRequest
-from .registry import classifier_of, preprocessing
+from .interface import InputPlan, PredictRequest
+from .prediction import (
+    PointRoles,
+    Prediction,
+    PredictionOptions,
+    WorkingCloud,
+    count_classes,
+    decide,
+    empty_columns,
+    move_from_ground,
+    reject,
+)
+from .registry import preprocessing
 
-#: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
-UNCLASSIFIED = 1
 #: How many times sparser or denser a cloud may be than those trained on before that is said.
 TOLERANCE = 2.0
 
@@ -217,139 +224,79 @@ class Model:
                 cure="Ask for the margin, which every model gives",
             )
         xyz = check_xyz(xyz)
-        n = len(xyz)
-        given = self._prepared(xyz, dict(dimensions or {}), ignore, how.threads, current)
-        asked = (
-            np.ones(n, np.bool_)
-            if where is None
-            else _checked("where", where, n, "b", "true or false")
-        )
-        there, ignored = None, 0
-        if (
-            ignore is not None
-            and (gone := _checked("ignore", ignore, n, "b", "true or false")).any()
-        ):
-            there, ignored = np.flatnonzero(~gone), int(np.count_nonzero(gone))
-            asked = asked & ~gone
-        rows = None if asked.all() else np.flatnonzero(asked)
-        codes, factors = self.codes, self.factors
-        now = (
-            None
-            if current is None
-            else _checked("current", current, n, "iu", "class code").astype(np.uint8)
-        )
-        out: dict[str, npt.NDArray[Any]] = {
-            "classification": np.zeros(n, np.uint8) if now is None else now.copy(),
-            "reliability": np.zeros(n, np.float32),
-            **{
-                name: np.zeros(n, np.float32)
-                for name in ("margin", "variance")
-                if getattr(how, name)
-            },
-            **(
-                {"probabilities": np.zeros((n, len(codes)), np.float32)}
-                if how.probabilities
-                else {}
-            ),
-        }
-        second, may = may_be_ground is not None, asked
-        if may_be_ground is not None:
-            may = _checked("may_be_ground", may_be_ground, n, "b", "true or false")
-            out["second"], out["second_share"] = np.zeros(n, np.uint8), np.zeros(n, np.float32)
-        values = list_values(self.plan.dimensions, given, n, there)
-        representatives = represent(xyz, self.voxel, values, rows, there)
-        del values, there
-        taken: npt.NDArray[Any] | None = None
-        if representatives is not None:  # from here on nobody looks at the others
-            rows, taken = representatives.wanted, representatives.rows
-            xyz = xyz[taken]
-            representatives = replace(representatives, rows=taken[:0])
-        order, grid = None, None
-        if self._cell is not None and len(xyz):
-            # one copy of the coordinates, in the order in which all is computed
-            grid = build_grid(xyz, self._cell)
-            order, xyz = grid.order, grid.coordinates
-            grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
-            if rows is not None:
-                rows = np.flatnonzero(np.isin(order, rows))
-            taken = order if taken is None else taken[order]
-        if taken is not None:
-            needed = (*self.required_dimensions, *self.optional_dimensions)
-            given = {name: np.asarray(given[name])[taken] for name in needed if name in given}
-        shown = progress if representatives is None else None
+        roles = PointRoles.check(len(xyz), where, ignore, current, may_be_ground)
+        given = self._add_preprocessed(xyz, dict(dimensions or {}), roles, how.threads)
+        columns = empty_columns(roles, len(self.codes), how)
+        values = list_values(self.plan.dimensions, given, len(xyz), roles.present)
+        representatives = represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
+        del values
+        if representatives is not None:  # the coordinates of the others are not needed any more
+            xyz = xyz[representatives.rows]
+        work = WorkingCloud.sort(xyz, self._cell, representatives, roles.wanted_rows)
+        del xyz
         request = PredictRequest(
-            xyz, given, rows, how.threads, how.memory_mb, shown, grid, how.variance, how.device
+            work.xyz,
+            work.take((*self.required_dimensions, *self.optional_dimensions), given),
+            work.wanted,
+            how.threads,
+            how.memory_mb,
+            progress if representatives is None else None,
+            work.grid,
+            how.variance,
+            how.device,
         )
-        # Before the search structures are there, with which it would be the most that is held.
-        found = density(xyz) if self.info.get("densities") is not None and request.count else 0.0
-        for at, decided in predict(
-            self.weighted_passes, request, lambda p: decide(weighed(p, factors), codes, how, second)
-        ):
-            place: Any = slice(None)
-            if order is not None:
-                at = order[at]
-            if representatives is not None:
-                at, place = representatives.members(at)
-                if progress is not None:
-                    progress.update(len(at))
-            for name, values in decided.items():
-                out[name][at] = values[place]
-        if second:
-            moved = _move_from_ground(out, asked & ~may)
-            request.report.figures["too_far_for_ground"] = moved
-        self._report_density(request.report, found, request.count)
+        del given
+        # Here and not later: search structures take more memory than is free beside them.
+        measure = self.info.get("densities") is not None and request.count
+        points_per_m2 = density(work.xyz) if measure else None
+        for block in classify(self.weighted_passes, request):
+            rows_in_cloud, rows_in_block = work.members(block.rows)
+            for name, values_of_block in decide(block, self.codes, columns).items():
+                columns[name][rows_in_cloud] = values_of_block[rows_in_block]
+            if progress is not None and representatives is not None:
+                progress.update(len(rows_in_cloud))
+        if roles.not_ground is not None:
+            request.report.figures["too_far_for_ground"] = move_from_ground(columns, roles)
+        if points_per_m2 is not None:
+            self._report_density(request.report, points_per_m2, request.count)
         request.report.warnings.extend(self.outdated)
-        if len(xyz) < n - ignored:
-            request.report.figures["representatives"] = len(xyz)
-        unsure = _reject(out, asked, now, how)
-        count = int(np.count_nonzero(asked))
-        number = np.bincount(out["classification"][asked], minlength=256)
-        report = Report(
-            {
-                "points": n,
-                "classified": count - len(unsure),
-                "rejected": len(unsure),
-                "outside_where": n - ignored - count,
-                **({"ignored": ignored} if ignored else {}),
-                "classes": {
-                    str(code): int(number[code]) for code in np.flatnonzero(number).tolist()
-                },
-            }
-        )
+        if len(work.xyz) < len(roles.wanted) - roles.ignored:
+            request.report.figures["representatives"] = len(work.xyz)
+        rejected = reject(columns, roles, how)
+        report = Report(count_classes(columns["classification"], roles, len(rejected)))
         report.merge(request.report)
-        return Prediction(**out, unsure=unsure, report=report)
+        return Prediction(**columns, unsure=rejected, report=report)
 
     @property
     def gives_variance(self) -> bool:
         """Whether the model is a network alone, which sees each point in several batches."""
         return len(self.passes) == 1 and self.passes[0].features is None
 
-    def _prepared(
+    def _add_preprocessed(
         self,
         xyz: npt.NDArray[np.float64],
         given: dict[str, npt.ArrayLike],
-        ignore: npt.ArrayLike | None,
+        roles: PointRoles,
         threads: int | None,
-        current: npt.ArrayLike | None = None,
     ) -> dict[str, npt.ArrayLike]:
-        """The dimensions, with heights made as in training where they are missing and the model says how."""
+        """Return the dimensions (n,), with heights computed as in training where they are missing and the model says how."""
         missing = [name for name in self.required_dimensions if name not in given]
-        preparation = self.info.get("preparation") or []
+        stages = self.info.get("preparation") or []
         if not missing:
             return given
-        usable = None if ignore is None else ~np.asarray(ignore, bool)
-        classes = None if current is None else np.asarray(current).astype(np.uint8)
-        made = preprocessing().made_of_coordinates(preparation, xyz, usable, threads, classes)
-        if made.keys() & given.keys() and made.keys() & set(
-            missing
-        ):  # heights of two kinds would be mixed
+        usable = None
+        if roles.present is not None:
+            usable = np.zeros(len(xyz), np.bool_)
+            usable[roles.present] = True
+        computed = preprocessing().made_of_coordinates(stages, xyz, usable, threads, roles.current)
+        both = sorted(computed.keys() & given.keys())
+        if both and computed.keys() & set(missing):  # heights of two kinds would be mixed
             raise DimensionError(
                 f"the dimension {missing[0]} is missing",
                 found=", ".join(given),
-                cure=f"Leave out {', '.join(sorted(made.keys() & given.keys()))}: all are then made as in training, by "
-                f"{json.dumps(preparation[0])}",
+                cure=f"Leave out {', '.join(both)}: all are then made as in training, by {json.dumps(stages[0])}",
             )
-        return {**made, **given}
+        return {**computed, **given}
 
     @property
     def _cell(self) -> float | None:
@@ -358,173 +305,15 @@ class Model:
             (one.features.plan.cell for one in self.passes if one.features is not None), None
         )
 
-    def _report_density(self, report: Report, found: float, count: int) -> None:
-        """How dense the cloud is; a warning where that is not what the model was trained for."""
-        trained = self.info.get("densities")
-        if trained is None or not count:
+    def _report_density(self, report: Report, points_per_m2: float, count: int) -> None:
+        """Report the density of a cloud, and warn where it is not what the model was trained for."""
+        trained = self.info["densities"]
+        report.figures["density"] = round(points_per_m2, 3)
+        if trained["low"] / TOLERANCE <= points_per_m2 <= trained["high"] * TOLERANCE:
             return
-        report.figures["density"] = round(found, 3)
-        if not trained["low"] / TOLERANCE <= found <= trained["high"] * TOLERANCE:
-            few = max(report.figures.get("fewer_than_three", {}).values(), default=0)
-            lonely = f"; {100 * few / count:.3g} % have fewer than three neighbors" if few else ""
-            report.warnings.append(
-                f"the cloud has {found:.3g} points/m2, the model was trained on "
-                f"{model_description.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
-            )
-
-
-def decide(
-    p: npt.NDArray[np.floating],
-    codes: npt.NDArray[np.uint8],
-    options: PredictionOptions,
-    second: bool = False,
-) -> dict[str, npt.NDArray[Any]]:
-    """Return the winner of each row of probabilities (n, classes), of equal ones the first class, and what is wanted.
-
-    With `second`, also the class that would win without it, and its probability.
-    """
-    best = p.argmax(axis=1)
-    win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
-    out = {"classification": codes[best], "reliability": win}
-    if options.margin:
-        out["margin"] = win - np.partition(p, -2, axis=1)[:, -2] if p.shape[1] > 1 else win
-    if second:
-        others = p.copy()
-        np.put_along_axis(others, best[:, None], -1.0, axis=1)
-        next_best = others.argmax(axis=1)
-        out["second"] = codes[next_best]
-        out["second_share"] = np.take_along_axis(p, next_best[:, None], axis=1)[:, 0]
-    return {**out, "probabilities": p} if options.probabilities else out
-
-
-def _move_from_ground(out: dict[str, npt.NDArray[Any]], forbidden: npt.NDArray[np.bool_]) -> int:
-    """Give points (n,) that must not be ground, but are, their second class; returns how many there were."""
-    second, share = out.pop("second"), out.pop("second_share")
-    rows = np.flatnonzero(forbidden & (out["classification"] == GROUND))
-    out["classification"][rows], out["reliability"][rows] = second[rows], share[rows]
-    if "margin" in out:
-        out["margin"][rows] = 0.0
-    return len(rows)
-
-
-def _reject(
-    out: dict[str, npt.NDArray[Any]],
-    asked: npt.NDArray[np.bool_],
-    current: npt.NDArray[np.uint8] | None,
-    options: PredictionOptions,
-) -> npt.NDArray[np.int64]:
-    """The points that were `asked` for (n,) and are not reliable enough; they do not get the winning class."""
-    code = out["classification"]
-    least = np.full(256, options.reject_below or 0.0, np.float32)
-    for one, limit in (options.limits or {}).items():
-        least[one] = max(least[one], limit)
-    if not least.any():
-        return np.zeros(0, np.int64)
-    low = np.flatnonzero(asked & (out["reliability"] < least[code]))
-    kept = UNCLASSIFIED if current is None else current[low]
-    code[low] = kept if options.rejected_code is None else options.rejected_code
-    return low
-
-
-def load_model(path: str | os.PathLike) -> Model:
-    """Read a model file, or a shipped model by its name. Nothing in it is executed or believed unchecked.
-
-    The stages that it wants before it (``info["preparation"]``) are of a short list, with options in bounds.
-
-    Raises
-    ------
-    ModelError
-        The file is missing, damaged, of a newer version, not what it says, or asks for what no model may ask for.
-    """
-    name = os.fspath(path)
-    file = model_file.find(name)
-    try:
-        model = assemble(*model_file.read(file, lambda name: classifier_of(name).rules))
-        if asked := model.info.get("preparation"):
-            model.info["preparation"] = preprocessing().check(asked)
-        return model
-    except ModelError as error:
-        others = [one for one in model_file.shipped() if one != name]
-        near = "" if os.path.lexists(name) else suggest(name, others)
-        error.cure = f"{near}{error.cure or model_file.CURE}"
-        raise error.at(file) from error.__cause__
-    except OptionError as error:  # a feature of another release, say
-        raise ModelError(
-            "the model needs what this release does not have", where=file, found=error
-        ) from error
-
-
-def loaded_model(path: str) -> Model:
-    """The same, read once per process as long as the file stays the same."""
-    path = model_file.find(path)
-    try:
-        stat = os.stat(path)
-    except (OSError, ValueError):  # the latter for a name that holds a null
-        return load_model(path)  # says what is wrong
-    return _loaded(path, stat.st_mtime_ns, stat.st_size)
-
-
-@lru_cache(maxsize=4)
-def _loaded(path: str, *stamp: int) -> Model:
-    return load_model(path)
-
-
-def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
-    """The model that a file's manifest and arrays describe; what they say is checked against each other."""
-    classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
-    codes = [code for code, _ in classes]
-    if sorted(set(codes)) != codes:
-        raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
-    check_side(manifest.get("voxel") or 0.0)
-    priors = manifest.get("priors")
-    if priors is not None and len(priors["factors"]) != len(classes):
-        raise ModelError(
-            "the manifest's priors must have one factor per class", found=len(priors["factors"])
+        few = max(report.figures.get("fewer_than_three", {}).values(), default=0)
+        lonely = f"; {100 * few / count:.3g} % have fewer than three neighbors" if few else ""
+        report.warnings.append(
+            f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
+            f"{model_description.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
         )
-    passes, before = [], codes
-    for number, entry in enumerate(manifest["passes"]):
-        own = entry.get("codes") or codes
-        if sorted(set(own)) != own or len(entry.get("factors") or own) != len(own):
-            raise ModelError(
-                "a pass's classes must ascend, each once, with one factor each", found=own[:10]
-            )
-        if (number > 0) != bool(entry["context"]):
-            raise ModelError(
-                "every pass but the first must read context", found=f"pass {number + 1}"
-            )
-        made: Any = classifier_of(entry["algorithm"]).from_file(entry, arrays[number], own)
-        if number and made.classes_before(own) != before:
-            raise ModelError(
-                "a pass reads other classes than the one before gives", found=f"pass {number + 1}"
-            )
-        before = own
-        importances = entry["importances"]
-        if importances is not None and len(importances) != len(entry["feature_names"]):
-            raise ModelError(
-                "the manifest's importances must have one value per feature", found=len(importances)
-            )
-        passes.append(made)
-    info = {
-        key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")
-    }
-    scores = ("importances", "codes", "factors")
-    info["passes"] = [
-        {key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]
-    ]
-    if before != codes:
-        raise ModelError("the last pass has other classes than the model", found=before[:10])
-    return Model(tuple(passes), classes, info)
-
-
-def _checked(name: str, given: npt.ArrayLike, n: int, kinds: str, what: str) -> npt.NDArray[Any]:
-    """An array of n points of some NumPy kinds, or an OptionError."""
-    array = np.asarray(given)
-    if array.shape != (n,) or array.dtype.kind not in kinds:
-        raise OptionError(
-            f"'{name}' must be one {what} per point", found=f"{array.dtype} of shape {array.shape}"
-        )
-    if n and kinds != "b" and (array.min() < 0 or array.max() > 255):
-        raise OptionError(
-            f"'{name}' must be one {what} per point", found=f"{array.min()} to {array.max()}"
-        )
-    return array

@@ -22,11 +22,13 @@ from ..features.return_features import SOURCES
 from .auto_context import FoldForests, WeightedPass, sample_context
 from .calibration import Sureness
 from .context_features import OWN, Context
-from .feature_forest import Blend, CloudFeatures, FeatureForest, Features, on_top, trust, weighed
+from .feature_forest import FeatureForest
+from .fitted_features import CloudFeatures, Features
 from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
-from .interface import PredictRequest
+from .interface import PredictRequest, weigh
 from .model import Model
 from .random_forest import Forest, grow_forest
+from .refinement import Blend, on_top, trust
 from .sampling import BLOCK, Folds, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
@@ -154,11 +156,8 @@ class _ForestTraining:
                 if not len(at):
                     continue
                 request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb)
-                computed = CloudFeatures(self.features, request).blocks(
-                    rows, lambda block, _: block, 1.0, bar
-                )
-                for part, block in computed:
-                    values[at[np.searchsorted(rows, part)]] = block
+                for block in CloudFeatures(self.features, request).blocks(rows, bar):
+                    values[at[np.searchsorted(rows, block.rows)]] = block.values
                 if cloud.own is not None:
                     self.short += max(request.report.beyond_halo.values(), default=0)
         bad = ~np.isfinite(values).all(axis=0)
@@ -319,7 +318,7 @@ class _ForestTraining:
         """Count in how far samples that were held out were right where they were sure, as the points lie."""
         blend = self.blends[0]
         if blend is None:
-            p = weighed(p, self.factors)
+            p = weigh(p, self.factors)
         elif self.options.target is not None:
             return  # what the others truly are is not known
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -193,9 +193,8 @@ class FeatureEngine:
         threads: int | None = None,
         memory_mb: float = 512,
         progress: Progress | bool | None = None,
-        apply: Callable[[np.ndarray, np.ndarray], Any] | None = None,
-    ) -> Iterator[tuple[np.ndarray, Any]]:
-        """Compute features block by block.
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Compute features block by block, on every core; :meth:`run` is for more work on each block in its thread.
 
         Parameters
         ----------
@@ -212,10 +211,6 @@ class FeatureEngine:
             Memory that blocks may take in all, over the cloud and its index.
         progress : Progress or bool, optional
             A progress to update, or ``True`` for one of its own.
-        apply : callable, optional
-            ``apply(values, rows)`` is called in the worker's thread, and its result is yielded in
-            place of the values: how a classifier predicts on every core without ever holding the
-            whole matrix.
 
         Yields
         ------
@@ -224,16 +219,32 @@ class FeatureEngine:
             cloud. Where they are coordinates: their row numbers. Every query comes once, in the
             order of the grid.
         values : (b, len(plan.names)) float32 array, C-contiguous
-            Or what `apply` made of it.
 
         Raises
         ------
         DimensionError
             Where a dimension of the plan is not given, or has not one value per query.
         """
-        run = Run(self, queries, dimensions, threads, memory_mb)
-        for _, rows, result in run.blocks(progress, apply):
-            yield rows, result
+        run = self.run(queries, dimensions=dimensions, threads=threads, memory_mb=memory_mb)
+        for block in run.computed(progress):
+            yield block.rows, block.values
+
+    def run(
+        self,
+        queries: npt.ArrayLike | None = None,
+        *,
+        dimensions: Given = None,
+        threads: int | None = None,
+        memory_mb: float = 512,
+    ) -> Run:
+        """Return the blocks of queries to compute; parameters as for :meth:`blocks`.
+
+        A classifier computes a block's features and classifies it in one thread, so that the whole matrix is never held::
+
+            for block, classes in map_blocks(classify, run.ranges, run.threads):  # classify calls run.compute
+                run.count(block)
+        """
+        return Run(self, queries, dimensions, threads, memory_mb)
 
     def table(
         self,
@@ -245,11 +256,22 @@ class FeatureEngine:
         progress: Progress | bool | None = None,
     ) -> FeatureTable:
         """The features of all queries as one table, row i for query i; parameters as for :meth:`blocks`."""
-        run = Run(self, queries, dimensions, threads, memory_mb)
+        run = self.run(queries, dimensions=dimensions, threads=threads, memory_mb=memory_mb)
         values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
-        for positions, _, part in run.blocks(progress):
-            values[positions] = part
+        for block in run.computed(progress):
+            values[block.positions] = block.values
         return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
+
+
+class FeatureBlock(NamedTuple):
+    """Features of some queries."""
+
+    positions: np.ndarray  #: (b,) int64: which of the queries, in the user's order
+    rows: (
+        np.ndarray
+    )  #: (b,) int64: which points of the cloud they are; of coordinates the positions
+    values: np.ndarray  #: (b, features) float32
+    tally: Tally
 
 
 class Run:
@@ -272,8 +294,9 @@ class Run:
         self.grid = engine.grid if coordinates is None else build_grid(coordinates, self.plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(engine.threads if threads is None else threads)
-        #: Sorted queries that are no copies of the one before, and those with which blocks start.
-        self.distinct, self.starts = np.zeros(0, np.int64), np.zeros(1, np.int64)
+        #: Sorted queries that are no copies of the one before; first and last (exclusive) of each block among these.
+        self.distinct = np.zeros(0, np.int64)
+        self.ranges: list[tuple[int, int]] = []
         if not count:
             return
         if not len(engine):
@@ -295,12 +318,12 @@ class Run:
             MOST_ROWS,
             count / (4 * self.threads),
         )
-        self.starts = np.append(
-            np.arange(0, len(self.distinct) - 1, max(int(rows), 64)), len(self.distinct) - 1
-        )
+        starts = np.arange(0, len(self.distinct) - 1, max(int(rows), 64))
+        self.ranges = list(pairwise([*starts.tolist(), len(self.distinct) - 1]))
 
-    def compute(self, begin: int, end: int) -> tuple[np.ndarray, np.ndarray, Tally]:
-        """Positions (in the user's order) and values of the distinct queries begin..end, and what to report."""
+    def compute(self, block: tuple[int, int]) -> FeatureBlock:
+        """Compute a block, one of `ranges`; may be called in several threads at a time."""
+        begin, end = block
         plan, grid, engine = self.plan, self.grid, self.engine
         at = self.distinct[begin:end]
         first, last = at[0], self.distinct[end]
@@ -325,8 +348,9 @@ class Run:
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)
+        rows = positions if self.indices is None else self.indices[positions]
         if callable(self.dimensions):
-            found = self.dimensions(positions if self.indices is None else self.indices[positions])
+            found = self.dimensions(rows)
         else:
             found = {name: given[positions] for name, given in self.dimensions.items()}
         for column, name in enumerate(plan.dimensions, width - len(plan.dimensions)):
@@ -336,38 +360,28 @@ class Run:
                 if given is None
                 else given
             )
-        return positions, values, tally
+        return FeatureBlock(positions, rows, values, tally)
 
-    def blocks(
-        self,
-        progress: Progress | bool | None,
-        apply: Callable[[np.ndarray, np.ndarray], Any] | None = None,
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, Any]]:
-        """Positions, rows, and values or what `apply` makes of them, as threads finish the blocks."""
-
-        def compute(block: tuple[int, int]):
-            positions, values, tally = self.compute(*block)
-            rows = positions if self.indices is None else self.indices[positions]
-            return positions, rows, values if apply is None else apply(values, rows), tally
-
+    def computed(self, progress: Progress | bool | None = None) -> Iterator[FeatureBlock]:
+        """Yield all blocks, counted, as threads finish them."""
         bar = Progress(len(self.grid), "features") if progress is True else progress or None
         try:
-            blocks = list(pairwise(self.starts.tolist()))
-            for positions, rows, result, tally in map_blocks(compute, blocks, self.threads):
-                self._count(len(rows), tally)
+            for block in map_blocks(self.compute, self.ranges, self.threads):
+                self.count(block)
                 if bar is not None:
-                    bar.update(len(rows))
-                yield positions, rows, result
+                    bar.update(len(block.rows))
+                yield block
         finally:
             if progress is True and bar is not None:
                 bar.close()
 
-    def _count(self, count: int, tally: Tally) -> None:
+    def count(self, block: FeatureBlock) -> None:
+        """Add a block to the engine's report; by one thread only."""
         report = self.engine.report
-        report.figures["queries"] += count
+        report.figures["queries"] += len(block.rows)
         report.reach = max(report.reach, *self.reaches)
         totals = {"beyond_halo": report.beyond_halo, **report.figures}
-        for key, counts in tally.items():
+        for key, counts in block.tally.items():
             for token, n in counts.items():
                 totals[key][token] = totals[key].get(token, 0) + n
 

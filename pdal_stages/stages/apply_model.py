@@ -15,8 +15,10 @@ from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, median_slope
 from ..classifier.calibration import Limit, Sureness, said, sureness_of
-from ..classifier.model import UNCLASSIFIED, Model, loaded_model
+from ..classifier.load_model import loaded_model
+from ..classifier.model import Model
 from ..classifier.model_file import find
+from ..classifier.prediction import UNCLASSIFIED
 from .base import Stage
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts

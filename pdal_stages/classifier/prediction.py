@@ -1,0 +1,290 @@
+"""Classifying a cloud: what may be asked, the points that are computed, and the results by point.
+
+Rows of points live in three orders, which names tell apart: ``rows_in_cloud`` of the cloud as it was given,
+``rows_in_work`` of the points that are computed (:class:`WorkingCloud`), and ``rows_in_block`` of a block of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..base.asprs import GROUND
+from ..base.errors import OptionError
+from ..base.report import Report
+from ..base.settings import Settings, setting
+from ..features.point_grid import CellGrid, build_grid
+from ..features.voxels import Representatives
+from .interface import Block
+
+#: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
+UNCLASSIFIED = 1
+
+
+@dataclass(frozen=True)
+class PredictionOptions(Settings):
+    """How a cloud is classified."""
+
+    threads: int | None = None
+    memory_mb: float = setting(256.0, "number", "Memory for blocks of points", 1, None, unit="MB")
+    probabilities: bool = False  #: whether to return them
+    margin: bool = False
+    variance: bool = False  #: of the probabilities over a network's batches
+    device: str = setting(
+        "cpu",
+        "string",
+        "Where a network is applied: cpu (NumPy, the same bits everywhere), cuda, or auto",
+        choices=("cpu", "cuda", "auto"),
+    )
+    #: points less reliable do not get the winning class, and are counted
+    reject_below: float | None = setting(
+        None, "number", "Points with a lower Reliability are rejected", 0, 1
+    )
+    rejected_code: int | None = setting(
+        None, "integer", "Class code for rejected points; by default they keep theirs", 0, 255
+    )
+    #: as `reject_below`, for points of each class; the larger one counts
+    limits: Mapping[int, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Classes given to a cloud's points, in its order; numbers are 0 for points that were not classified."""
+
+    classification: npt.NDArray[np.uint8]  #: (n,) ASPRS codes
+    reliability: npt.NDArray[np.float32]  #: (n,) probability of the winning class
+    unsure: npt.NDArray[np.int64]  #: (m,) points that were not reliable enough, and so rejected
+    report: Report  #: counts, notes and warnings for the metadata
+    margin: npt.NDArray[np.float32] | None = None  #: (n,) winning minus second probability
+    #: (n,) variance of a class's probability over a network's batches, mean over the classes
+    variance: npt.NDArray[np.float32] | None = None
+    #: (n, classes) in the order of ``Model.classes``
+    probabilities: npt.NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PointRoles:
+    """What each point of a cloud is to a prediction."""
+
+    wanted: npt.NDArray[np.bool_]  #: (n,) points to classify
+    present: (
+        npt.NDArray[np.int64] | None
+    )  #: (k,) rows in the cloud of points that are not ignored; None: all
+    current: npt.NDArray[np.uint8] | None  #: (n,) class codes that the points have now
+    not_ground: npt.NDArray[np.bool_] | None  #: (n,) points to classify that must not become ground
+
+    @classmethod
+    def check(
+        cls,
+        n: int,
+        where: npt.ArrayLike | None,
+        ignore: npt.ArrayLike | None,
+        current: npt.ArrayLike | None,
+        may_be_ground: npt.ArrayLike | None,
+    ) -> PointRoles:
+        """Check the arguments of ``Model.predict`` about n points; OptionError for other shapes or types."""
+        wanted = np.ones(n, np.bool_) if where is None else _mask("where", where, n)
+        present = None
+        if ignore is not None and (ignored := _mask("ignore", ignore, n)).any():
+            present = np.flatnonzero(~ignored)
+            wanted = wanted & ~ignored
+        codes = None if current is None else _codes("current", current, n)
+        not_ground = None
+        if may_be_ground is not None:
+            not_ground = wanted & ~_mask("may_be_ground", may_be_ground, n)
+        return cls(wanted, present, codes, not_ground)
+
+    @property
+    def wanted_rows(self) -> npt.NDArray[np.int64] | None:
+        """Rows in the cloud of the points to classify, ascending; None: all."""
+        return None if self.wanted.all() else np.flatnonzero(self.wanted)
+
+    @property
+    def ignored(self) -> int:
+        """Number of points that are ignored."""
+        return 0 if self.present is None else len(self.wanted) - len(self.present)
+
+
+def _mask(name: str, given: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
+    array = np.asarray(given)
+    if array.shape != (n,) or array.dtype.kind != "b":
+        raise OptionError(
+            f"'{name}' must be one true or false per point",
+            found=f"{array.dtype} of shape {array.shape}",
+        )
+    return array
+
+
+def _codes(name: str, given: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:
+    array = np.asarray(given)
+    found = f"{array.dtype} of shape {array.shape}"
+    valid = array.shape == (n,) and array.dtype.kind in "iu"
+    if valid and n and (array.min() < 0 or array.max() > 255):
+        valid, found = False, f"{array.min()} to {array.max()}"
+    if not valid:
+        raise OptionError(f"'{name}' must be one class code per point", found=found)
+    return array.astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class WorkingCloud:
+    """Points of a cloud that are computed: one for each voxel, none that is ignored, in the order of the features' grid."""
+
+    xyz: npt.NDArray[np.float64]  #: (k, 3) meters
+    wanted: (
+        npt.NDArray[np.int64] | None
+    )  #: rows in work that stand for points to classify, ascending; None: all
+    grid: CellGrid | None  #: the index of `xyz`
+    rows_in_cloud: (
+        npt.NDArray[Any] | None
+    )  #: (k,) of the points themselves; None: each is its own row
+    _order: npt.NDArray[Any] | None  #: (k,) place of each among the representatives
+    _representatives: Representatives | None
+
+    @classmethod
+    def sort(
+        cls,
+        xyz: npt.NDArray[np.float64],
+        cell: float | None,
+        representatives: Representatives | None,
+        wanted_rows: npt.NDArray[np.int64] | None,
+    ) -> WorkingCloud:
+        """Sort the points that are computed by the cells of a grid.
+
+        Parameters
+        ----------
+        xyz : (k, 3) float64
+            Of the representatives, where there are any.
+        cell : float or None
+            Side of the grid's cells, meters; None leaves the points in their order.
+        representatives : Representatives or None
+            Which points of the cloud stand for which; None: each for itself.
+        wanted_rows : (m,) int64 or None
+            Rows in the cloud of the points to classify. Representatives know those that stand for any of them.
+        """
+        rows_in_cloud = None
+        wanted = wanted_rows
+        if representatives is not None:
+            wanted, rows_in_cloud = representatives.wanted, representatives.rows
+            representatives = replace(representatives, rows=rows_in_cloud[:0])
+        if cell is None or not len(xyz):
+            return cls(xyz, wanted, None, rows_in_cloud, None, representatives)
+        grid = build_grid(xyz, cell)
+        order = grid.order
+        if wanted is not None:
+            wanted = np.flatnonzero(np.isin(order, wanted))
+        rows_in_cloud = order if rows_in_cloud is None else rows_in_cloud[order]
+        sorted_grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
+        return cls(grid.coordinates, wanted, sorted_grid, rows_in_cloud, order, representatives)
+
+    def take(
+        self, names: Iterable[str], dimensions: Mapping[str, npt.ArrayLike]
+    ) -> dict[str, npt.ArrayLike]:
+        """Return the values (k,) of those of the dimensions (n,) that are there."""
+        if self.rows_in_cloud is None:
+            return dict(dimensions)
+        return {
+            name: np.asarray(dimensions[name])[self.rows_in_cloud]
+            for name in names
+            if name in dimensions
+        }
+
+    def members(
+        self, rows_in_work: npt.NDArray[np.int64]
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64] | slice]:
+        """Return the rows in the cloud that a block stands for, and for each the row in the block that stands for it."""
+        rows = rows_in_work if self._order is None else self._order[rows_in_work]
+        if self._representatives is None:
+            return rows, slice(None)
+        return self._representatives.members(rows)
+
+
+def empty_columns(
+    roles: PointRoles, classes: int, options: PredictionOptions
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the columns (n,) or (n, classes) of results that options ask for, before any point is classified."""
+    n, current = len(roles.wanted), roles.current
+    columns: dict[str, npt.NDArray[Any]] = {
+        "classification": np.zeros(n, np.uint8) if current is None else current.copy(),
+        "reliability": np.zeros(n, np.float32),
+    }
+    for name in ("margin", "variance"):
+        if getattr(options, name):
+            columns[name] = np.zeros(n, np.float32)
+    if options.probabilities:
+        columns["probabilities"] = np.zeros((n, classes), np.float32)
+    if roles.not_ground is not None:
+        columns["second"], columns["second_share"] = np.zeros(n, np.uint8), np.zeros(n, np.float32)
+    return columns
+
+
+def decide(
+    block: Block, codes: npt.NDArray[np.uint8], wanted: Iterable[str]
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the wanted columns of a block; of classes that are equally likely the first wins.
+
+    ``second`` is the class that would win without the winner, ``second_share`` its probability.
+    """
+    p = block.probabilities
+    best = p.argmax(axis=1)
+    win = np.take_along_axis(p, best[:, None], axis=1)[:, 0]
+    columns = {"classification": codes[best], "reliability": win}
+    if "margin" in wanted:
+        columns["margin"] = win - np.partition(p, -2, axis=1)[:, -2] if p.shape[1] > 1 else win
+    if "variance" in wanted and block.variance is not None:
+        columns["variance"] = block.variance
+    if "second" in wanted:
+        others = p.copy()
+        np.put_along_axis(others, best[:, None], -1.0, axis=1)
+        next_best = others.argmax(axis=1)
+        columns["second"] = codes[next_best]
+        columns["second_share"] = np.take_along_axis(p, next_best[:, None], axis=1)[:, 0]
+    if "probabilities" in wanted:
+        columns["probabilities"] = p
+    return columns
+
+
+def move_from_ground(columns: dict[str, npt.NDArray[Any]], roles: PointRoles) -> int:
+    """Give points that must not be ground, but are, their second class; return how many there were."""
+    second, share = columns.pop("second"), columns.pop("second_share")
+    rows = np.flatnonzero(roles.not_ground & (columns["classification"] == GROUND))
+    columns["classification"][rows], columns["reliability"][rows] = second[rows], share[rows]
+    if "margin" in columns:
+        columns["margin"][rows] = 0.0
+    return len(rows)
+
+
+def reject(
+    columns: dict[str, npt.NDArray[Any]], roles: PointRoles, options: PredictionOptions
+) -> npt.NDArray[np.int64]:
+    """Take the class from points that are not reliable enough; return their rows in the cloud."""
+    code = columns["classification"]
+    least = np.full(256, options.reject_below or 0.0, np.float32)
+    for one, limit in (options.limits or {}).items():
+        least[one] = max(least[one], limit)
+    if not least.any():
+        return np.zeros(0, np.int64)
+    rows = np.flatnonzero(roles.wanted & (columns["reliability"] < least[code]))
+    kept = UNCLASSIFIED if roles.current is None else roles.current[rows]
+    code[rows] = kept if options.rejected_code is None else options.rejected_code
+    return rows
+
+
+def count_classes(
+    classification: npt.NDArray[np.uint8], roles: PointRoles, rejected: int
+) -> dict[str, Any]:
+    """Return the counts of a prediction, for its report."""
+    n, wanted = len(roles.wanted), int(np.count_nonzero(roles.wanted))
+    number = np.bincount(classification[roles.wanted], minlength=256)
+    return {
+        "points": n,
+        "classified": wanted - rejected,
+        "rejected": rejected,
+        "outside_where": n - roles.ignored - wanted,
+        **({"ignored": roles.ignored} if roles.ignored else {}),
+        "classes": {str(code): int(number[code]) for code in np.flatnonzero(number).tolist()},
+    }
