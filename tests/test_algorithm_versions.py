@@ -7,6 +7,7 @@ import laspy
 import numpy as np
 import pytest
 
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.registry import stage_type, stage_types
 
 DATA = Path(__file__).parent / "data"
@@ -38,7 +39,7 @@ def results(kind: str) -> dict[str, list[float]]:
             xyz = xyz[np.abs(xyz - middle)[:, :2].max(axis=1) < MIDDLE]
         made = {name: np.zeros(len(xyz)) for name in stage.creates()}
         columns = {**dict(zip("XYZ", xyz.T, strict=True)), **made}
-        out = stage.run(stage.points(columns))
+        out = stage.run(stage.points(columns), WHOLE_CLOUD)
         parts = np.array_split(np.argsort(xyz[:, 0] + xyz[:, 1], kind="stable"), PARTS)
         for name in made:
             means = [round(float(np.mean(out[name][part])), 5) for part in parts]

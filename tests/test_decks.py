@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from pdal_stages.cli import main
 from pdal_stages.stages.bridges import Bridges
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.structures.decks import DeckRules, find_decks
 from pdal_stages.terrain import filtered_ground
 
@@ -140,7 +141,7 @@ def test_bridges_leave_ground_and_buildings():
     arrays |= {"Classification": given_codes, "Ground": ground}
     stage = Bridges({"code": 20})
     points = stage.points(arrays)
-    out = stage.run(points)["Classification"]
+    out = stage.run(points, WHOLE_CLOUD)["Classification"]
     assert out[deck[:5]].tolist() == [20, 5, 12, 18, 20]
     assert (out == 20).sum() == points.report.figures["decks"] > 0.9 * len(deck)
     assert {"1", "2", "6"} >= set(points.report.figures["left"])

@@ -21,6 +21,7 @@ from pdal_stages.base.errors import ModelError
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.json_source import parse_pipeline
 from pdal_stages.stages.base import Stage
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.registry import stage_types
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -131,7 +132,7 @@ def test_the_worked_example_of_a_stage_works(monkeypatch):
         "HeightAboveGround": np.array([0.1, 1.0, 9.0, 9.0, 2.5]),
     }
     points = made.points(arrays)
-    assert made.run(points)["Classification"].tolist() == [3, 4, 5, 2, 4]
+    assert made.run(points, WHOLE_CLOUD)["Classification"].tolist() == [3, 4, 5, 2, 4]
     assert points.report.figures["changed"] == 3
     assert "medium" in stage.schema()["properties"]
 

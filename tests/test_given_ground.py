@@ -150,10 +150,10 @@ def test_after_csf_as_well():
     stage = stage_from({"type": "filters.modelclassifier", "model": "standard"})
     reach = stage.halo_m()
     before = [({"type": name}, {"HeightAboveGround": "double"}) for name in ("filters.csf", "filters.hag_nn")]  # fmt: skip
-    _, warning = settle_upstream(stage, before)
+    placed, _ = settle_upstream(stage, before)
+    warning = placed.check_upstream()
     assert "filters.csf" in warning and "from points of class 2 Ground, Height" in warning
-    assert stage.reads() == ["HeightAboveGround"] and stage.halo_m() > reach
-    settle_upstream(stage, [])
+    assert placed.reads() == ["HeightAboveGround"] and placed.halo_m() > reach
     assert "Ground" in stage.reads() and stage.halo_m() == reach
 
 

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.detached_noise import DetachedNoise
 from pdal_stages.terrain import low_outliers, noise
 from pdal_stages.terrain.noise import detached_noise
@@ -476,7 +477,7 @@ def test_the_stage_keeps_classes_and_where_and_takes_codes():
     codes[truth == 18] = 5
     stage = DetachedNoise({"where": "Classification != 5", "low_class": 65})
     points = stage.points(arrays_of(xyz, codes))
-    out = stage.run(points)["Classification"]
+    out = stage.run(points, WHOLE_CLOUD)["Classification"]
     assert (out[truth == 18] == 5).all() and (out[truth == 0] == 2).all()
     assert (out[truth == 7] == 65).mean() > 0.9
     assert points.report.figures["low"] == (out == 65).sum() and points.report.figures["high"] == 0

@@ -9,6 +9,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline.run import Pipeline
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.registry import stage_type
 from pdal_stages.synthetic import write_town
 
@@ -28,7 +29,7 @@ def run_stage(arrays, **options):
     made = {
         name: np.zeros(len(arrays["X"]), "u8") for name in stage.creates() if name not in arrays
     }
-    return stage.run(stage.points({**arrays, **made}))
+    return stage.run(stage.points({**arrays, **made}), WHOLE_CLOUD)
 
 
 def stages(source, target, **options):

@@ -14,6 +14,7 @@ import pdal_stages as ps
 from pdal_stages.base import polygons as overlays
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.polygons import Overlay, points_inside
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.polygons import Polygons
 
 pyogrio, shapely, pyproj = (pytest.importorskip(name) for name in ("pyogrio", "shapely", "pyproj"))
@@ -56,7 +57,7 @@ def inside(arrays, *shapes):
 def run(polygons, arrays, epsg=RD, **more):
     stage = Polygons({"polygons": polygons, **more})
     points = stage.points(arrays, wkt=pyproj.CRS(epsg).to_wkt("WKT1_GDAL") if epsg else "")
-    return stage.run(points)["Classification"], points.report
+    return stage.run(points, WHOLE_CLOUD)["Classification"], points.report
 
 
 def test_what_is_written_for_a_file_and_a_class():
@@ -234,9 +235,9 @@ def test_what_cannot_be_read_after_the_check_is_an_error_of_ours(tmp_path, monke
     with pytest.raises(
         StageError, match=r"lake.gpkg: the vector file cannot be read.*GEOSException"
     ):
-        stage.run(points)
+        stage.run(points, WHOLE_CLOUD)
     monkeypatch.setattr(shapely, "from_wkb", real)
     monkeypatch.setattr(Overlay, "check", lambda self: "lake")
     (tmp_path / "lake.gpkg").write_bytes(b"no GeoPackage any more")
     with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read"):
-        stage.run(points)
+        stage.run(points, WHOLE_CLOUD)

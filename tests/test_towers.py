@@ -10,6 +10,7 @@ import pytest
 from corridor_scenes import CORRIDORS
 from scipy.cluster.hierarchy import fcluster, linkage
 
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.wires import Wires
 from pdal_stages.structures import towers
 from pdal_stages.structures import wires as lines
@@ -108,7 +109,7 @@ def test_the_stage_gives_towers_their_class():
     }
     stage = Wires({"towers": True, "tower_code": 65})
     points = stage.points(arrays)
-    after = stage.run(points)["Classification"]
+    after = stage.run(points, WHOLE_CLOUD)["Classification"]
     tower = found(xyz, height, wire)
     assert np.array_equal(after, np.where(tower, 65, np.where(wire, 14, before)))
     assert points.report.figures["towers"] == tower.sum() > 1000

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 import pdal_stages.synthetic
+from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.wires import Wires
 from pdal_stages.structures import wires
 from pdal_stages.structures.wires import find_wires
@@ -165,7 +166,7 @@ def test_the_stage_gives_wires_their_class():
     }
     stage = Wires({})
     points = stage.points(arrays)
-    after = stage.run(points)["Classification"]
+    after = stage.run(points, WHOLE_CLOUD)["Classification"]
     wire = found(xyz) & (before != 12)
     assert np.array_equal(after, np.where(wire, 14, before))
     assert points.report.figures["wires"] == wire.sum()

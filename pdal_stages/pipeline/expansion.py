@@ -159,8 +159,8 @@ def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str])
 
 def settle_upstream(
     stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]
-) -> tuple[list[dict[str, Any]], str | None]:
-    """Tell a stage which earlier stages created what it reads; returns these, and a warning for the user.
+) -> tuple[Stage, bool]:
+    """Return a stage placed after those that created what it reads, and whether any created what it creates.
 
     `before` are the earlier stages in order, as written, each with the dimensions it creates: :meth:`Stage.creates`, or
     :func:`heights_of` for PDAL's own.
@@ -169,8 +169,8 @@ def settle_upstream(
         "Classification"
     }  # which noise is marked in, too: it is no preparation
     makers = [preprocessing.entry(given) for given, creates in before if wanted & set(creates)]
-    stage.makes_again = any(set(creates) & set(stage.creates()) for _, creates in before)
-    return makers, stage.follows(makers)
+    created_before = any(set(creates) & set(stage.creates()) for _, creates in before)
+    return stage.after(makers), created_before
 
 
 def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
@@ -179,19 +179,20 @@ def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _follow_preparations(expanded: Expanded) -> None:
-    """Tell each of our stages which earlier stages created what it reads."""
+    """Place each of our stages after the earlier ones that created what it reads."""
     numbered = {ours.index: ours for ours in expanded.ours}
     before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
     for index, plain in enumerate(expanded.stages):
         if (ours := numbered.get(index)) is None:
             before.append((plain, heights_of(plain)))
             continue
-        makers, warning = settle_upstream(ours.stage, before)
-        if ours.stage.makes_again:
-            plain["pdalargs"]["makes_again"] = True
-        if makers:
-            plain["pdalargs"]["preparation"] = makers
-        if warning is not None:
+        ours.stage, created_before = settle_upstream(ours.stage, before)
+        if created_before:
+            ours.update_context(created_before=True)
+            plain["pdalargs"]["created_before"] = True
+        if ours.stage.upstream:
+            plain["pdalargs"]["preparation"] = list(ours.stage.upstream)
+        if (warning := ours.stage.check_upstream()) is not None:
             expanded.warnings.append(warning)
         before.append((ours.given, ours.stage.creates()))
 

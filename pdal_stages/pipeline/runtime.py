@@ -15,7 +15,7 @@ import sys
 import uuid
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
 from weakref import WeakValueDictionary
@@ -25,6 +25,7 @@ import numpy as np
 from ..base.errors import InterruptedStage, StageError
 from ..base.report import Report
 from ..stages.base import Stage
+from ..stages.context import WHOLE_CLOUD, StageContext
 from ..stages.points import Points
 from ..stages.preprocessing import NEEDS_GROUND
 from ..stages.registry import place, stage_from
@@ -40,8 +41,13 @@ class ExpandedStage:
     index: int  #: its index in the expanded list
     given: dict[str, Any]  #: the stage as it was written
     plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
+    context: StageContext = WHOLE_CLOUD  #: what its runs are told
     reports: list[Report] = field(default_factory=list)  #: one per point view
     failure: StageError | None = None
+
+    def update_context(self, **facts: Any) -> None:
+        """Put facts into the context of the runs to come."""
+        self.context = replace(self.context, **facts)
 
 
 #: Gets the script's globals, the dimensions, and a dict for those to write back.
@@ -140,17 +146,21 @@ def _run_one(
     if isinstance(held, Callback):
         held.function(module, ins, outs)
         return
-    report = run_on_view(held.stage if held else _made_again(arguments), module, ins, outs)
+    stage, context = (held.stage, held.context) if held else _made_again(arguments)
+    report = run_on_view(stage, context, module, ins, outs)
     module["out_metadata"] = node(arguments["stage"], leaves(report))
     if held:
         held.reports.append(report)
 
 
-def points_of(stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any]) -> Points:
+def points_of(
+    stage: Stage, context: StageContext, module: Mapping[str, Any], ins: Mapping[str, Any]
+) -> Points:
     """The points of a view, as a stage sees them, from what PDAL sets in a script's globals."""
     metadata = module.get("metadata")
     return stage.points(
         ins,
+        context,
         wkt=wkt_of(module.get("spatialreference")),
         legacy_flags=pdal_env.flags_inside_classification(ins, metadata),
         overlap_as_flag=pdal_env.overlap_as_flag(ins, metadata),
@@ -170,28 +180,31 @@ def points_of_views(
     )
 
 
-def _made_again(arguments: Mapping[str, Any]) -> Stage:
-    """The stage of an expanded pipeline, in another process than the one that expanded it."""
+def _made_again(arguments: Mapping[str, Any]) -> tuple[Stage, StageContext]:
+    """Return the stage of an expanded pipeline, in another process than the one that expanded it."""
     named = {"type": arguments["stage"], "tag": arguments.get("tag")}
     stage = stage_from({**arguments.get("options", {}), **named})
-    stage.makes_again = arguments.get("makes_again", False)
-    stage.follows(arguments.get("preparation", []))
-    return stage
+    created_before = arguments.get("created_before", False)
+    return stage.after(arguments.get("preparation", ())), StageContext(created_before)
 
 
 def run_on_view(
-    stage: Stage, module: Mapping[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
+    stage: Stage,
+    context: StageContext,
+    module: Mapping[str, Any],
+    ins: Mapping[str, Any],
+    outs: dict[str, Any],
 ) -> Report:
     """Run a stage on one view; its report."""
     _refuse_overwritten(module.get("metadata"))
-    points = points_of(stage, module, ins)
+    points = points_of(stage, context, module, ins)
     for name in stage.reads():
         if name not in ins:
             raise points.missing(name, stage.hint)
     if not points.count:
         return run_on_nothing(stage)
     points.lent_by_pdal = ins.keys() - outs.keys() if isinstance(ins, dict) else set()
-    for name, values in stage.run(points).items():
+    for name, values in stage.run(points, context).items():
         target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.
         array = np.ascontiguousarray(values, dtype=target)

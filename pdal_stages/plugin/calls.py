@@ -18,6 +18,7 @@ from ..base.errors import StageError
 from ..base.version import __version__
 from ..pipeline import expansion, runtime
 from ..stages.base import Stage
+from ..stages.context import StageContext
 from ..stages.registry import place, stage_from, stage_type, stage_types
 from . import declarations
 
@@ -39,15 +40,16 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     # PDAL's module object stays alive; the register need not grow.
     sys.modules.pop(question["label"], None)
     try:
-        stage, warning = _made(question)
+        stage, context = _made(question)
         if question["step"] == "prepare":
             said = [
                 runtime.leaf("dimension", f"{name}={kind}")
                 for name, kind in stage.creates().items()
             ]
+            warning = stage.check_upstream()
             warnings = [warning] if warning else []
         else:
-            report = runtime.run_on_view(stage, module, ins, outs)
+            report = runtime.run_on_view(stage, context, module, ins, outs)
             said, warnings = runtime.leaves(report), report.messages
         said += [runtime.leaf("pdal_stages_warning", text) for text in warnings]
     except BaseException as error:
@@ -57,8 +59,8 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     return True
 
 
-def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
-    """The stage of a call, and a warning about the stages before it."""
+def _made(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
+    """Return the stage of a call, placed in its pipeline, and its context."""
     kind = stage_type(question["stage"])
     if (question["version"], question["digest"]) != (__version__, declarations.digest(kind)):
         raise StageError(
@@ -73,7 +75,9 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, str | None]:
     before = _stages(question["pipeline"])[:-1]
     named = {"type": kind.type, "tag": question.get("tag")}
     stage = stage_from({**kind.from_pipeline(given, before), **given, **named})
-    return stage, expansion.settle_upstream(stage, [(one, _creates(one)) for one in before])[1]
+    upstream = [(one, _creates(one)) for one in before]
+    stage, created_before = expansion.settle_upstream(stage, upstream)
+    return stage, StageContext(created_before)
 
 
 def _stages(text: str) -> list[dict[str, Any]]:

@@ -24,6 +24,7 @@ from ..base.units import name_of_wkt
 from ..classifier.load_model import loaded_model
 from .apply_model import ApplyModel
 from .base import Stage, files_read
+from .context import StageContext
 from .options import option
 from .points import Points
 from .selection import Selection
@@ -103,7 +104,7 @@ class AccuracyStage(Stage):
     def reads(self) -> list[str]:
         return [self.dimension, self.reference]
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         self.compare([("", points)], points.report)
         return {}
 

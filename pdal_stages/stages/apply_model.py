@@ -20,6 +20,7 @@ from ..classifier.model import Model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED
 from .base import Stage
+from .context import WHOLE_CLOUD, StageContext
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
 from .preprocessing import OF_PDAL, as_json, same, with_given_ground
@@ -177,20 +178,21 @@ class ApplyModel(Stage):
             else None
         )
 
-    #: Whether heights come from PDAL's stages, which measure from points of class 2.
-    measured_by_pdal: bool = False
+    @property
+    def measured_by_pdal(self) -> bool:
+        """Whether heights come from PDAL's stages, which measure from points of class 2."""
+        types = {stage["type"] for stage in self.upstream}
+        return bool(types) and types <= {*OF_PDAL}
 
-    def follows(self, preparation: list[dict[str, Any]]) -> str | None:
-        types = [stage["type"] for stage in preparation]
-        self.measured_by_pdal = bool(types) and {*types} <= {*OF_PDAL}
-        if not self.preparation or not preparation or same(preparation, self.preparation):
+    def check_upstream(self) -> str | None:
+        if not self.preparation or not self.upstream or same(self.upstream, self.preparation):
             return None
-        if self.given_ground and same(preparation, with_given_ground(self.preparation)):
+        if self.given_ground and same(self.upstream, with_given_ground(self.preparation)):
             return None
         made = ", ".join(self.made_from_ground)
         return (
             f"{self.type}: the model was trained on other heights than this pipeline makes. Trained on: "
-            f"{as_json(self.preparation)}. Here: {as_json(preparation)}"
+            f"{as_json(self.preparation)}. Here: {as_json(self.upstream)}"
             f"{f', and from points of class 2 {made}' if made else ''}. Expect lower accuracy, or use the former"
         )
 
@@ -245,7 +247,7 @@ class ApplyModel(Stage):
         unsure = UNCLASSIFIED if self.keep_sure is not None else None
         return unsure if self.rejected_code is None else self.rejected_code
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
         current = points.class_codes
@@ -330,7 +332,8 @@ class ApplyModel(Stage):
         stage = self._of_ground
         created = {name: np.zeros(points.count, np.float32) for name in stage.creates()}
         arrays = {**points.arrays, **created}
-        made = stage.run(stage.points(arrays, wkt=points.wkt, legacy_flags=points.legacy_flags))
+        seen = stage.points(arrays, wkt=points.wkt, legacy_flags=points.legacy_flags)
+        made = stage.run(seen, WHOLE_CLOUD)
         points.arrays = {**points.arrays, **{name: made[name] for name in names}}
 
     def _may_be_ground(self, points: Points) -> NDArray[np.bool_]:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
 from ..base.units import named_unit
+from .context import WHOLE_CLOUD, StageContext
 from .options import Option, option, parse_options
 from .points import Points
 from .selection import Expression
@@ -48,6 +49,8 @@ class Stage(ABC):
     ----------
     options : dict
         Every option's parsed value by its name.
+    given : frozenset of str
+        Names of the options that the user gave.
 
     Raises
     ------
@@ -94,17 +97,12 @@ class Stage(ABC):
         "Unit of z, where the spatial reference does not say; otherwise that of x and y",
     )
 
-    #: In tiles: a dimension, how many meters outside a point lies, below zero for the tile's own, which reports count alone;
-    #: and how far outside results of this stage are still used.
-    own_points: str = ""
-    used_m: float = 0.0
-    #: Whether stages before it in the pipeline make what it makes too.
-    makes_again: bool = False
-    #: Set where a pipeline's writer cannot hold codes above 31: what to say of them, and the cure.
-    code_limit: tuple[str, str] | None = None
+    #: The stages before it in the pipeline that create what it reads, as a model's preprocessing holds them.
+    upstream: tuple[Mapping[str, Any], ...] = ()
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
         self.place = place or self.type
+        self.given = frozenset(given)
         try:
             self.options = parse_options(self.all_options(), given)
             for name in ("horizontal_unit", "vertical_unit"):
@@ -116,6 +114,18 @@ class Stage(ABC):
                 check_writable(output.path, output.what, output.kind)
         except StageError as error:
             raise error.prefixed(self.place) from None
+        self._frozen = True
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_frozen" in self.__dict__:
+            raise AttributeError(f"a stage cannot be changed after it is made: '{name}' is set")
+        super().__setattr__(name, value)
+
+    def after(self, makers: Iterable[Mapping[str, Any]]) -> Self:
+        """Return this stage placed behind the stages of a pipeline that create what it reads."""
+        placed = copy.copy(self)
+        placed.__dict__["upstream"] = tuple(makers)
+        return placed
 
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:
@@ -135,8 +145,8 @@ class Stage(ABC):
     def check(self) -> None:
         """Refuse options that contradict each other; read the files they name."""
 
-    def follows(self, preparation: list[dict[str, Any]]) -> str | None:
-        """Told, before it runs in a pipeline, which stages made what it reads; what the user should know of it."""
+    def check_upstream(self) -> str | None:
+        """Return a warning about the stages upstream (:attr:`upstream`); None where they fit."""
         return None
 
     @property
@@ -168,11 +178,22 @@ class Stage(ABC):
         """The largest class code the stage may write to `Classification` (0: none)."""
         return 0
 
-    def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
-        """How far around a box lie the points that decide the results of the wanted ones, for an open-ended stage.
+    def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
+        """Return how far around a tile lie the points that decide its results, for an open-ended stage.
 
-        `points` are what was read: the box (min x, min y, max x, max y) and some surroundings. All in meters; more than
-        was read, where that was not enough.
+        Parameters
+        ----------
+        points : Points
+            What was read: the tile and some surroundings.
+        context : StageContext
+            It tells which results are used.
+        box : sequence of float
+            Min x, min y, max x, max y of the tile in meters.
+
+        Returns
+        -------
+        float
+            Meters; more than was read where that was not enough, infinity where nobody knows.
         """
         return 0.0
 
@@ -186,6 +207,7 @@ class Stage(ABC):
     def points(
         self,
         arrays: Mapping[str, NDArray],
+        context: StageContext = WHOLE_CLOUD,
         *,
         wkt: str = "",
         legacy_flags: bool = False,
@@ -193,8 +215,6 @@ class Stage(ABC):
     ) -> Points:
         """PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
-        own = arrays.get(self.own_points)
-        used = self.used(arrays) if self.where_chooses and own is not None else None
         return Points(
             arrays,
             wkt,
@@ -202,19 +222,27 @@ class Stage(ABC):
             units,
             legacy_flags,
             overlap_as_flag,
-            own,
-            used,
-            self.code_limit,
+            arrays.get(context.outside),
+            context.used(arrays) if self.where_chooses else None,
+            context.code_limit,
         )
 
-    def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-        """In tiles: the points whose results are used."""
-        outside = arrays[self.own_points]
-        return outside <= self.used_m if self.used_m > 0 else outside < 0
-
     @abstractmethod
-    def run(self, points: Points) -> dict[str, NDArray]:
-        """Do the work on points, of which there are some; return the dimensions that change, one value per point."""
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Process the points of one view; return the dimensions that change.
+
+        Parameters
+        ----------
+        points : Points
+            At least one.
+        context : StageContext
+            The tile and the pipeline around the stage.
+
+        Returns
+        -------
+        dict
+            Dimension -> (n,) values for all points, those outside `where` included.
+        """
 
     @classmethod
     def schema(cls) -> dict[str, Any]:

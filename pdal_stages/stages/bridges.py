@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..base.asprs import BRIDGE
 from ..structures.decks import RULES, find_decks
 from .base import ClassStage
+from .context import StageContext
 from .options import code_option, ignore_option, keep_option
 from .points import Points, class_counts
 from .selection import Selection
@@ -36,7 +37,7 @@ class Bridges(ClassStage):
     def largest_class(self) -> int:
         return self.code
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         ignored, ground = points.ignored(self.ignore), points.dimension("Ground") != 0
         before = points.class_codes
         free = points.inside & ~ignored & ~points.chosen(self.keep)

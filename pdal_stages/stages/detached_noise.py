@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..base.asprs import NOISE
 from ..terrain.noise import REACH, detached_noise
 from .base import ClassStage
+from .context import StageContext
 from .options import code_option, ignore_option, option
 from .points import Points, class_counts
 from .selection import Selection
@@ -54,7 +55,7 @@ class DetachedNoise(ClassStage):
     def largest_class(self) -> int:
         return max(self.low_class, self.high_class)
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         ignored = points.ignored(self.ignore)
         found = detached_noise(
             *points.axes,

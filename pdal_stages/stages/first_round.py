@@ -35,9 +35,6 @@ def inside_block(block: tuple[int, int]) -> str:
 class FarReaching(Stage):
     """A stage whose far reach tiles replace by blocks."""
 
-    #: In tiles: what :meth:`made_of_blocks` returned.
-    from_blocks: Any = None
-
     @abstractmethod
     def blocks(self) -> Blocks | None:
         """Return the blocks that the stage needs; None where its options make it look no farther than its halo."""
@@ -61,4 +58,4 @@ class FarReaching(Stage):
 
     @abstractmethod
     def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
-        """Return :attr:`from_blocks` made of these arrays of the blocks that a box touches."""
+        """Return :attr:`StageContext.blocks` made of these arrays of the blocks that a box touches."""

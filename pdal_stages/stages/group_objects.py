@@ -26,6 +26,7 @@ from ..objects.detect import find_objects
 from ..objects.raster_view import MARGIN
 from ..objects.results import Objects, ObjectSettings
 from .base import Stage
+from .context import StageContext
 from .options import code_option, ignore_option, option
 from .points import Points
 from .selection import Selection
@@ -64,7 +65,6 @@ class ObjectOptions:
     ignore: Selection = ignore_option("Points that belong to no object")
 
     options: dict[str, Any]
-    own_points: str
 
     @cached_property
     def settings(self) -> ObjectSettings:
@@ -81,7 +81,7 @@ class ObjectOptions:
         for name in self.options["refuse"]:
             checks.one_of("a reason in option 'refuse'", name, REASONS)
 
-    def cells(self, points: Points) -> Cells:
+    def cells(self, points: Points, context: StageContext) -> Cells:
         """Records of the points that may be of objects, or are ground.
 
         Raises
@@ -93,7 +93,7 @@ class ObjectOptions:
         try:
             refuse_unclassified(cells, points.class_codes[points.usable(self.ignore)])
         except StageError as error:
-            if not self.own_points:
+            if not context.outside:
                 raise
             points.report.warnings.append(str(error))
         if thin := cells.sparse_kind():
@@ -161,12 +161,13 @@ class GroupObjects(ObjectOptions, Stage):
     def halo_m(self) -> float:
         return MARGIN + 4 * self.settings.cell
 
-    def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
-        if not wanted.any():
+    def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
+        wanted = context.used(points.arrays)
+        if wanted is None or not wanted.any():
             return 0.0
         unit, size = points.units.horizontal, self.settings.cell
         west, south, east, north = (value * unit for value in box)
-        found = self._found(points)
+        found = self._found(points, context)
         mine = np.unique(self._ids(found, points)[wanted])
         away = 0.0
         for kind in (Kind.BUILDING, Kind.SPAN, Kind.DECK):
@@ -182,16 +183,16 @@ class GroupObjects(ObjectOptions, Stage):
                 away = max(away, *beyond)
         return float(away) + self.halo_m()
 
-    def _found(self, points: Points) -> Objects:
-        return find_objects(self.cells(points), self.settings, progress=False)
+    def _found(self, points: Points, context: StageContext) -> Objects:
+        return find_objects(self.cells(points, context), self.settings, progress=False)
 
     def _ids(self, found: Objects, points: Points) -> NDArray[np.int64]:
         kinds = kind_of_code(self.classes)[points.class_codes]
         kinds[~points.inside | points.chosen(self.ignore)] = -1
         return found.ids_at(points.xyz[:, 0], points.xyz[:, 1], kinds)
 
-    def run(self, points: Points) -> dict[str, NDArray]:
-        found = self._found(points)
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        found = self._found(points, context)
         ids = self._ids(found, points)
         out: dict[str, NDArray] = {"ObjectID": ids}
         if self.judged:

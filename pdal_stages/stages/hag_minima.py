@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
 from .base import HEIGHTS_OUTSIDE, Stage
+from .context import StageContext
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
@@ -52,19 +53,22 @@ class HagMinima(Stage):
         # empty cell is filled from the nearest ones with points.
         return 4.0 * self.cell
 
-    def reach_of(self, points: Points, wanted: NDArray[np.bool_], box: Sequence[float]) -> float:
+    def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
+        used = context.used(points.arrays)
+        if used is None:
+            return 0.0
         x, y, _ = points.xyz.T
         return terrain_reach(
-            x, y, points.usable(self.ignore), wanted, box, self.cell, self.resolution
+            x, y, points.usable(self.ignore), used, box, self.cell, self.resolution
         )
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         x, y, z = points.xyz.T
         forms = points.usable(self.ignore)
         if points.mask is not None and not points.mask.any():  # which the report says
             return {}
         terrain = MinimaTerrain(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)
-        wanted = points.wanting("HeightAboveGround", self.makes_again)
+        wanted = points.wanting("HeightAboveGround", context.created_before)
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
         height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical
         points.report.figures |= terrain.figures

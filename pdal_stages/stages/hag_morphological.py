@@ -24,6 +24,7 @@ from ..terrain.heights import filtered_ground
 from ..terrain.openings import opening_names
 from ..terrain.smrf import FilterOptions
 from .base import HEIGHTS_OUTSIDE
+from .context import StageContext
 from .first_round import Blocks, FarReaching, inside_block
 from .options import ignore_option, option
 from .points import Points
@@ -128,9 +129,6 @@ class HagMorphological(FarReaching):
             return reach_of_given(self._filter) * self.cell
         return self._filter.reach_of_points * self.cell
 
-    #: In tiles: what :meth:`made_of_blocks` gave.
-    from_blocks: GroundCells | None = None
-
     def blocks(self) -> Blocks | None:
         """How far the rounds before the tiles reach; all that a point's height depends on is in cells."""
         if self.given_ground:
@@ -163,14 +161,13 @@ class HagMorphological(FarReaching):
         return GroundCells.names_within(_PART, *(math.floor(side / self.cell) for side in box))
 
     def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
-        """At last, :attr:`from_blocks` out of these arrays of the blocks that a box touches."""
+        """At last, the context's `blocks` out of these arrays of the blocks that a box touches."""
         return GroundCells.of_blocks(blocks, len(self.openings))
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         usable = points.usable(self.ignore)
-        wanted = points.wanting("HeightAboveGround", self.makes_again)
+        wanted = points.wanting("HeightAboveGround", context.created_before)
         all_wanted = bool(wanted.all())
-        cells, self.from_blocks = self.from_blocks, None  # needed once
         given = usable & (points.class_codes == GROUND) if self.given_ground else None
         if given is not None and not given.any():
             raise NoTerrainError(
@@ -184,7 +181,7 @@ class HagMorphological(FarReaching):
             **vars(self._filter),
             slope_too=self.terrain_slope,
             threads=self.threads,
-            cells=cells,
+            cells=context.blocks,
             figures=points.report.figures,
             given=given if given is None or all_wanted else given[wanted],
         )

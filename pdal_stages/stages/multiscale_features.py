@@ -18,6 +18,7 @@ from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.registry import ALGORITHM_VERSION
 from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage
+from .context import StageContext
 from .options import ignore_option, option
 from .points import Points
 from .selection import Selection
@@ -131,7 +132,7 @@ class MultiscaleFeatures(Stage):
     def halo_m(self) -> float:
         return self.plan.halo_m + self.voxel
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         plan, names = self.plan, self.columns
         bins, threshold = self._thresholds()
         ignored = points.ignored(self.ignore)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..base.polygons import Overlay, inside_of
 from ..base.vector import with_vector
 from .base import ClassStage
+from .context import StageContext
 from .options import ignore_option, keep_option, option
 from .points import TOUCH_NONE, Points, class_counts
 from .selection import Selection
@@ -40,7 +41,7 @@ class Polygons(ClassStage):
     def largest_class(self) -> int:
         return max((overlay.code for overlay in self.overlays), default=0)
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         change = points.changeable(self.ignore, self.keep)
         x, y = (np.asarray(points.arrays[name], np.float64) for name in "XY")
         box = float(x.min()), float(y.min()), float(x.max()), float(y.max())

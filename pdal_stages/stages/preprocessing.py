@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, StageError
 from ..base.las import number_type
+from .context import WHOLE_CLOUD
 from .options import Option, split_list
 from .registry import stage_type, stage_types
 
@@ -225,5 +226,5 @@ def made_of_coordinates(
     columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **there}
     if classes is not None:
         columns["Classification"] = classes
-    made = stage.run(stage.points(columns))
+    made = stage.run(stage.points(columns), WHOLE_CLOUD)
     return {name: values.astype(there[name].dtype, copy=False) for name, values in made.items()}

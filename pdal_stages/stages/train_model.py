@@ -35,6 +35,7 @@ from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
 from .base import Stage, files_read
 from .checked_points import SURE, CheckedChoice, CheckedPoints
+from .context import StageContext
 from .options import option
 from .points import Points
 from .preprocessing import check
@@ -147,8 +148,6 @@ class TrainModel(Stage):
         for name in ("max_features", "max_depth"):
             if isinstance(given.get(name), int | float) and not isinstance(given[name], bool):
                 given[name] = str(given[name])
-        self._preparation: list[dict[str, Any]] = []
-        self._by_hand: list[str] = []
         super().__init__(given, place)
 
     @classmethod
@@ -161,18 +160,20 @@ class TrainModel(Stage):
     def describe_choices(cls) -> str:
         return describe_recipes()
 
-    def follows(self, preparation: list[dict[str, Any]]) -> str | None:
-        self._preparation, self._by_hand = [], []
+    def check_upstream(self) -> str | None:
         try:
-            self._preparation = check(preparation)
+            check(self.upstream)
         except ModelError as error:
-            self._by_hand = [str(stage["type"]) for stage in preparation]
             return (
                 f"{self.type}: the model will not hold the stages before it, so `classify` cannot run them by itself: "
                 f"{error.what}{f' (found {error.found})' if error.found is not None else ''}. Write a pipeline with "
-                f"the same stages, {', '.join(self._by_hand)}, before filters.modelclassifier"
+                f"the same stages, {', '.join(self._upstream_types)}, before filters.modelclassifier"
             )
         return None
+
+    @property
+    def _upstream_types(self) -> list[str]:
+        return [str(stage["type"]) for stage in self.upstream]
 
     @cached_property
     def training(self) -> TrainingOptions:
@@ -227,7 +228,7 @@ class TrainModel(Stage):
         own = [name for name in (self.survey, self.groups) if name]
         return [self.label, *own, *required_dimensions(self.training.inputs)]
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         training = self.training_on(points)
         clouds = [cloud for _, cloud in self.surveys(self.cloud_of(points, training))]
         self.finish(train(clouds, training), points.report)
@@ -265,18 +266,20 @@ class TrainModel(Stage):
 
     def finish(self, model: Model, report: Report) -> None:
         """Write the model, and report what is to be known of it."""
+        by_hand = self.check_upstream() is not None
+        preprocessing = [] if by_hand else check(self.upstream)
         if self.base is None:
-            model.record_preprocessing(self._preparation)
+            model.record_preprocessing(preprocessing)
         else:
-            model.info["preparation"] = self._preparation
+            model.info["preparation"] = preprocessing
             model.info["base"] = {"name": Path(self.base).stem, "sha256": digest_of(self.base)}
             if "checked" in report.figures and "sureness" in model.info:
                 before = loaded_model(self.base).info
                 model.info["sureness"] = of_the_base(
                     model.info["sureness"], before, find(self.base)
                 )
-        if self._by_hand:
-            model.info["by_hand"] = self._by_hand
+        if by_hand:
+            model.info["by_hand"] = self._upstream_types
         model.save(self.filename)
         shown = {key: model.info[key] for key in _SHOWN if key in model.info}
         report.figures |= {"model": self.filename, **shown}

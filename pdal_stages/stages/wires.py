@@ -10,6 +10,7 @@ from ..structures import towers
 from ..structures.towers import find_towers
 from ..structures.wires import RULES, find_wires
 from .base import ClassStage
+from .context import StageContext
 from .options import code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
 from .selection import Selection
@@ -38,7 +39,7 @@ class Wires(ClassStage):
     def largest_class(self) -> int:
         return max(self.code, self.tower_code) if self.towers else self.code
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         ignored = points.ignored(self.ignore)
         height = np.asarray(points.dimension("HeightAboveGround"), np.float64)
         free = points.inside & ~ignored & ~points.chosen(self.keep)

@@ -8,6 +8,7 @@ from ..base.files import Output
 from ..base.vector import with_vector
 from ..objects.detect import find_objects
 from .base import Stage
+from .context import StageContext
 from .group_objects import ObjectOptions
 from .options import option
 from .points import Points
@@ -35,9 +36,6 @@ class WriteObjects(ObjectOptions, Stage):
         choices=(STRAIGHT, CELLS),
     )
 
-    #: Whether whoever reads the files may take larger cells than `cell` where points are few.
-    widens = False
-
     def check(self) -> None:
         from ..reports.object_layers import check_target
 
@@ -52,10 +50,12 @@ class WriteObjects(ObjectOptions, Stage):
     def reads(self) -> list[str]:
         return ["Classification"]
 
-    def run(self, points: Points) -> dict[str, NDArray]:
+    def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         from ..reports.object_layers import write_objects
 
-        found, refused = find_objects(self.cells(points), self.settings).without(self.refuse)
+        found, refused = find_objects(self.cells(points, context), self.settings).without(
+            self.refuse
+        )
         if self.refuse:
             points.report.figures["refused"] = refused
         straight = self.outlines == STRAIGHT

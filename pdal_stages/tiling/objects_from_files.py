@@ -90,9 +90,7 @@ def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> Wri
                 "objects takes only options of writers.objects and filters.objects", found=one.flag
             )
         given[one.option] = one.value
-    stage = WriteObjects({**given, "filename": output})
-    stage.widens = "cell" not in given
-    return stage
+    return WriteObjects({**given, "filename": output})
 
 
 def _find_in_files(
@@ -105,13 +103,14 @@ def _find_in_files(
     wkt = references[inputs[0]].wkt
     cells = _all_cells(inputs, stage, wkt, workers)
     size, thin = cells.size, cells.sparse_kind()
-    while stage.widens and cells.sparse_kind() and cells.size < LARGEST:
+    widens = "cell" not in stage.given
+    while widens and cells.sparse_kind() and cells.size < LARGEST:
         cells = cells.doubled()
     if thin:
         too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
         print_messages(
             f"{too_few}, so cells of {cells.size:g} m are used, where roofs look rougher; --cell {size:g} keeps smaller ones"
-            if stage.widens
+            if widens
             else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
         )
     found = find_objects(cells, replace(stage.settings, cell=cells.size))

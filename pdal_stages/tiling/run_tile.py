@@ -18,6 +18,7 @@ from ..pipeline.las_output import REPLACED, check_writers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, Function, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
+from ..stages.context import WHOLE_CLOUD
 from ..stages.first_round import FarReaching
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
 from ..stages.registry import stage_types
@@ -73,10 +74,10 @@ def run_head(
     def reach(
         number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
     ) -> None:
-        stage = ours[number].stage
-        points = points_of(stage, module, ins)
+        one = ours[number]
+        points = points_of(one.stage, one.context, module, ins)
         box = [side * points.units.horizontal for side in context.grid.box(tile)]
-        needs.append(stage.reach_of(points, stage.used(ins), box))
+        needs.append(one.stage.reach_of(points, one.context, box))
 
     def take(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         wanted = ins if plan.creates is None else plan.creates
@@ -107,14 +108,14 @@ def run_head(
     ours = {one.number: one for one in pipeline.expanded.ours}
     check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
     for one in ours.values():
-        one.stage.own_points, one.stage.used_m = OUTSIDE, used[one.number]
+        one.update_context(outside=OUTSIDE, used_m=used[one.number])
     if before is not None:  # of the first one alone
         far = next(
-            one.stage
+            one
             for one in ours.values()
             if isinstance(one.stage, FarReaching) and one.stage.blocks() is not None
         )
-        far.from_blocks = before.blocks
+        far.update_context(blocks=before.blocks)
     pipeline.execute(arrays=False)
     reports = [
         report for _, reports in pipeline.reports for report in reports if report.beyond_halo
@@ -205,9 +206,13 @@ def run_first_round(
     def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         mine = ins[OUTSIDE] < 0
         if mine.any():
-            left.append(stage.left_of(points_of(stage, module, {n: ins[n][mine] for n in ins})))
+            own = {name: ins[name][mine] for name in ins}
+            left.append(stage.left_of(points_of(stage, WHOLE_CLOUD, module, own)))
 
-    before = replace(plan, head=plan.head[: first.at], creates=first.kept or [], first=None)
+    # Class codes that do not fit the writers may still be changed by the stages after these: no tail.
+    before = replace(
+        plan, head=plan.head[: first.at], tail=[], creates=first.kept or [], first=None
+    )
     context = replace(context, plan=before, grid=context.squares)
     head = HeadRun([])
     with TemporaryDirectory(

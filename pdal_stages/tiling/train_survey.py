@@ -165,13 +165,15 @@ class TrainTask:
 
     def run(self) -> list[str]:
         """Train and write the model; returns messages."""
-        stage = self.stage
-        base = stage.training.base
+        base = self.stage.training.base
         made_by = (
-            preparation_of(stage.wished) if base is None else base.info.get("preparation") or []
+            preparation_of(self.stage.wished)
+            if base is None
+            else base.info.get("preparation") or []
         )
         heights = [overridden(one, self.overrides) for one in made_by]
-        told = [follows] if (follows := stage.follows(heights)) is not None else []
+        stage = self.stage.after(heights)
+        told = [warning] if (warning := stage.check_upstream()) is not None else []
         pdal_env.bindings()  # says what is wrong with PDAL before any work
         check_outputs(stage.outputs(), [*self.files, *self.named, *stage_files(stage)])
         report = Report()
