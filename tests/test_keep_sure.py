@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier.calibration import BINS, Sureness, of_the_base, said, sureness_of
+from pdal_stages.classifier.calibration import (
+    BINS,
+    Calibration,
+    calibrate_on_base,
+    read_calibration,
+)
 from pdal_stages.classifier.model_file import find
 from pdal_stages.cli import main
 from pdal_stages.pipeline.classify_request import ClassifyRequest
@@ -24,12 +29,12 @@ def test_limits_are_the_lowest_that_hold(seed, n, accuracy):
     random = np.random.default_rng(seed)
     given_, true = random.choice([2, 6], (2, n))
     reliability = np.round(random.random(n), 3)
-    known = Sureness()
+    known = Calibration()
     half = n // 2  # counted in parts
     known.add(given_[:half], true[:half], reliability[:half])
     known.add(given_[half:], true[half:], reliability[half:])
     bins = np.minimum(np.floor(reliability * BINS), BINS - 1)
-    for code, limit in known.limits(accuracy).items():
+    for code, limit in known.limits(accuracy).classes.items():
         mine = given_ == code
         shares = {}
         for k in range(BINS):
@@ -40,16 +45,16 @@ def test_limits_are_the_lowest_that_hold(seed, n, accuracy):
         if good:
             assert limit.reliability == min(good) / BINS
             assert np.isclose(limit.kept, (mine & (bins >= min(good))).sum() / mine.sum())
-            assert np.isclose(limit.right, shares[min(good)])
+            assert np.isclose(limit.accuracy, shares[min(good)])
         else:
             assert (
                 limit.reliability > 1
                 and limit.kept == 0
-                and np.isclose(limit.right, max(shares.values()))
+                and np.isclose(limit.accuracy, max(shares.values()))
             )
-    again = Sureness.from_dict(json.loads(json.dumps(known.to_dict())))
+    again = Calibration.from_dict(json.loads(json.dumps(known.to_dict())))
     assert again.limits(accuracy) == known.limits(accuracy)
-    assert 0 <= known.kept(known.limits(accuracy)) <= 1
+    assert 0 <= known.limits(accuracy).kept <= 1
 
 
 def test_what_is_damaged_or_not_there_is_refused(tmp_path):
@@ -59,22 +64,22 @@ def test_what_is_damaged_or_not_there_is_refused(tmp_path):
         {"about": "", "classes": 3},
     ):
         with pytest.raises(ModelError):
-            Sureness.from_dict(wrong)
+            Calibration.from_dict(wrong)
     with pytest.raises(OptionError, match="never scored on ground"):
-        sureness_of({}, str(tmp_path / "m.model"))
+        read_calibration({}, str(tmp_path / "m.model"))
     for text in (b"{", b"\xff", b"[]"):
-        (tmp_path / "m.sureness.json").write_bytes(text)
+        (tmp_path / "m.calibration.json").write_bytes(text)
         with pytest.raises(ModelError, match="damaged"):
-            sureness_of({}, str(tmp_path / "m.model"))
+            read_calibration({}, str(tmp_path / "m.model"))
 
 
 def test_the_shipped_model_says_what_it_costs():
     lines = ClassifyRequest(keep_sure=0.95).cost
     assert lines[0].startswith("to be right in 95 % of the points of each class, about ")
     assert any("6 Building" in line for line in lines) and ClassifyRequest().cost == []
-    known = Sureness()
+    known = Calibration()
     known.add(np.array([6, 6]), np.array([6, 2]), np.array([0.9, 0.9]))
-    line = said(known, {}, 0.9)[1]
+    line = known.limits(0.9).describe_cost({})[1]
     assert "no point keeps it" in line
     assert "50.0 % of the most reliable were right; with 0.5, 100.0 % would" in line
     # Of corrections on top of a base: what is known of the base, and of new classes alone what they say: here as many
@@ -83,16 +88,16 @@ def test_the_shipped_model_says_what_it_costs():
         "about": "",
         "classes": {"6": known.to_dict()["classes"]["6"], "14": known.to_dict()["classes"]["6"]},
     }
-    standard = of_the_base({}, {}, find("standard"))
-    joined = of_the_base(own, {}, find("standard"))
+    standard = calibrate_on_base({}, {}, find("standard"))
+    joined = calibrate_on_base(own, {}, find("standard"))
     assert joined["about"] == standard["about"] and standard["about"].startswith("its base (")
     assert {code: joined["classes"][code] for code in standard["classes"]} == standard["classes"]
-    both = Sureness.from_dict(joined)
+    both = Calibration.from_dict(joined)
     assert (
         np.isclose(both.points([14]), both.points([2, 5, 6]), rtol=1e-3)
         and both.points([2, 5, 6]) > 1e6
     )
-    assert of_the_base(own, {}, "nowhere.model") == own
+    assert calibrate_on_base(own, {}, "nowhere.model") == own
     sure = ClassifyRequest(keep_sure=0.98).cost  # buildings stay with 98 %, too
     assert not any("no point keeps it" in line for line in sure)
 
@@ -112,7 +117,7 @@ def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
                               count=1500, passes=1)  # fmt: skip
     heights = {"HeightAboveGround": xyz[:, 2]}
     model = train([TrainingCloud(xyz, label, heights)], options, progress=False)
-    known = Sureness.from_dict(model.info["sureness"])
+    known = Calibration.from_dict(model.info["sureness"])
     assert "held out" in known.about and set(known.right) == {2, 6}
     # As many as the labels, not as the samples.
     assert np.isclose(
@@ -121,7 +126,7 @@ def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
     limits = known.limits(0.9)
     other, truth = blocks(1)
     found = model.predict(other, {"HeightAboveGround": other[:, 2]},
-                          limits={c: one.reliability for c, one in limits.items()}, rejected_code=1)  # fmt: skip
+                          limits=limits, rejected_code=1)  # fmt: skip
     plain = model.predict(other, {"HeightAboveGround": other[:, 2]})
     kept = found.classification != 1
     assert 0 < len(found.unsure) == np.count_nonzero(~kept) < len(other)
@@ -130,7 +135,7 @@ def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
         mine = kept & (found.classification == code)
         all_ = plain.classification == code
         assert (truth[mine] == code).mean() > 0.87 > (truth[all_] == code).mean() - 0.02
-        assert (plain.reliability[all_ & ~kept] < limits[code].reliability).all()
+        assert (plain.reliability[all_ & ~kept] < limits.classes[code].reliability).all()
 
 
 @pytest.mark.pdal

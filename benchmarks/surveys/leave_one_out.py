@@ -33,7 +33,7 @@ from surveys import (
 
 from pdal_stages import TrainingCloud
 from pdal_stages.accuracy import Accuracy
-from pdal_stages.classifier.calibration import Sureness
+from pdal_stages.classifier.calibration import Calibration
 from pdal_stages.reports.pictures import png, triptych
 
 #: Points per square meter that the surveys are thinned to.
@@ -156,14 +156,14 @@ def calibrates(survey: LabeledSurvey) -> bool:
     return survey.landscape != COAST and not survey.tall and survey.tells(VEGETATION)
 
 
-def calibrate(judged: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Sureness:
+def calibrate(judged: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Calibration:
     """Return how often the models were right at which reliability, of surveys whose labels tell what vegetation is.
 
     Rocks and scrub are left out: models that have seen no such land are surely wrong there, and the shipped one has seen it.
     `judged` has classes, truth and reliability (n,) of the scored points by survey.
     """
     names = [name for name in judged if calibrates(SURVEYS[name])]
-    out = Sureness(
+    out = Calibration(
         about=f"{len(names)} surveys ({', '.join(names)}), each classified by a model that had not seen its group"
     )
     # Between all points alike and all surveys alike: limits should hold in a survey, not in the sum of all.
@@ -184,7 +184,7 @@ def main() -> None:
     options.add_argument("--trained", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     options.add_argument("--groups", nargs="+", default=GROUPS, choices=GROUPS)
     options.add_argument("--pictures", type=Path, help="folder for the card's pictures")
-    options.add_argument("--sureness", type=Path, help="where the counts behind --keep-sure go")
+    options.add_argument("--calibration", type=Path, help="where the counts behind --keep-sure go")
     options.add_argument(
         "--save", type=Path, required=True, help="folder for the models and the features"
     )
@@ -217,9 +217,9 @@ def main() -> None:
     print(group_table(runs), survey_table(runs), sep="\n\n")
     if args.json:
         args.json.write_text(json.dumps({"trees": TREES, "surveys": runs}, indent=1) + "\n")
-    if args.sureness:
+    if args.calibration:
         counts = json.dumps(calibrate(judged).to_dict(), separators=(",", ":"))
-        args.sureness.write_text(counts + "\n")
+        args.calibration.write_text(counts + "\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""How often a model was right where it said how sure it was, on ground that it had not seen.
+"""Calibration: how often a model was right at which reliability, on ground that it had not seen.
 
-So it is known from which reliability on the points of a class are right as often as is wanted.
+It tells from which reliability on points keep their class, so that a wanted share of the points that keep it is right.
 """
 
 from __future__ import annotations
@@ -17,90 +17,124 @@ from ..base.checks import strict_json
 from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
 
-#: Reliabilities are counted in so many bins from 0 to 1, the last of which holds 1.
+#: Bins of reliability from 0 to 1; the last one holds 1.
 BINS = 64
-#: What the file beside a model's is called.
-SUFFIX = ".sureness.json"
+#: End of the name of the file beside a model that holds its calibration.
+SUFFIX = ".calibration.json"
+#: A reliability that no point has: every point of the class is rejected.
+UNREACHABLE = 2.0
+#: Significant digits of the counts in a file.
+_DIGITS = 4
 
 
-class Limit(NamedTuple):
-    """For a class: from which reliability on points keep it, the share of its points that do, and how many of these are
-    right."""
+class ClassLimit(NamedTuple):
+    """From which reliability on points keep a class."""
 
-    reliability: float
-    kept: float
-    right: float
+    reliability: float  #: :data:`UNREACHABLE` where no reliability gives the accuracy wanted
+    kept: float  #: share of the class's points that keep it
+    accuracy: (
+        float  #: share of these that are right; where none keeps it, the largest share there is
+    )
+    #: where none keeps it: a lower accuracy, and the share of points that would keep the class with it
+    instead: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class ReliabilityLimits:
+    """Limits by class that keep a wanted share of points right, as the option `keep_sure` asks for."""
+
+    accuracy: float  #: share of points of each class that should be right
+    classes: Mapping[int, ClassLimit]  #: by code
+    kept: float  #: share of all points that keep their class
+
+    def least_reliability(self) -> npt.NDArray[np.float32]:
+        """Return the least reliability (256,) with which a point keeps a class, by its code; 0 for other classes."""
+        least = np.zeros(256, np.float32)
+        for code, limit in self.classes.items():
+            least[code] = limit.reliability
+        return least
+
+    def describe_cost(self, names: Mapping[int, str]) -> list[str]:
+        """Return lines of text: the share of points that is expected to lose its class, by class."""
+        lines = [
+            f"to be right in {100 * self.accuracy:g} % of the points of each class, about "
+            f"{100 * (1 - self.kept):.1f} % of all points are expected to become class 1 (unclassified):"
+        ]
+        for code, limit in self.classes.items():
+            name = f"{code} {names.get(code, '')}".strip()
+            if limit.instead is None:
+                lines.append(
+                    f"  {name}: {100 * limit.kept:.1f} % keep it, from reliability {limit.reliability:.2f} on"
+                )
+            else:
+                accuracy, share = limit.instead
+                lines.append(
+                    f"  {name}: no point keeps it, as at most {100 * limit.accuracy:.1f} % of the most reliable were "
+                    f"right; with {accuracy:g}, {100 * share:.1f} % would"
+                )
+        return lines
 
 
 @dataclass
-class Sureness:
-    """Points by the class a model gave them and its reliability; weights are as the points lie."""
+class Calibration:
+    """Weights of right and wrong points by the class a model gave them and its reliability."""
 
-    right: dict[int, npt.NDArray[np.float64]] = field(
-        default_factory=dict
-    )  #: (BINS,) of each class
-    wrong: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)
-    about: str = ""  #: where they were counted
+    right: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)  #: code -> (BINS,)
+    wrong: dict[int, npt.NDArray[np.float64]] = field(default_factory=dict)  #: code -> (BINS,)
+    about: str = ""  #: where the points were counted
 
     def add(
         self,
-        given: npt.NDArray[Any],
+        predicted: npt.NDArray[Any],
         true: npt.NDArray[Any],
         reliability: npt.NDArray[np.floating],
         weight: npt.NDArray[np.floating] | None = None,
     ) -> None:
-        """Count points: (n,) classes given, true classes, reliabilities, and how much each counts."""
-        place = np.clip(np.floor(np.asarray(reliability, np.float64) * BINS), 0, BINS - 1).astype(
-            np.int64
-        )
-        for code in np.unique(given).tolist():
-            for table, chosen in ((self.right, given == true), (self.wrong, given != true)):
-                mine = (given == code) & chosen
-                counted = np.bincount(place[mine], None if weight is None else weight[mine], BINS)
-                table[code] = table.get(code, np.zeros(BINS)) + counted
+        """Count points: (n,) codes predicted, true codes, reliabilities, and weights (default 1)."""
+        place = np.floor(np.asarray(reliability, np.float64) * BINS)
+        place = np.clip(place, 0, BINS - 1).astype(np.int64)
+        for code in np.unique(predicted).tolist():
+            for table, chosen in ((self.right, predicted == true), (self.wrong, predicted != true)):
+                rows = (predicted == code) & chosen
+                counts = np.bincount(place[rows], None if weight is None else weight[rows], BINS)
+                table[code] = table.get(code, np.zeros(BINS)) + counts
 
-    def limits(self, accuracy: float) -> dict[int, Limit]:
-        """The lowest reliability of each class from which on the share of right points is `accuracy`; above 1 where it never
-        is, and then the largest share there is."""
-        out = {}
-        for code in sorted(self.right):
-            right, wrong = (table[code][::-1].cumsum()[::-1] for table in (self.right, self.wrong))
-            all_ = right + wrong
-            good = (all_ > 0) & (right >= accuracy * all_)
-            if not good.any():
-                out[code] = Limit(2.0, 0.0, float(np.max(right / np.maximum(all_, 1e-12))))
-                continue
+    def limits(self, accuracy: float) -> ReliabilityLimits:
+        """Return the lowest limits from which on at least `accuracy` of the points of each class are right."""
+        classes = {code: self._limit(code, accuracy) for code in sorted(self.right)}
+        kept = sum(limit.kept * self.points([code]) for code, limit in classes.items())
+        return ReliabilityLimits(accuracy, classes, kept / max(self.points(self.right), 1e-9))
+
+    def _limit(self, code: int, accuracy: float) -> ClassLimit:
+        right, wrong = (table[code][::-1].cumsum()[::-1] for table in (self.right, self.wrong))
+        points = right + wrong
+        good = (points > 0) & (right >= accuracy * points)
+        if good.any():
             first = int(np.flatnonzero(good)[0])
-            out[code] = Limit(
-                first / BINS, float(all_[first] / all_[0]), float(right[first] / all_[first])
-            )
-        return out
+            kept, share_right = points[first] / points[0], right[first] / points[first]
+            return ClassLimit(first / BINS, float(kept), float(share_right))
+        most = float(np.max(right / np.maximum(points, 1e-12)))
+        instead = float(np.floor(100 * most) / 100)
+        share = self._limit(code, instead).kept if instead < accuracy else 0.0
+        return ClassLimit(UNREACHABLE, 0.0, most, (instead, share))
 
     def points(self, codes: Iterable[int]) -> float:
-        """The points that were given these classes."""
-        return sum(
-            float((self.right[code] + self.wrong[code]).sum())
-            for code in codes
-            if code in self.right
-        )
+        """Return the weight of the points that were given these classes."""
+        known = [code for code in codes if code in self.right]
+        return sum(float((self.right[code] + self.wrong[code]).sum()) for code in known)
 
-    def share_right(self, codes: Iterable[int]) -> float | None:
-        """Return the share of points that were given these classes and are right; None where there is no such point."""
+    def accuracy(self, codes: Iterable[int]) -> float | None:
+        """Return the share of points given these classes that are right; None where there is no such point."""
         known = [code for code in codes if code in self.right]
         points = self.points(known)
         return sum(float(self.right[code].sum()) for code in known) / points if points else None
 
-    def kept(self, limits: Mapping[int, Limit]) -> float:
-        """The share of all points that keep their class."""
-        kept = sum(limit.kept * self.points([code]) for code, limit in limits.items())
-        return kept / max(self.points(self.right), 1e-9)
-
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for a manifest or a file."""
+        """Return plain values, for a manifest or a file."""
         tables = {"right": self.right, "wrong": self.wrong}
         classes = {
             str(code): {
-                name: [float(f"{value:.4g}") for value in table[code]]
+                name: [float(f"{value:.{_DIGITS}g}") for value in table[code]]
                 for name, table in tables.items()
             }
             for code in sorted(self.right)
@@ -108,41 +142,40 @@ class Sureness:
         return {"about": self.about, "classes": classes}
 
     @classmethod
-    def from_dict(cls, said: Mapping[str, Any]) -> Sureness:
-        """What :meth:`to_dict` gave; ModelError for something else."""
-        made = cls()
+    def from_dict(cls, entry: Mapping[str, Any]) -> Calibration:
+        """Return the calibration that :meth:`to_dict` gave; ModelError for something else."""
+        out = cls()
         try:
-            made.about = one_line(str(said["about"]))
-            for code, counted in said["classes"].items():
-                for table, name in ((made.right, "right"), (made.wrong, "wrong")):
-                    table[int(code)] = values = np.array(counted[name], np.float64)
-                    if (
-                        values.shape != (BINS,)
-                        or not (values >= 0).all()
-                        or not np.isfinite(values).all()
-                    ):
+            out.about = one_line(str(entry["about"]))
+            for code, counts in entry["classes"].items():
+                for table, name in ((out.right, "right"), (out.wrong, "wrong")):
+                    table[int(code)] = values = np.array(counts[name], np.float64)
+                    finite = values.shape == (BINS,) and np.isfinite(values).all()
+                    if not finite or (values < 0).any():
                         raise ValueError(name)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(
                 "the counts of right and wrong points by reliability are damaged", found=str(error)
             ) from None
-        return made
+        return out
 
 
-def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
-    """What is known of a model: in its file, or in a file beside it.
+def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
+    """Return the calibration of a model: from its manifest `info`, or the file beside the model's `path`.
 
     Raises
     ------
     OptionError
-        If nothing is.
+        If there is neither.
+    ModelError
+        If it is damaged.
     """
     if info.get("sureness"):
-        return Sureness.from_dict(info["sureness"])
+        return Calibration.from_dict(info["sureness"])
     beside = Path(path).with_suffix(SUFFIX)
     if beside.is_file():
         try:
-            return Sureness.from_dict(strict_json(beside.read_bytes()))
+            return Calibration.from_dict(strict_json(beside.read_bytes()))
         except (OSError, ValueError, RecursionError) as error:
             raise ModelError(
                 "the file beside the model is damaged", where=str(beside), found=error
@@ -157,43 +190,34 @@ def sureness_of(info: Mapping[str, Any], path: str) -> Sureness:
     )
 
 
-def of_the_base(own: Mapping[str, Any], base: Mapping[str, Any], path: str) -> Mapping[str, Any]:
-    """What a model on top of a base says of itself where its labels are a person's corrections.
+def calibrate_on_base(
+    refined: Mapping[str, Any], base: Mapping[str, Any], path: str
+) -> Mapping[str, Any]:
+    """Return the calibration of a model whose labels are a person's corrections of its base.
 
-    These lie where the base was worst, so its `own` counts are taken for new classes alone, where the base's are known,
-    as many to one of the base's classes as among the labels.
+    Corrections lie where the base was worst. So the counts of the `refined` model are taken for new classes alone, scaled
+    to the base's as its points of the base's classes are; for these the counts are the base's.
+
+    Parameters
+    ----------
+    refined : mapping
+        Calibration of the refined model as a manifest has it.
+    base : mapping
+        Manifest of the base.
+    path : str
+        File of the base.
     """
     try:
-        known = sureness_of(base, path)
+        known = read_calibration(base, path)
     except OptionError:
-        return own
-    mine = Sureness.from_dict({"about": "", "classes": {}, **own})
-    ratio = known.points(known.right) / (mine.points(known.right) or known.points(known.right))
-    for code in mine.right.keys() - known.right.keys():
-        known.right[code], known.wrong[code] = ratio * mine.right[code], ratio * mine.wrong[code]
+        return refined
+    counts = Calibration.from_dict({"about": "", "classes": {}, **refined})
+    points = known.points(known.right)
+    scale = points / (counts.points(known.right) or points)
+    for code in counts.right.keys() - known.right.keys():
+        known.right[code], known.wrong[code] = (
+            scale * counts.right[code],
+            scale * counts.wrong[code],
+        )
     known.about = f"its base ({known.about}), as its own labels lie where that was looked at"
     return known.to_dict()
-
-
-def said(known: Sureness, names: Mapping[int, str], accuracy: float) -> list[str]:
-    """What it costs, in lines; where no point of a class can be kept, what can be had instead."""
-    limits = known.limits(accuracy)
-    lost = 100 * (1 - known.kept(limits))
-    lines = [
-        f"to be right in {100 * accuracy:g} % of the points of each class, about {lost:.1f} % of all points are "
-        "expected to become class 1 (unclassified):"
-    ]
-    for code, one in limits.items():
-        name = f"{code} {names.get(code, '')}".strip()
-        if one.reliability > 1.0:
-            best = np.floor(100 * one.right) / 100
-            share = 100 * known.limits(best)[code].kept
-            lines.append(
-                f"  {name}: no point keeps it, as at most {100 * one.right:.1f} % of the most reliable were right; "
-                f"with {best:g}, {share:.1f} % would"
-            )
-        else:
-            lines.append(
-                f"  {name}: {100 * one.kept:.1f} % keep it, from reliability {one.reliability:.2f} on"
-            )
-    return lines

@@ -8,7 +8,7 @@ from typing import Any
 from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
 from ..features.neighborhoods import parse_neighborhoods
-from .calibration import Sureness
+from .calibration import Calibration
 from .interface import Column
 from .registry import REFINED_FOREST
 
@@ -106,11 +106,11 @@ def _measured(info: Mapping[str, Any]) -> _Rows:
     """Return how many points of ground that was held out were right, by the class they were given."""
     if not info.get("sureness"):
         return []
-    known = Sureness.from_dict(info["sureness"])
-    shares = {code: known.share_right([code]) for code in sorted(known.right)}
+    known = Calibration.from_dict(info["sureness"])
+    shares = {code: known.accuracy([code]) for code in sorted(known.right)}
     each = ", ".join(f"{code}: {_percent(share)}" for code, share in shares.items())
     return [
-        ("points right", f"{_percent(known.share_right(known.right))}; of those given {each}"),
+        ("points right", f"{_percent(known.accuracy(known.right))}; of those given {each}"),
         ("", f"measured on {known.about}"),
     ]
 
@@ -238,8 +238,8 @@ def score(info: Mapping[str, Any]) -> str:
         return f"not scored     its labels are answers of {teacher['name']}; only labels of your own tell how right it is"
     row = held_out(info)
     if not row and info.get("sureness"):
-        known = Sureness.from_dict(info["sureness"])
-        share = _percent(known.share_right(known.right))
+        known = Calibration.from_dict(info["sureness"])
+        share = _percent(known.accuracy(known.right))
         return f"measured       {share} of points right, on ground it had not seen"
     if not row:
         why = "no score in the file (the shipped model: docs/models.md)"

@@ -19,6 +19,7 @@ from ..base.report import Report
 from ..base.settings import Settings, setting
 from ..features.point_grid import CellGrid, build_grid
 from ..features.voxels import Representatives
+from .calibration import ReliabilityLimits
 from .interface import Block
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
@@ -47,8 +48,8 @@ class PredictionOptions(Settings):
     rejected_code: int | None = setting(
         None, "integer", "Class code for rejected points; by default they keep theirs", 0, 255
     )
-    #: as `reject_below`, for points of each class; the larger one counts
-    limits: Mapping[int, float] | None = None
+    #: as `reject_below`, by class; the larger one counts
+    limits: ReliabilityLimits | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,8 +265,8 @@ def reject(
     """Take the class from points that are not reliable enough; return their rows in the cloud."""
     code = columns["classification"]
     least = np.full(256, options.reject_below or 0.0, np.float32)
-    for one, limit in (options.limits or {}).items():
-        least[one] = max(least[one], limit)
+    if options.limits is not None:
+        np.maximum(least, options.limits.least_reliability(), out=least)
     if not least.any():
         return np.zeros(0, np.int64)
     rows = np.flatnonzero(roles.wanted & (columns["reliability"] < least[code]))

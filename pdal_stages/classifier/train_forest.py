@@ -20,7 +20,7 @@ from ..features.engine import fit_clouds
 from ..features.registry import SHAPE_FEATURES
 from ..features.return_features import SOURCES
 from .auto_context import FoldForests, WeightedPass, sample_context
-from .calibration import Sureness
+from .calibration import Calibration
 from .context_features import OWN, Context
 from .feature_forest import FeatureForest
 from .fitted_features import CloudFeatures, Features
@@ -216,8 +216,8 @@ class _ForestTraining:
         info = self.labeled.described(
             o, counts, training, importances, packages, validation, priors=priors
         )
-        if validation is not None and self.sureness.right:
-            info["sureness"] = self.sureness.to_dict()
+        if validation is not None and self.calibration.right:
+            info["sureness"] = self.calibration.to_dict()
         names = dict(zip(self.codes, self.labeled.classes.names, strict=True))
         if base is None:
             return Model(tuple(forests), list(names.items()), info)
@@ -281,7 +281,9 @@ class _ForestTraining:
         names, index = np.unique(group, return_inverse=True)
         asked = {"groups": o.groups} if o.groups else {}
         for by in (["groups" if o.groups else "surveys"] if len(names) > 1 else []) + ["blocks"]:
-            self.sureness = Sureness(about=f"{by} held out, forests of {self.fold_trees} trees")
+            self.calibration = Calibration(
+                about=f"{by} held out, forests of {self.fold_trees} trees"
+            )
             here = (
                 0.0 if by == "surveys" else gap
             )  # which do not see each other, whatever their coordinates
@@ -325,7 +327,7 @@ class _ForestTraining:
             p = replace(blend, factors=None)(self._said_by_base(rows), p)
         given = np.asarray(self._codes_after(0))[p.argmax(axis=1)]
         true = np.asarray(self.codes)[self.samples.label[rows]]
-        self.sureness.add(given, true, p.max(axis=1), self.stands_for[rows])
+        self.calibration.add(given, true, p.max(axis=1), self.stands_for[rows])
 
     def _unscored(self, reason: str, gap: float) -> str:
         """Why there is no score, and which class to label next, and where not: that of the fewest blocks of ground."""

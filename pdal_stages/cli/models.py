@@ -185,13 +185,13 @@ def _compare_objects(options: argparse.Namespace) -> None:
 
 def _model(options: argparse.Namespace) -> None:
     from ..base.errors import OptionError
-    from ..classifier.calibration import sureness_of
+    from ..classifier.calibration import read_calibration
     from ..classifier.load_model import load_model
     from ..classifier.model_file import find
 
     model = load_model(options.file)
     with contextlib.suppress(OptionError):  # it was never scored
-        model.info["sureness"] = sureness_of(model.info, find(options.file)).to_dict()
+        model.info["sureness"] = read_calibration(model.info, find(options.file)).to_dict()
     if options.showjson:
         print(json.dumps(model.describe(), indent=2, default=str))
     else:

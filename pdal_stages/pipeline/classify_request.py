@@ -86,7 +86,7 @@ class ClassifyRequest:
         if given.get("keep_sure") is None:
             return []
         stage: Any = stage_from(given)
-        return stage.cost()
+        return stage.limits.describe_cost(dict(stage.model.classes))
 
     @cached_property
     def loaded(self) -> Any:

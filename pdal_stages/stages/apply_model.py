@@ -14,7 +14,7 @@ from ..base.asprs import HIGH as HIGH_VEGETATION
 from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, median_slope
-from ..classifier.calibration import Limit, Sureness, said, sureness_of
+from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.load_model import loaded_model
 from ..classifier.model import Model
 from ..classifier.model_file import find
@@ -146,20 +146,11 @@ class ApplyModel(Stage):
         return loaded_model(self.model_file)
 
     @cached_property
-    def limits(self) -> dict[int, Limit] | None:
-        """How sure points of each class must be to keep it, with `keep_sure`."""
-        return None if self.keep_sure is None else self.sureness.limits(self.keep_sure)
-
-    @property
-    def sureness(self) -> Sureness:
-        """How often the model was right where it was how sure."""
-        return sureness_of(self.model.info, find(self.model_file))
-
-    def cost(self) -> list[str]:
-        """What `keep_sure` is expected to cost, in lines; none without it."""
+    def limits(self) -> ReliabilityLimits | None:
+        """From which reliability on points keep their class, with `keep_sure`."""
         if self.keep_sure is None:
-            return []
-        return said(self.sureness, dict(self.model.classes), self.keep_sure)
+            return None
+        return read_calibration(self.model.info, find(self.model_file)).limits(self.keep_sure)
 
     @property
     def preparation(self) -> list[dict[str, Any]]:
@@ -280,7 +271,7 @@ class ApplyModel(Stage):
                 device=self.device,
                 reject_below=self.reject_below,
                 rejected_code=self._rejected,
-                limits={code: one.reliability for code, one in (self.limits or {}).items()},
+                limits=self.limits,
                 progress=progress,
             )
         rejected = np.zeros(points.count, np.bool_)

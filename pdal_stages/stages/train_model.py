@@ -15,7 +15,7 @@ from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
 from ..base.report import Report
 from ..classifier import model_description
-from ..classifier.calibration import of_the_base
+from ..classifier.calibration import calibrate_on_base
 from ..classifier.class_map import ClassMap
 from ..classifier.input_dimensions import (
     CHECKED,
@@ -275,7 +275,7 @@ class TrainModel(Stage):
             model.info["base"] = {"name": Path(self.base).stem, "sha256": digest_of(self.base)}
             if "checked" in report.figures and "sureness" in model.info:
                 before = loaded_model(self.base).info
-                model.info["sureness"] = of_the_base(
+                model.info["sureness"] = calibrate_on_base(
                     model.info["sureness"], before, find(self.base)
                 )
         if by_hand:
