@@ -1,10 +1,11 @@
-"""Pages of stages: what is written of each in docs/stage_texts, with tables of its declarations, as JSON Schema has them.
+"""Pages of stages: a text of docs/stage_texts or the docstring of the class, with tables of declarations.
 
 python docs/stage_pages.py        # writes docs/stages/*.md
 """
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ TEXTS = FOLDER.with_name("stage_texts")
 
 def page(stage: type[Stage]) -> str:
     """One stage in the shape of PDAL's stage pages."""
-    text = (TEXTS / f"{stage.type}.md").read_text(encoding="utf-8").strip()
+    text = text_of(stage)
     lines = [f"# {stage.type}", "", f"{stage.summary}.", ""]
     if stage.source:
         lines += [f"Source: {stage.source} (see [the papers](../papers.md)).", ""]
@@ -42,10 +43,18 @@ def page(stage: type[Stage]) -> str:
     return "\n".join(lines)
 
 
+def text_of(stage: type[Stage]) -> str:
+    """Return what the stage does, and an example."""
+    path = TEXTS / f"{stage.type}.md"
+    if path.exists():
+        return path.read_text(encoding="utf-8").strip()
+    shown = json.dumps(["in.laz", {"type": stage.type, **stage.example}, "out.laz"], indent=1)
+    return f"{inspect.getdoc(stage) or ''}\n\n## Example\n\n```json\n{shown}\n```"
+
+
 def example(stage: type[Stage]) -> dict[str, Any]:
     """The stage in the pipeline that its text shows."""
-    text = (TEXTS / f"{stage.type}.md").read_text(encoding="utf-8")
-    pipeline = json.loads(text.partition("```json\n")[2].partition("\n```")[0])
+    pipeline = json.loads(text_of(stage).partition("```json\n")[2].partition("\n```")[0])
     return next(one for one in pipeline if isinstance(one, dict) and one.get("type") == stage.type)
 
 

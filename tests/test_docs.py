@@ -9,7 +9,6 @@ import json
 import re
 import runpy
 import sys
-import types
 from pathlib import Path
 
 import jsonschema
@@ -20,8 +19,6 @@ import pdal_stages as ps
 from pdal_stages.base.errors import ModelError
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.json_source import parse_pipeline
-from pdal_stages.stages.base import Stage
-from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.stages.registry import stage_types
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -111,30 +108,6 @@ def test_pipelines_and_python_objects_run(tmp_path, monkeypatch, write_las, pdal
     (snippet,) = [b for b in blocks(page, "python") if "ps.Filter" in b]
     exec(compile(snippet, "pipelines.md", "exec"), {})
     assert (tmp_path / "classified.laz").stat().st_size > 1000
-
-
-def test_the_worked_example_of_a_stage_works(monkeypatch):
-    (text,) = blocks(ROOT / "docs" / "adding-a-stage.md", "python")
-    module = types.ModuleType("pdal_stages.stages.heightband")
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    exec(compile(text, "adding-a-stage.md", "exec"), module.__dict__)
-    (stage,) = [
-        v
-        for v in vars(module).values()
-        if isinstance(v, type) and issubclass(v, Stage) and v is not Stage
-    ]
-    made = stage({"medium": 3})
-    arrays = {
-        "X": np.zeros(5),
-        "Y": np.zeros(5),
-        "Z": np.zeros(5),
-        "Classification": np.array([5, 5, 5, 2, 3], np.uint8),
-        "HeightAboveGround": np.array([0.1, 1.0, 9.0, 9.0, 2.5]),
-    }
-    points = made.points(arrays)
-    assert made.run(points, WHOLE_CLOUD)["Classification"].tolist() == [3, 4, 5, 2, 4]
-    assert points.report.figures["changed"] == 3
-    assert "medium" in stage.schema()["properties"]
 
 
 def test_stage_pages_are_made_from_the_registry(monkeypatch):

@@ -30,7 +30,8 @@ def test_what_is_not_kept_is_let_go_of_and_coordinates_stay():
     with pytest.raises(DimensionError, match="GpsTime"):
         points.dimension("GpsTime")
     assert np.array_equal(points.take_xyz(), np.column_stack([given[name] for name in "XYZ"]))
-    assert points.counted(np.ones(1000, bool)) == 1000
+    points.tally("all", np.ones(1000, bool))
+    assert points.report.figures["all"] == 1000
 
 
 @pytest.mark.parametrize("scale", [0.01, 0.001, 0.00025])

@@ -20,7 +20,7 @@ from ..base.errors import OptionError, StageError
 from ..base.files import HTML, JSON, Output, write_json, write_whole
 from ..base.memory import parse_size
 from ..base.messages import count_of, one_line, print_messages
-from ..pipeline.run import LEFT_ALONE
+from ..stages.registry import describe_count
 from ..tiling.jobs import InterruptedRun, TiledRun
 from ..tiling.options import PER, TilingOptions
 from . import INPUTS, Parser, takes_options
@@ -330,9 +330,8 @@ def print_classes(
     """Print the points of each class in all files together, and those without a class."""
     for code, points in sorted((int(code), points) for code, points in classes.items()):
         print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
-    for key, what in LEFT_ALONE.items():
-        if left_alone.get(key):
-            print(f"  {what:32s} {left_alone[key]:>12,}")
+    for name, points in left_alone.items():
+        print(f"  {describe_count(name):32s} {points:>12,}")
 
 
 def print_run(run: TiledRun) -> None:

@@ -34,17 +34,6 @@ from .stage_files import (
     writers_outputs,
 )
 
-#: Points that got no class from the classifier, or were changed after it, by their keys in the reports of stages.
-LEFT_ALONE = {
-    "rejected": "rejected as unreliable",
-    "ignored": "noise and withheld points, not classified (ignore)",
-    "kept": "class kept (keep)",
-    "outside_where": "outside where",
-    "decks": "bridge decks (bridges)",
-    "wires": "wires (wires)",
-    "towers": "towers (wires)",
-}
-
 
 class Pipeline:
     """A PDAL pipeline that may hold stages of ours.
@@ -98,10 +87,12 @@ class Pipeline:
 
     @property
     def left_alone(self) -> dict[str, int]:
-        """Numbers of points by :data:`LEFT_ALONE`, from the last stage that counts them."""
-        last = [each[-1].figures for _, each in self.reports if each]
+        """Points that stages of the last run counted (:attr:`Stage.counts`): ``type.name`` -> number above 0."""
         return {
-            k: one[k] for one in last for k in LEFT_ALONE if isinstance(one.get(k), int) and one[k]
+            f"{ours.stage.type}.{name}": number
+            for ours in self.expanded.ours
+            for name in ours.stage.counts
+            if ours.reports and (number := ours.reports[-1].figures.get(name, 0))
         }
 
     @property

@@ -42,6 +42,12 @@ class ApplyModel(Stage):
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors"
     forgets = True
+    counts = {
+        "rejected": "rejected as unreliable",
+        "ignored": "noise and withheld points, not classified (ignore)",
+        "kept": "class kept (keep)",
+        "outside_where": "outside where",
+    }
     model_file: str = option(
         "model",
         None,
@@ -246,7 +252,7 @@ class ApplyModel(Stage):
             kept = kept | (current == GROUND)
         if missing := [name for name in self.made_from_ground if name not in points.arrays]:
             self._add_from_ground(points, missing)
-        points.report.figures["kept"] = points.counted(inside & kept & ~ignored)
+        points.tally("kept", inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         dimensions = {
             n: points.arrays[n] for n in self.model.optional_dimensions if n in points.arrays
@@ -313,9 +319,9 @@ class ApplyModel(Stage):
             values[self.mark] = inside
         values["Classification"] = points.with_codes(values["Classification"])
         if self.reject_below is not None or self.limits is not None:
-            points.report.figures["rejected"] = points.counted(rejected)
+            points.tally("rejected", rejected)
         points.report.merge(found.report)
-        points.report.figures["outside_where"] = points.counted(~inside)
+        points.tally("outside_where", ~inside)
         return values
 
     def _add_from_ground(self, points: Points, names: list[str]) -> None:

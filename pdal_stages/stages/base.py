@@ -74,6 +74,11 @@ class Stage(ABC):
     in_models: ClassVar[tuple[str, ...]] = ()
     #: For the same: raise it when results change. Models store it, and warn where they were trained with another one.
     algorithm_version: ClassVar[int] = 1
+    #: Counts that it puts into its report (:meth:`Points.tally`): name -> what these points are. Tiles add them up, and
+    #: `classify` prints them.
+    counts: ClassVar[Mapping[str, str]] = {}
+    #: Options of the example on its page; needed where an option is required.
+    example: ClassVar[Mapping[str, Any]] = {}
     #: Whether it forgets most dimensions (:meth:`Points.keep_only`) and then needs much memory: the next stage gets the
     #: points from PDAL anew.
     forgets: ClassVar[bool] = False

@@ -22,6 +22,7 @@ class Bridges(ClassStage):
     summary = "Classify bridge decks, which are then no longer ground or building"
     source = "after Sithole, Vosselman 2006, ISPRS Journal of Photogrammetry and Remote Sensing 61(1), 33-46"
     where_help = "Points outside keep their class but still serve as neighbors"
+    counts = {"decks": "bridge decks (bridges)"}
     code: int = code_option(BRIDGE, "Class code of bridge decks")
     ignore: Selection = ignore_option(
         "Points that are left out, even as neighbors, and keep their class"
@@ -45,7 +46,7 @@ class Bridges(ClassStage):
         codes = before.copy()
         codes[deck] = self.code
         figures = points.report.figures
-        figures["decks"] = points.counted(deck)
+        points.tally("decks", deck)
         figures["left"] = class_counts(before[deck & (before != self.code)])
         figures["classes"] = class_counts(codes[free])
         return {"Classification": points.with_codes(codes)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
@@ -71,7 +70,7 @@ class DetachedNoise(ClassStage):
             ("low", "high"), NOISE, (self.low_class, self.high_class), strict=True
         ):
             codes[found == code] = given
-            points.report.figures[name] = int(np.count_nonzero(found == code))
+            points.tally(name, found == code)
         if found.any():
             points.report.figures["classes"] = class_counts(codes[found != 0])
         return {"Classification": points.with_codes(codes)}

@@ -134,6 +134,7 @@ class GroupObjects(ObjectOptions, Stage):
         "others 2017 (Global Change Biology 23, 177-190)"
     )
     where_help = "Points outside form no object, and keep what they have"
+    counts = {"refused_points": "points of rejected objects (refuse)"}
     open_ended = True  # a building may be larger than the surroundings of a tile
     judged: bool = option(
         "boolean",
@@ -221,7 +222,7 @@ class GroupObjects(ObjectOptions, Stage):
             codes[refused] = self.refused_class
             ids[refused] = 0
             out["Classification"] = points.with_codes(codes)
-            points.report.figures["refused_points"] = int(np.count_nonzero(refused))
+            points.tally("refused_points", refused)
         out["ObjectID"] = ids.astype(np.uint64)
         if points.mask is not None:
             out["ObjectID"] = np.where(points.mask, out["ObjectID"], points.arrays["ObjectID"])

@@ -60,7 +60,7 @@ class Points:
     )
     #: Whether class 12 (overlap) of LAS 1.0-1.3 may be read as class 0 with the flag Overlap, as PDAL from 2.6 on does.
     overlap_as_flag: bool = False
-    #: Below zero for the points whose results are used: :meth:`counted` counts those alone.
+    #: Below zero for the points whose results are used: :meth:`tally` counts those alone.
     own: NDArray | None = None
     used: NDArray[np.bool_] | None = None  #: in tiles: those for which anything is to be computed
     #: Where they will be written with codes up to 31 alone: what to say of others, and the cure.
@@ -89,9 +89,10 @@ class Points:
         """The points inside `where`; all, where there is none."""
         return np.ones(self.count, bool) if self.mask is None else self.mask
 
-    def counted(self, points: NDArray[np.bool_]) -> int:
-        """How many points these are, for a report."""
-        return int(np.count_nonzero(points if self.own is None else points & (self.own < 0)))
+    def tally(self, name: str, points: NDArray[np.bool_]) -> None:
+        """Put the number of these points (n,) into the report; in a tile, of those that lie in the tile itself."""
+        inside = points if self.own is None else points & (self.own < 0)
+        self.report.figures[name] = int(np.count_nonzero(inside))
 
     @cached_property
     def units(self) -> Units:
@@ -236,9 +237,7 @@ class Points:
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:
         """The same, counted in the report as ``ignored``, where they are inside `where`."""
         found = self.chosen(selection)
-        self.report.figures["ignored"] = self.counted(
-            found if self.mask is None else found & self.mask
-        )
+        self.tally("ignored", found if self.mask is None else found & self.mask)
         return found
 
     def usable(self, ignored: Selection) -> NDArray[np.bool_]:

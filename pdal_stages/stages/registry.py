@@ -97,6 +97,12 @@ def stage_type(name: str) -> type[Stage]:
     return _STAGES[name]
 
 
+def describe_count(name: str) -> str:
+    """Return what a count of a stage means (:attr:`Stage.counts`), from ``type.name``."""
+    kind, _, count = name.rpartition(".")
+    return stage_type(kind).counts[count]
+
+
 def place(type_name: str, tag: str | None) -> str:
     """Return how errors name a stage: its type, and its tag where it has one."""
     return f"{type_name} (tag '{tag}')" if tag else type_name

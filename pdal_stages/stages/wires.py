@@ -20,6 +20,7 @@ class Wires(ClassStage):
     type = "filters.wires"
     summary = "Classify wires, long thin lines in the air, and the towers that carry them"
     where_help = "Points outside keep their class but still serve as neighbors"
+    counts = {"wires": "wires (wires)", "towers": "towers (wires)"}
     code: int = code_option(WIRE, "Class code of wires")
     towers: bool = option(
         "boolean", False, "Also give towers their class, where wires end and meet"
@@ -51,9 +52,9 @@ class Wires(ClassStage):
             tower = find_towers(points.xyz, height, wire, ~ignored)
             wire &= ~tower
             codes[tower & free] = self.tower_code
-            figures["towers"] = points.counted(tower & free)
+            points.tally("towers", tower & free)
         codes[wire & free] = self.code
-        figures["wires"] = points.counted(wire & free)
+        points.tally("wires", wire & free)
         figures["left"] = class_counts(before[codes != before])
         figures["classes"] = class_counts(codes[points.inside])
         return {"Classification": points.with_codes(codes)}

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.messages import count_of
 from ..base.version import __version__
-from ..pipeline.run import LEFT_ALONE
 from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
 
 if TYPE_CHECKING:
@@ -159,7 +158,7 @@ def summarize(tiles: list[Job], cpu_seconds: float, seconds: float) -> dict[str,
         "cpu_seconds": cpu_seconds,
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
-        "left_alone": {key: alone[key] for key in LEFT_ALONE if alone[key]},
+        "left_alone": dict(alone),
     }
 
 
