@@ -15,7 +15,7 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.grid import GridWindow
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground, pieces, smrf
-from pdal_stages.terrain.openings import objects_of, opening_radii
+from pdal_stages.terrain.openings import FILL_RINGS, fill_holes, objects_of, opening_radii
 from pdal_stages.terrain.smrf import FilterOptions
 from pdal_stages.terrain.surface import GroundRaster, planes_of_blocks
 
@@ -60,6 +60,19 @@ def slow_opening(raster, radius):
     return ndimage.grey_dilation(centers, footprint=octagon(radius), mode="constant", cval=-np.inf)
 
 
+def test_holes_are_filled_up_to_some_rings_from_measured_cells():
+    """On a slope all around holes the filled cells continue it; far holes stay."""
+    height = np.add.outer(0.5 * np.arange(40.0), np.zeros(40)).astype(np.float32)
+    raster = height.copy()
+    raster[5:36, 5:36] = np.inf
+    filled = fill_holes(raster)
+    depth = ndimage.distance_transform_cdt(np.isinf(raster), "chessboard")
+    assert np.array_equal(np.isfinite(filled), depth <= FILL_RINGS)
+    raster = np.where(np.random.default_rng(0).random(height.shape) < 0.5, np.inf, height)
+    inside = np.s_[4:-4, 4:-4]
+    assert np.abs(fill_holes(raster.astype(np.float32)) - height)[inside].max() < 1.0
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38), (60, 50)])
 @np.errstate(invalid="ignore")
 def test_openings_and_objects_equal_the_slow_reference(shape):
@@ -69,13 +82,13 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
         np.float32
     )
     raster[rng.random(shape) < 0.3] = np.inf
-    window, measured = 21, np.isfinite(raster)
+    window, measured, filled = 21, np.isfinite(raster), fill_holes(raster)
     objects, floor, opened = objects_of(raster, 1.5, 0.1, window, keep=range(1, 25))
     for radius in range(1, 25):
-        assert np.array_equal(opened[radius], slow_opening(raster, radius)), radius
-    want, want_floor, before = np.zeros(shape, bool), raster.copy(), raster
+        assert np.array_equal(opened[radius], slow_opening(filled, radius)), radius
+    want, want_floor, before = np.zeros(shape, bool), raster.copy(), filled
     for radius in opening_radii(window):
-        after = slow_opening(raster, radius)
+        after = slow_opening(filled, radius)
         new = measured & ~want & (before - after > np.float32(0.1 * radius * 1.5))
         want_floor[new] = after[new]
         want |= new

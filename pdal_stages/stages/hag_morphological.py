@@ -38,7 +38,7 @@ class HagMorphological(FarReaching):
     type = "filters.hag_morphological"
     summary = "Height above ground found by a progressive morphological filter"
     source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
-    algorithm_version = 2
+    algorithm_version = 3
     where_help = HEIGHTS_OUTSIDE
     in_models = (
         "cell",
@@ -58,7 +58,7 @@ class HagMorphological(FarReaching):
     )
     slope: float = option(
         "number",
-        0.15,
+        0.12,
         "Rise over run: a window removes what it lowers by more than this times its radius; raise it for rugged terrain "
         "without buildings",
         minimum=0,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..base.grid import GridWindow
 from .cells import HOLE
 from .low_outliers import pits_reach
-from .openings import openings_of
+from .openings import FILL_RINGS, fill_holes, openings_of
 from .pieces import patches
 from .smrf import (
     FAR,
@@ -32,7 +32,8 @@ def reach_of_given(options: FilterOptions) -> int:
     surfaces = sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
     if not options.opening_radii:
         return surfaces + 4
-    return max(surfaces, 2 * max(options.opening_radii) + pits_reach(options.cell)) + 4
+    openings = 2 * max(options.opening_radii) + 2 * FILL_RINGS + pits_reach(options.cell)
+    return max(surfaces, openings) + 4
 
 
 def given_pieces(
@@ -42,7 +43,7 @@ def given_pieces(
 
     Numbers of the piece's points, which of them are its own, the raster, and the means of its ground points by cell.
     """
-    margin = 2 + max([0, *options.opening_radii])
+    margin = 2 + FILL_RINGS + max([0, *options.opening_radii])
     for of, own in patches(points.column, points.row, reach_of_given(options), options.link):
         part = points.some(of)
         window = GridWindow.enclosing(part.column, part.row).padded(margin)
@@ -65,4 +66,4 @@ def _openings(
     if not options.opening_radii:
         return {}
     _, raster, _ = minimum_grid(points, window, options.cell)
-    return dict(openings_of(raster, {*options.opening_radii}))
+    return dict(openings_of(fill_holes(raster), {*options.opening_radii}))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..base.grid import GridWindow, cell_keys, cell_numbers, group_by_key
 from .cells import HIGHEST, HOLE, lowest_of_cells
+from .openings import FILL_RINGS
 from .smrf import (
     NEAR,
     CellMeans,
@@ -143,7 +144,7 @@ def cells_of_block(
     own = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     cell, openings = options.cell, options.opening_radii
     # Openings reach into cells without points.
-    spill = max([*openings, 0]) + 2
+    spill = max([*openings, 0]) + FILL_RINGS + 2
     margin = max(spill, _beside(options))
 
     def given(x, y, z, top) -> GroundPoints:

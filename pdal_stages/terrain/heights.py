@@ -6,12 +6,15 @@ point is ground if it lies within `threshold` plus `scalar` times the terrain's 
 
 * the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile with its halo gets the
   bits of the whole cloud, and so does any order of the points;
-* holes are left open, not painted over; a pyramid of planes carries the surface across them (:mod:`.surface`);
+* holes are filled near measured cells only, and for the openings only; a pyramid of planes carries the surface across
+  them (:mod:`.surface`);
 * ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
 * low outliers are told from ground under a canopy (:mod:`.low_outliers`).
 
-Parameters have SMRF's defaults. What lies beyond the cloud's end or in a hole is unknown, and no evidence for an object.
-Roofs wider than the window stay ground: a classifier tells them by heights above openings of other widths.
+Parameters have SMRF's defaults but for `slope`, 0.15 there: 0.12 lowers the mean error of 27 surveys
+from 0.67 to 0.61 and that of the ISPRS samples from 3.58 to 3.45 (`benchmarks/ablation.py`). What
+lies beyond the cloud's end or in a hole is unknown, and no evidence for an object. Roofs wider than
+the window stay ground: a classifier tells them by heights above openings of other widths.
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
 airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30.
@@ -55,7 +58,7 @@ def filtered_ground(
     *,
     mask: ArrayLike | None = None,
     cell: float = 1.0,
-    slope: float = 0.15,
+    slope: float = 0.12,
     window: float = 18.0,
     threshold: float = 0.5,
     scalar: float = 1.25,
@@ -76,7 +79,7 @@ def filtered_ground(
         Points that may be ground, e.g. all but noise; the others only receive heights.
     cell : float, default 1
         Side of the grid's cells, meters.
-    slope : float, default 0.15
+    slope : float, default 0.12
         Rise over run: a window of radius r removes what it lowers by more than `slope` times r.
     window : float, default 18
         Radius of the largest window, meters: half the width of the largest object that is removed.

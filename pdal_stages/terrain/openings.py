@@ -1,8 +1,11 @@
 """Morphological openings of a minimum grid by octagons, and the objects that growing openings show [P13].
 
-A hole is ``+inf``: erosion passes over it, and no window is centered on one, so an opening is the highest level
-that a window centered on measured cells reaches. Octagons (squares and diamonds taken in turn) treat ridges alike
-whatever their direction, as discs do, but fall apart into lines, so an opening costs the logarithm of its radius.
+Holes near measured cells are filled first, as SMRF inpaints them: between scattered points of a
+slope, an opening would lower each to its lowest neighbor in the window. Other holes are ``+inf``:
+erosion passes over them, and no window is centered on one, so an opening is the highest level that
+a window centered on known cells reaches. Octagons (squares and diamonds taken in turn) treat ridges
+alike whatever their direction, as discs do, but fall apart into lines, so an opening costs the
+logarithm of its radius.
 """
 
 from __future__ import annotations
@@ -15,6 +18,10 @@ from numpy.typing import NDArray
 
 from ..base.jit import njit
 from .cells import HOLE
+
+#: Cells beyond measured ones, along both axes and diagonals, up to which holes are filled. On 27 surveys, 36 clips with
+#: holes and the ISPRS samples, 2 to 8 give the same errors within 0.03 points, 0 more by 0.05 to 0.1.
+FILL_RINGS = 3
 
 
 def opening_radius(window: float, cell: float) -> int:
@@ -72,24 +79,47 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
     return np.ascontiguousarray(rows)
 
 
+@njit
+def _fill_ring(heights):
+    """Fill holes that touch known cells with their mean (h, w); those at an edge count twice those at a corner."""
+    h, w = heights.shape
+    out = heights.copy()
+    for j in range(h):
+        for i in range(w):
+            if heights[j, i] != HOLE:
+                continue
+            total, weights = 0.0, 0
+            for b in range(max(j - 1, 0), min(j + 2, h)):
+                for a in range(max(i - 1, 0), min(i + 2, w)):
+                    if heights[b, a] != HOLE:
+                        weight = 2 if a == i or b == j else 1
+                        total += weight * np.float64(heights[b, a])
+                        weights += weight
+            if weights > 0:
+                out[j, i] = np.float32(total / weights)
+    return out
+
+
+def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the raster (h, w) with the holes up to `FILL_RINGS` cells from measured ones filled, ring by ring; meters."""
+    for _ in range(FILL_RINGS):
+        raster = _fill_ring(raster)
+    return raster
+
+
 def openings_of(
     raster: NDArray[np.float32], radii: Iterable[int]
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield radii in cells, ascending, and the openings (h, w) of a minimum grid by octagons of them; meters."""
-    measured = raster != HOLE
-    # Heights by their rank: that takes half the bytes, and order is all that openings look at.
-    heights, rank = np.unique(raster[measured], return_inverse=True)
-    heights = np.concatenate(([-HOLE], heights, [HOLE]))
-    last = len(heights) - 1
-    most = measured * np.min_scalar_type(last).type(last)
-    upended = np.zeros_like(most)
-    upended[measured] = last - 1 - rank
-    taken = 0, 0
+    # Erosion is the maximum of what is upended. The ceiling keeps windows from holes.
+    ceiling = np.where(raster != HOLE, HOLE, -HOLE)
+    lowest_upended = np.where(raster != HOLE, -raster, -HOLE)
+    done = 0, 0
     for radius in sorted(radii):
         squares, diamonds = _steps(min(radius, sum(raster.shape)))
-        upended = highest_around(upended, squares - taken[0], diamonds - taken[1])
-        taken = squares, diamonds
-        yield radius, heights[highest_around(np.minimum(last - upended, most), squares, diamonds)]
+        lowest_upended = highest_around(lowest_upended, squares - done[0], diamonds - done[1])
+        done = squares, diamonds
+        yield radius, highest_around(np.minimum(-lowest_upended, ceiling), squares, diamonds)
 
 
 def objects_of(
@@ -117,12 +147,13 @@ def objects_of(
         Radius -> (h, w) float32, of `keep`.
     """
     measured, openings = raster != HOLE, {}
-    objects, floor, before = np.zeros(raster.shape, bool), raster.copy(), raster
+    filled = fill_holes(raster)
+    objects, floor, before = np.zeros(raster.shape, bool), raster.copy(), filled
     # An opening lowers nothing by more than all heights differ.
     range_m = np.ptp(raster[measured]) if measured.any() else 0.0
     drops = {radius: np.float32(slope * radius * cell) for radius in opening_radii(window)}
     drops = {radius: drop for radius, drop in drops.items() if drop < range_m}
-    for radius, opened in openings_of(raster, {*drops, *keep}):
+    for radius, opened in openings_of(filled, {*drops, *keep}):
         if radius in keep:
             openings[radius] = opened
         if radius in drops:

@@ -20,7 +20,7 @@ from ..base.grid import GridWindow, cell_numbers
 from ..base.jit import njit
 from .cells import HOLE, lowest_points
 from .low_outliers import pits, pits_reach
-from .openings import objects_of, opening_radius
+from .openings import FILL_RINGS, objects_of, opening_radius
 from .surface import GroundRaster, from_parents, planes_of_blocks
 from .surface import reach as planes_reach
 
@@ -40,7 +40,7 @@ class FilterOptions:
     """Of :func:`.heights.filtered_ground`; lengths in meters. Wrong ones raise an :class:`OptionError`."""
 
     cell: float = 1.0
-    slope: float = 0.15
+    slope: float = 0.12
     window: float = 18.0
     threshold: float = 0.5
     scalar: float = 1.25
@@ -97,7 +97,8 @@ class FilterOptions:
         An opening looks twice its radius away; low outliers are judged before, and surfaces fitted through ground after.
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
-        return pits_reach(self.cell) + 2 * self.largest_radius + surfaces + 2
+        openings = 2 * self.largest_radius + 2 * FILL_RINGS
+        return pits_reach(self.cell) + openings + surfaces + 2
 
     @property
     def reach_of_points(self) -> int:
@@ -115,7 +116,8 @@ class FilterOptions:
     @property
     def link(self) -> int:
         """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
-        return max(pits_reach(self.cell), self.largest_radius, planes_reach(self.levels(FAR))) + 2
+        openings = self.largest_radius + 2 * FILL_RINGS
+        return max(pits_reach(self.cell), openings, planes_reach(self.levels(FAR))) + 2
 
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
@@ -146,7 +148,10 @@ class GroundPoints(NamedTuple):
 
 
 def ground_raster(
-    points: GroundPoints, options: FilterOptions, margin: int = 1, wanted: GridWindow | None = None
+    points: GroundPoints,
+    options: FilterOptions,
+    margin: int = FILL_RINGS + 1,
+    wanted: GridWindow | None = None,
 ) -> tuple[GroundRaster, NDArray[np.int64]]:
     """Classify the cells of the minimum grid round points into ground and objects.
 
