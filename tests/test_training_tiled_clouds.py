@@ -100,7 +100,7 @@ def test_tiles_hold_each_point_once_and_what_lies_around(tmp_path):
     tiles = list(cut(cloud, 8.1, tmp_path / "raw").clouds(10.0))
     assert sum(tile.points for tile in tiles) == len(cloud)
     for tile in tiles:
-        own = tile.xyz[tile.own]
+        own = tile.xyz[tile.inside]
         low, high = np.floor(own[0, :2] / 8.1) * 8.1, np.floor(own[0, :2] / 8.1) * 8.1 + 8.1
         near = ((cloud.xyz[:, :2] >= low - 10) & (cloud.xyz[:, :2] <= high + 10)).all(axis=1)
         assert np.count_nonzero(near) == len(tile)

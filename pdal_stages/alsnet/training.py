@@ -81,7 +81,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
     counts = ({"available": int(m), "samples": int(m), "duplicates": 0} for m in count)
     every = int(count.sum())
     training = {"count": every, "seed": options.seed, "samples": every, **session.notes()}
-    info = known.described(options, counts, training, [None], ("numpy", "torch"))
+    info = known.describe(options, counts, training, [None], ("numpy", "torch"))
     classes = list(zip(known.classes.codes, known.classes.names, strict=True))
     return Model((net,), classes, info)
 

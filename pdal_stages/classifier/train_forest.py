@@ -158,7 +158,7 @@ class _ForestTraining:
                 request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb)
                 for block in CloudFeatures(self.features, request).blocks(rows, bar):
                     values[at[np.searchsorted(rows, block.rows)]] = block.values
-                if cloud.own is not None:
+                if cloud.inside is not None:
                     self.short += max(request.report.beyond_halo.values(), default=0)
         bad = ~np.isfinite(values).all(axis=0)
         if bad.any():
@@ -213,7 +213,7 @@ class _ForestTraining:
         }
         counts = map(self.samples.counts, range(len(self.codes)))
         packages = ("numpy", "scikit-learn", "numba")
-        info = self.labeled.described(
+        info = self.labeled.describe(
             o, counts, training, importances, packages, validation, priors=priors
         )
         if validation is not None and self.calibration.right:

@@ -1,4 +1,4 @@
-"""Labeled clouds to train on: prepared, kept on disk where they need not fit in memory, in tiles or not; their classes."""
+"""Labeled clouds for training: cleaned, thinned, in tiles, kept on disk; and their classes."""
 
 from __future__ import annotations
 
@@ -45,9 +45,8 @@ class TrainingCloud:
     mask: npt.ArrayLike | None = None
     survey: str = ""  #: the survey it belongs to; by default one of its own, called as it is
     copy: str = ""  #: which of the survey's copies it is, where there are several
-    own: npt.ArrayLike | None = (
-        None  #: (n,) bool, of a tile its own points; the others are only neighbors
-    )
+    #: (n,) bool, of a tile the points inside; the others are only neighbors. None: all are inside
+    inside: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
@@ -58,44 +57,44 @@ class TrainingCloud:
 
     @property
     def codes(self) -> npt.NDArray[np.uint16]:
-        """The labels, or StageError where they are none."""
+        """Return the labels (n,) as codes; StageError where they are not whole numbers."""
         return as_codes(self.labels, f"label of {self.name}")
 
     @property
     def points(self) -> int:
-        """How many points are its own."""
-        return len(self) if self.own is None else int(np.count_nonzero(self.own))
+        """Return the number of points inside."""
+        return len(self) if self.inside is None else int(np.count_nonzero(self.inside))
 
     @property
     def usable(self) -> npt.NDArray[np.bool_]:
-        """(n,) points that samples may be drawn from."""
+        """Return which points (n,) samples may be drawn from."""
         good = np.ones(len(self), np.bool_) if self.mask is None else np.array(self.mask)
-        return good if self.own is None else good & np.asarray(self.own)
+        return good if self.inside is None else good & np.asarray(self.inside)
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """All that is known of each point by name; dimensions as ``d/Intensity``."""
-        found = {"xyz": self.xyz, "labels": self.labels, "mask": self.mask, "own": self.own}
-        found |= {f"d/{name}": values for name, values in self.dimensions.items()}
-        return {name: np.asarray(values) for name, values in found.items() if values is not None}
+        """Return all values of the points by name; dimensions as ``d/Intensity``."""
+        values = {"xyz": self.xyz, "labels": self.labels, "mask": self.mask, "inside": self.inside}
+        values |= {f"d/{name}": array for name, array in self.dimensions.items()}
+        return {name: np.asarray(array) for name, array in values.items() if array is not None}
 
-    def having(self, arrays: Mapping[str, npt.NDArray[Any]], **more: Any) -> TrainingCloud:
-        """The same cloud of other points, of which this is known."""
+    def with_arrays(self, arrays: Mapping[str, npt.NDArray[Any]], **more: Any) -> TrainingCloud:
+        """Return a cloud of other points, with values as of :attr:`arrays`; the rest stays."""
         dimensions = {name[2:]: values for name, values in arrays.items() if name.startswith("d/")}
         known: dict[str, Any] = {
-            name: arrays.get(name) for name in ("xyz", "labels", "mask", "own")
+            name: arrays.get(name) for name in ("xyz", "labels", "mask", "inside")
         }
         return replace(self, dimensions=dimensions, **known, **more)
 
     def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
-        """Some of its points, as a cloud of the same survey."""
-        some = {name: values[rows] for name, values in self.arrays.items()}
+        """Return some of the points as a cloud of the same survey."""
+        arrays = {name: values[rows] for name, values in self.arrays.items()}
         name, copy = f"{self.name} {copy}".strip(), copy or self.copy
-        return self.having(some, name=name, copy=copy)
+        return self.with_arrays(arrays, name=name, copy=copy)
 
 
 def prepared(sources: Iterable[TrainingCloud], options: TrainingOptions) -> Iterator[TrainingCloud]:
-    """The clouds without ignored points and with one point per voxel, each followed by its thinned copies."""
+    """Yield the clouds without ignored points, one point per voxel, and their thinned copies."""
     for source in sources:
         cloud = _cleaned(source, options)
         yield cloud
@@ -110,15 +109,15 @@ def prepared(sources: Iterable[TrainingCloud], options: TrainingOptions) -> Iter
 
 
 def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
-    """A cloud without ignored points and with one point per voxel."""
+    """Return a cloud without ignored points and with one point per voxel."""
     check_xyz(cloud.xyz, cloud.name)
     named: set[int] = set()
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
     labels = cloud.codes
     if len(labels) != len(cloud):
-        found = f"{len(labels)} and {len(cloud)}"
-        raise OptionError("labels and points differ in number", where=cloud.name, found=found)
+        numbers = f"{len(labels)} and {len(cloud)}"
+        raise OptionError("labels and points differ in number", where=cloud.name, found=numbers)
     mask = None if cloud.mask is None else np.asarray(cloud.mask)
     if mask is not None and (mask.shape != labels.shape or mask.dtype != np.bool_):
         raise OptionError("the mask must be one true or false per point", where=cloud.name)
@@ -133,7 +132,8 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     part = cloud.part(rows)
     if options.base is None:
         return part
-    # Labels are few, and each counts: a representative without one gets the least of its voxel that may be trained on.
+    # Labels are few, and each counts: a representative without one gets the smallest usable one
+    # of its voxel.
     usable = np.isin(labels, list(named)) if named else ~np.isin(labels, _left_out(options))
     if cloud.mask is not None:
         usable &= np.asarray(cloud.mask)
@@ -142,19 +142,19 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     least = np.full(len(rows), MAX_LABEL + 1, np.int64)
     np.minimum.at(least, place[good], labels[points[good]])
     lent = ~usable[rows] & (least <= MAX_LABEL)
-    told = np.where(lent, least, labels[rows])
-    return replace(part, labels=told, mask=None if cloud.mask is None else usable[rows] | lent)
+    labels = np.where(lent, least, labels[rows])
+    return replace(part, labels=labels, mask=None if cloud.mask is None else usable[rows] | lent)
 
 
 def _left_out(options: TrainingOptions) -> list[int]:
-    """Labels that become no classes by themselves: those that tell nothing, but for classes of the base."""
+    """Return the labels that do not become classes by themselves: 0 and 1, unless of the base."""
     known = () if options.base is None else options.base.codes
     return [label for label in UNINFORMATIVE if label not in known]
 
 
 def spooled(clouds: Iterable[TrainingCloud], folder: Path) -> list[TrainingCloud]:
-    """The clouds with their arrays in files of `folder`: one cloud at a time is in memory."""
-    return [_mapped(one, folder, number) for number, one in enumerate(clouds)]
+    """Return the clouds with their arrays in files of `folder`, one after the other."""
+    return [_mapped(cloud, folder, number) for number, cloud in enumerate(clouds)]
 
 
 def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
@@ -170,7 +170,7 @@ def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
                 found=f"{folder}: {error.strerror or error}",
                 cure="Make room there, set TMPDIR to another disk, or write the model to one",
             ) from error
-    return cloud.having(kept)
+    return cloud.with_arrays(kept)
 
 
 class TiledCloud:
@@ -181,7 +181,8 @@ class TiledCloud:
     folder : Path
         Made for them alone.
     side : float
-        Of the squares, meters: (i, j) begins at ``i * side, j * side``. Points on an edge may belong to either.
+        Of the squares in meters: tile (i, j) begins at ``i * side, j * side``. Points on an
+        edge may belong to either tile.
     """
 
     def __init__(self, folder: Path, side: float) -> None:
@@ -190,35 +191,37 @@ class TiledCloud:
         folder.mkdir()
 
     def put(self, tile: tuple[int, int], cloud: TrainingCloud) -> None:
-        """Write a tile; nothing where it is empty."""
+        """Write a tile, unless it is empty."""
         if len(cloud):
             self.tiles[tile] = _mapped(cloud, self.folder, len(self.tiles))
 
     def clouds(self, halo: float) -> Iterator[TrainingCloud]:
-        """Each tile with the points up to `halo` meters around it, row by row; the files are gone in the end."""
+        """Yield each tile with the points up to `halo` meters around it; then remove the files."""
         steps = math.ceil(halo * (1 + 1e-6) / self.side)
         for tile in sorted(self.tiles, key=lambda t: (t[1], t[0])):
             low = np.array(tile) * self.side - halo
             high = low + self.side + 2 * halo
-            parts, own = [], []
+            parts, inside = [], []
             for b in range(tile[1] - steps, tile[1] + steps + 1):
                 for a in range(tile[0] - steps, tile[0] + steps + 1):
                     part = self.tiles.get((a, b))
                     if part is None:
                         continue
-                    mine = (a, b) == tile
-                    near = mine | ((part.xyz[:, :2] >= low) & (part.xyz[:, :2] <= high)).all(axis=1)
+                    is_tile = (a, b) == tile
+                    near = is_tile | ((part.xyz[:, :2] >= low) & (part.xyz[:, :2] <= high)).all(
+                        axis=1
+                    )
                     parts.append(part.part(np.flatnonzero(near)))
-                    own.append(np.full(len(parts[-1]), mine))
+                    inside.append(np.full(len(parts[-1]), is_tile))
             each = [part.arrays for part in parts]
-            whole = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
-            yield self.tiles[tile].having({**whole, "own": np.concatenate(own)})
+            whole = {name: np.concatenate([arrays[name] for arrays in each]) for name in each[0]}
+            yield self.tiles[tile].with_arrays({**whole, "inside": np.concatenate(inside)})
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Labeled:
-    """For each cloud its coordinates and the place of each point's class, -1 where it is not used."""
+    """Clouds with their classes: of each the coordinates and class positions, -1 where not used."""
 
     clouds: Sequence[TrainingCloud]
     classes: ClassMap
@@ -235,7 +238,7 @@ class Labeled:
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
         return (self[number] for number in range(len(self)))
 
-    def described(
+    def describe(
         self,
         options: TrainingOptions,
         counts: Iterable[Mapping[str, int]],
@@ -245,7 +248,11 @@ class Labeled:
         crossed: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> dict[str, Any]:
-        """What a manifest says: `counts` of each class's samples, `importances` of each pass, `crossed` is the score."""
+        """Return the manifest of a model trained on the clouds.
+
+        `counts` are those of each class's samples, `importances` those of each pass, `crossed` is
+        the score of the cross-validation, `packages` are those whose versions are stored.
+        """
         classes = zip(
             self.classes.codes, self.classes.names, self.classes.labels, counts, strict=True
         )
@@ -262,7 +269,7 @@ class Labeled:
             "densities": densities(self.clouds),
             "voxel": options.voxel,
             "accuracy": {"cross_validation": crossed},
-            "passes": [{"importances": one} for one in importances],
+            "passes": [{"importances": values} for values in importances],
             "created_by": {
                 "pdal_stages": __version__,
                 "python": platform.python_version(),
@@ -274,19 +281,20 @@ class Labeled:
 def label_classes(
     clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool = False
 ) -> Labeled:
-    """The classes that the clouds' labels make."""
+    """Return the clouds with the classes that their labels make."""
     number = np.zeros(MAX_LABEL + 1, np.int64)
     with Progress(sum(map(len, clouds)), "counting labels", enabled=progress) as bar:
         for cloud in clouds:
             number += np.bincount(cloud.codes[cloud.usable], minlength=len(number))
             bar.update(len(cloud))
-    found = {int(label): int(number[label]) for label in np.flatnonzero(number)}
-    listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(found.items())[:20]) or "no points"
-    classes = ClassMap.parse(options.classes, found, _left_out(options))
+    counts = {int(label): int(number[label]) for label in np.flatnonzero(number)}
+    listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(counts.items())[:20])
+    listing = listing or "no points"
+    classes = ClassMap.parse(options.classes, counts, _left_out(options))
     if options.strategy == "binary" and options.target is not None:
         classes = classes.binary(options.target, options.background)
     for code, name, members in zip(classes.codes, classes.names, classes.labels, strict=True):
-        if not any(found.get(label) for label in members):
+        if not any(counts.get(label) for label in members):
             raise OptionError(
                 f"class {code} ({name}) has no samples",
                 found=f"none of label {' or '.join(map(str, members))}; labels {listing}",
@@ -296,27 +304,27 @@ def label_classes(
         raise OptionError(
             "a classifier needs at least two classes",
             found=f"labels {listing}",
-            cure=f"Labels {', '.join(map(str, _left_out(options)))} are left out unless 'classes' names them",
+            cure=f"Labels {', '.join(map(str, _left_out(options)))} are left out unless 'classes' "
+            "names them",
         )
     return Labeled(clouds, classes)
 
 
 def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
-    """Names and numbers of points of clouds, the tiles of one as one, for a manifest."""
+    """Return names and numbers of points of clouds, the tiles of a cloud together."""
     rows: dict[tuple[str, int], int] = {}
     for number, cloud in enumerate(clouds):
-        key = os.path.basename(cloud.name), number if cloud.own is None else -1
+        key = os.path.basename(cloud.name), number if cloud.inside is None else -1
         rows[key] = rows.get(key, 0) + cloud.points
     return [{"name": name, "points": points} for (name, _), points in rows.items()]
 
 
 def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
-    """Smallest and largest density of some clouds, as a manifest has it; of tiles the median."""
-    found: dict[object, list[float]] = {}
+    """Return the smallest and largest density of some clouds; of tiles the median counts."""
+    of_cloud: dict[object, list[float]] = {}
     for number, cloud in enumerate(clouds):
-        key = number if cloud.own is None else (cloud.name, cloud.survey, cloud.copy)
-        found.setdefault(key, []).append(density(cloud.xyz))
-    there = [
-        one for each in found.values() if (one := float(np.median(each)))
-    ]  # empty ones do not count
-    return {"low": min(there, default=0.0), "high": max(there, default=0.0)}
+        key = number if cloud.inside is None else (cloud.name, cloud.survey, cloud.copy)
+        of_cloud.setdefault(key, []).append(density(cloud.xyz))
+    medians = [float(np.median(each)) for each in of_cloud.values()]
+    positive = [median for median in medians if median]  # empty clouds do not count
+    return {"low": min(positive, default=0.0), "high": max(positive, default=0.0)}

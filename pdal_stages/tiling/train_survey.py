@@ -320,7 +320,7 @@ def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCl
     wanted, sure = (arrays.pop(f"d/{mark}", np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
     if choice is not None:
         arrays["mask"] = choice.mask(CheckedPoints(wanted, sure, arrays["labels"]), arrays["xyz"])
-    return TrainingCloud(arrays["xyz"], arrays["labels"], name=name).having(arrays)
+    return TrainingCloud(arrays["xyz"], arrays["labels"], name=name).with_arrays(arrays)
 
 
 def take_points(
