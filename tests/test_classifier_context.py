@@ -87,7 +87,7 @@ def test_band_by_band_is_the_same(seed, kind, size):
     got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto_context, "BAND", size)
-        run = PassRun([WeightedPass(FirstPass(blocks), 3)], request, context)
+        run = PassRun([WeightedPass(FirstPass(blocks), (2, 5, 6))], request, context)
         for rows, columns in run.blocks():
             seen[rows] += 1
             got[rows] = columns

@@ -198,7 +198,7 @@ def test_a_pass_may_come_from_elsewhere(two, other):
 
         def predict(self, request):
             p = np.zeros((len(request.xyz), 3))
-            for block in classify([WeightedPass(first, 3)], request):
+            for block in classify([WeightedPass(first, (2, 5, 6))], request):
                 p[block.rows] = block.probabilities
             rows = np.arange(len(p)) if request.rows is None else request.rows
             request.report.figures["batches"] = 1

@@ -20,7 +20,7 @@ from ..base.grid import begins_run, cell_numbers
 from ..base.threads import map_blocks
 from ..features import FeaturePlan
 from ..features.engine import FeatureBlock, Run
-from .context_features import CellContext, Context, around, count_shares
+from .context_features import HEIGHT, CellContext, Context, around, count_shares
 from .feature_forest import FeatureForest
 from .fitted_features import CloudFeatures, Features
 from .interface import Block, InputPlan, PredictRequest, weigh
@@ -77,7 +77,7 @@ class WeightedPass(NamedTuple):
 
     #: a FeatureClassifier, or as the first a CloudClassifier
     classifier: Any
-    classes: int
+    codes: Sequence[int]  #: its classes
     #: (classes,) what the probabilities are multiplied by before they are handed on
     factors: npt.NDArray[np.float64] | None = None
 
@@ -97,7 +97,8 @@ def sample_context(
 ) -> npt.NDArray[np.float32]:
     """Return the context (m, columns) that a further pass would read at the m rows wanted, which ascend."""
     assert request.rows is not None
-    out = np.empty((len(request.rows), len(context.tokens) * passes[-1].classes), np.float32)
+    width = len(context.names(passes[-1].codes))
+    out = np.empty((len(request.rows), width), np.float32)
     for rows, columns in PassRun(passes, request, context).blocks():
         out[np.searchsorted(request.rows, rows)] = columns
     return out
@@ -143,7 +144,7 @@ class PassRun:
         self._strips = Strips(request.xyz, wanted[0], width)
         n = len(self._strips)
         #: (n, classes) of each step but the last, in the order of the strips
-        self._shares = [np.zeros((n, one.classes), np.uint16) for one in passes[: self._last]]
+        self._shares = [np.zeros((n, len(one.codes)), np.uint16) for one in passes[: self._last]]
         self._features = _share_sources(read, request)
 
     def blocks(self) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any]]]:
@@ -210,9 +211,16 @@ class PassRun:
         """Return what a step does with the blocks of a band, by the shares of the band and the strips beside it."""
         columns = None
         if context := self._contexts[step]:
-            xyz = self._request.xyz[self._strips.rows(band[1])]
+            rows, request = self._strips.rows(band[1]), self._request
             shares = self._shares[step - 1][band[1]]
-            columns = context.cell_means(xyz, shares, self._request.threads)
+            height = request.dimensions.get(HEIGHT) if context.segment_codes else None
+            columns = context.cell_means(
+                request.xyz[rows],
+                shares,
+                request.threads,
+                self._passes[step - 1].codes,
+                None if height is None else np.asarray(height)[rows],
+            )
         one = self._passes[step] if step < len(self._passes) else None
         return _StepOnBand(
             one, step < self._last, columns, self._strips, band[1].start, self._wanted[step]

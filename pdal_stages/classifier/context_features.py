@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import OptionError
+from ..base.errors import ModelError, OptionError
 from ..base.grid import compact_keys, places_among
 from ..base.threads import map_blocks
 from ..features.cell_means import WHOLE, cell_means
 from ..features.neighborhoods import SIDES
+from .segments import COLUMNS, RULES, SegmentContext, describe_segments
 
 #: Word of a token, which the side of a cell in meters follows: axes of the cells (3 x 3 x 3 around the point's, or 3 x 3
 #: columns of any height), and whether it reads the share of votes for each class in place of mean probabilities.
@@ -29,6 +30,12 @@ CELLS = {"box": (3, False), "column": (2, False), "boxvotes": (3, True), "column
 
 #: The token of the point's own probabilities.
 OWN = "own"
+#: Word of a token, which the code of a class follows: what its segments are like.
+SEGMENTS = "segments"
+#: Dimension that segments read.
+HEIGHT = "HeightAboveGround"
+#: Code of the class whose votes do not count against those of a segment.
+GROUND = 2
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class Context:
 
     tokens: tuple[
         str, ...
-    ]  #: ``own``, or a word of :data:`CELLS` and a side: ``box1``, ``columnvotes8``
+    ]  #: ``own``, a word of :data:`CELLS` and a side (``box1``, ``columnvotes8``), or ``segments6``
 
     def __post_init__(self) -> None:
         self.scales  # noqa: B018  refused when it is made
@@ -54,42 +61,68 @@ class Context:
         found = {}
         for token in self.tokens:
             match = re.fullmatch(rf"({'|'.join(CELLS)})(\d+(?:\.\d+)?)", token)
-            if token != OWN and (match is None or float(match[2]) not in SIDES):
+            if (
+                token != OWN
+                and token not in self.segment_codes
+                and (match is None or float(match[2]) not in SIDES)
+            ):
                 raise OptionError(
                     "a token of 'context' is not known",
                     found=repr(token)[:60],
                     cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in meters that is a power of two "
-                    f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8",
+                    f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8; or {SEGMENTS} and the code of a class",
                 )
             if match:
                 found[token] = (float(match[2]), *CELLS[match[1]])
         return found
 
+    @cached_property
+    def segment_codes(self) -> dict[str, int]:
+        """Class of the tokens of segments."""
+        matches = {token: re.fullmatch(rf"{SEGMENTS}(\d{{1,3}})", token) for token in self.tokens}
+        return {token: int(match[1]) for token, match in matches.items() if match}
+
     @property
     def strip(self) -> float:
-        """Width in meters of strips such that a point's cells all lie in its own and the two beside it; 0 without cells."""
-        return max((side for side, _, _ in self.scales.values()), default=0.0)
+        """Width of strips in meters such that what a point reads lies in its own and the two beside it.
+
+        0 where it reads nothing around.
+        """
+        sides = [side for side, _, _ in self.scales.values()]
+        return max(sides + [RULES.block] * bool(self.segment_codes), default=0.0)
 
     @property
     def reach(self) -> float:
         """Meters, along x or y, to the farthest point that can matter."""
         return 2.0 * self.strip
 
+    def describe_columns(self, codes: Sequence[int]) -> list[tuple[str, str, str]]:
+        """Return name, feature and token of the columns, where the pass before has these classes.
+
+        The name is as in ``Probability_2_box0_5``, the feature ``Probability_2``.
+        """
+        columns = []
+        for token in self.tokens:
+            features: Sequence[str] = [f"Probability_{code}" for code in codes]
+            if token in self.segment_codes:
+                features = COLUMNS
+            end = token.replace(".", "_")
+            columns += [(f"{feature}_{end}", feature, token) for feature in features]
+        return columns
+
     def names(self, codes: Sequence[int]) -> tuple[str, ...]:
-        """Columns, token by token, in each the classes of these codes: ``Probability_2_box0_5``."""
-        return tuple(
-            f"Probability_{code}_{token.replace('.', '_')}"
-            for token in self.tokens
-            for code in codes
-        )
+        """Return the names of the columns, where the pass before has these classes."""
+        return tuple(name for name, _, _ in self.describe_columns(codes))
 
     def cell_means(
         self,
         xyz: npt.NDArray[np.float64],
         shares: npt.NDArray[np.uint16],
         threads: int | None = None,
+        codes: Sequence[int] = (),
+        height: npt.ArrayLike | None = None,
     ) -> CellContext:
-        """Return the mean shares of all cells.
+        """Return the mean shares of all cells, and the segments.
 
         Parameters
         ----------
@@ -97,14 +130,39 @@ class Context:
             Meters. Cells of points whose columns will be wanted must be complete, and so must those around them.
         shares : (n, classes) uint16
             Of each point; see :func:`count_shares`.
+        codes : sequence of int
+            Classes of the shares; only segments need them.
+        height : (n,) array_like
+            Heights above ground in meters; only segments need them.
         """
         jobs = [(xyz[:, :axes], shares, side, votes) for side, axes, votes in self.scales.values()]
         means = map_blocks(_cell_means, jobs, threads)
-        return CellContext(self.tokens, shares, dict(zip(self.scales, means, strict=True)))
+        segments = {}
+        for token, code in self.segment_codes.items():
+            assert height is not None
+            target, ground = codes.index(code), codes.index(GROUND) if GROUND in codes else None
+            heights = np.asarray(height, np.float64)
+            segments[token] = describe_segments(xyz, shares, heights, target, ground)
+        cells = dict(zip(self.scales, means, strict=True))
+        return CellContext(self.tokens, shares, cells, segments)
+
+    def check_segments(self, codes: Sequence[int], dimensions: Sequence[str]) -> None:
+        """Raise a ModelError where segments need what is not there.
+
+        `codes` are the classes of the pass before, `dimensions` what the pass reads of the points.
+        """
+        for token, code in self.segment_codes.items():
+            if code not in codes or HEIGHT not in dimensions:
+                raise ModelError(
+                    f"the context '{token}' needs class {code} and the dimension {HEIGHT}",
+                    found=f"classes {list(codes)}; dimensions {', '.join(dimensions)}"[:200],
+                    cure=f"Name {HEIGHT} among the dimensions, or leave '{token}' out of the context",
+                )
 
     def own(self, columns: npt.NDArray[np.float32], classes: int) -> npt.NDArray[np.float64]:
         """(n, classes) of these columns: the point's own probabilities."""
-        first = self.tokens.index(OWN) * classes
+        before = Context(self.tokens[: self.tokens.index(OWN)])
+        first = len(before.names(range(classes)))
         said = columns[:, first : first + classes].astype(np.float64)
         return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
 
@@ -117,19 +175,20 @@ class CellContext:
     shares: npt.NDArray[np.uint16]  #: (n, classes) of the points themselves
     #: of the tokens that have cells: (n,) the cell of each point, (cells, classes) the means around each cell
     cells: Mapping[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]]
+    segments: Mapping[str, SegmentContext]  #: of the tokens of segments
 
     def columns(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
-        """Return the columns (b, tokens * classes) of some of the points."""
-        classes = self.shares.shape[1]
-        out = np.empty((len(rows), len(self.tokens) * classes), np.float32)
-        for k, token in enumerate(self.tokens):
-            part = out[:, k * classes : (k + 1) * classes]
+        """Return the columns (b, columns) of some of the points, token by token."""
+        parts: list[npt.NDArray[Any]] = []
+        for token in self.tokens:
             if token == OWN:
-                part[:] = self.shares[rows] / WHOLE
+                parts.append(self.shares[rows] / WHOLE)
+            elif token in self.segments:
+                parts.append(self.segments[token].columns(rows))
             else:
                 cell, mean = self.cells[token]
-                part[:] = mean[cell[rows]]
-        return out
+                parts.append(mean[cell[rows]])
+        return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
 def _cell_means(job: tuple[Any, ...]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
@@ -149,7 +208,7 @@ def around(
 
     These are whole cells: what of a cell is asked for is all of it.
     """
-    if rows is None or not len(rows) or not context.scales:
+    if rows is None or not len(rows) or not context.strip:
         return rows
     keys, offsets = compact_keys(xyz[:, :2], context.strip)
     wanted = np.unique(keys[rows])

@@ -61,6 +61,8 @@ class FeatureForest:
                 "the model's last columns must be the points' dimensions and what it reads of the pass before",
                 found=", ".join(names[-3:]),
             )
+        if context is not None:
+            context.check_segments(before, entry["dimensions"])
         features = Features.from_dict(entry, names[: len(names) - len(others)])
         forest = Forest.from_arrays(arrays, len(names), len(labeled))
         return cls(features, forest, context, blend)
@@ -95,9 +97,10 @@ class FeatureForest:
         columns = [Column(name, *found[number]) for number, name in enumerate(self.plan.features)]
         columns += [Column(name, name, "dimension", "(dimension)") for name in self.plan.dimensions]
         codes = self.classes_before(codes)
-        for token in () if self.context is None else self.context.tokens:
-            for name, code in zip(Context((token,)).names(codes), codes, strict=True):
-                columns.append(Column(name, f"Probability_{code}", "context", token))
+        for name, feature, token in (
+            () if self.context is None else self.context.describe_columns(codes)
+        ):
+            columns.append(Column(name, feature, "context", token))
         return columns
 
     # ---- applying it ---------------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ class Model:
         """Its passes, each with what its probabilities are weighted by."""
         given = [one.get("factors") for one in self.info["passes"][:-1]]
         factors = [*(None if one is None else np.array(one) for one in given), self.factors]
-        return list(map(WeightedPass, self.passes, map(len, self.codes_of), factors))
+        return list(map(WeightedPass, self.passes, self.codes_of, factors))
 
     @property
     def required_dimensions(self) -> tuple[str, ...]:

@@ -117,6 +117,9 @@ class _ForestTraining:
         if options.scaling == "percentiles":
             limit_to_percentiles(self.own, plan)
         context = Context(tuple(options.context))
+        if options.passes > 1 or self.base is not None:
+            codes = self.codes if self.base is None else self.base.codes.tolist()
+            context.check_segments(codes, inputs(options))
         self.reads: list[Context | None] = [None, *[context] * (options.passes - 1)]
         self.blends = self._blends()
         #: What the first pass reads of the samples.
@@ -383,8 +386,8 @@ class _ForestTraining:
         o, context = self.options, self.reads[number]
         assert context is not None
         base = [] if self.base is None else self.base.weighted_passes
-        classes = len(self._codes_after(number - 1)) if number else base[-1].classes
-        out = np.empty((len(self.samples), len(context.tokens) * classes), np.float32)
+        codes = self._codes_after(number - 1) if number else base[-1].codes
+        out = np.empty((len(self.samples), len(context.names(codes))), np.float32)
         with self.progress(
             len(out), f"context for pass {number + 1}" if number else "what the base says"
         ) as bar:
@@ -396,9 +399,7 @@ class _ForestTraining:
                 if folds is not None:
                     fold = folds.points(cloud.xyz, self.surveys[place])
                     each = (FoldForests(forests, fold) for forests in held_out)
-                    mine = [
-                        WeightedPass(one, len(self._codes_after(k))) for k, one in enumerate(each)
-                    ]
+                    mine = [WeightedPass(one, self._codes_after(k)) for k, one in enumerate(each)]
                 request = PredictRequest(
                     cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar
                 )
