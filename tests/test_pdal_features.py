@@ -10,7 +10,7 @@ import pytest
 
 import pdal_stages as ps
 
-DOCS = Path(__file__).parents[1] / "docs" / "features.md"
+DOCS = Path(__file__).parents[1] / "docs" / "pdal-users.md"
 #: Ours -> (PDAL's name, modes of PDAL's under which both are equal, PDAL's value for ours of n points)
 TABLE = {
     "Linearity": ("Linearity", ("raw", "normalized"), lambda v, n: v),
@@ -89,7 +89,7 @@ def test_the_optimal_neighborhood_of_pdal(cloud):
 
 def test_the_table_of_the_docs_is_this_one():
     text = DOCS.read_text(encoding="utf-8")
-    part = text[text.index("## Beside PDAL's") :].partition("\n## ")[0]
+    part = text[text.index("## Features of the same name") :].partition("\n## ")[0]
     for name, (named, modes, _) in TABLE.items():
         (row,) = [
             line
