@@ -20,7 +20,7 @@ from recipe import OPTIONS, training_clouds
 from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud
-from pdal_stages.classifier.context_features import Context, count_shares
+from pdal_stages.classifier.context_features import HEIGHT, Context, count_shares
 from pdal_stages.classifier.feature_forest import FeatureForest
 from pdal_stages.classifier.fitted_features import CloudFeatures, Features
 from pdal_stages.classifier.interface import PredictRequest
@@ -57,17 +57,20 @@ def compute_features(cloud: TrainingCloud, folder: Path) -> npt.NDArray[np.float
 class GroupsLeftOut:
     """The copies of the surveys that are trained on, and models without one group of them."""
 
-    def __init__(self, data: Path, surveys: Iterable[str], folder: Path) -> None:
-        names = sorted(surveys)
+    def __init__(self, data: Path, trained: Iterable[str], folder: Path) -> None:
+        names = sorted(trained)
         self.clouds = [cloud for name in names for cloud in training_clouds(data, name)]
         self.tables = [compute_features(cloud, folder) for cloud in self.clouds]
         labeled = label_classes(self.clouds, OPTIONS)
         self.classes = list(zip(labeled.classes.codes, labeled.classes.names, strict=True))
-        of = [cloud.survey for cloud in self.clouds]
-        self.samples = draw_samples(labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, of)
-        self.group_of = np.array([SURVEYS[name].group for name in of])
+        self.codes = list(labeled.classes.codes)
+        surveys = [cloud.survey for cloud in self.clouds]
+        self.samples = draw_samples(
+            labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, surveys
+        )
+        self.group_of = np.array([SURVEYS[name].group for name in surveys])
         #: Surveys of one fold are left out together for the votes that a later pass reads, as the trainer does it.
-        self.fold_of = np.array([names.index(name) % VOTE_FOLDS for name in of])
+        self.fold_of = np.array([names.index(name) % VOTE_FOLDS for name in surveys])
         self.group = self.group_of[self.samples.cloud]
         self.fold = self.fold_of[self.samples.cloud]
         self.values = self.samples.take(self.tables.__getitem__)
@@ -112,14 +115,14 @@ class GroupsLeftOut:
                 read = np.ascontiguousarray(self.tables[number])
                 if before:
                     every = np.arange(len(read))
-                    around = self._context(number, before[number], every)
-                    read = np.concatenate([read, around], axis=1)
+                    context = self._context(number, before[number], every)
+                    read = np.concatenate([read, context], axis=1)
                 votes[number] = count_shares(forest.predict_proba(read))
         return votes
 
     def _context_of_samples(self, votes: Votes) -> npt.NDArray[np.float32]:
         """Return the samples' context (samples, columns); 0 for those of clouds without votes."""
-        out = np.zeros((len(self.samples), len(CONTEXT.tokens) * len(self.classes)), np.float32)
+        out = np.zeros((len(self.samples), len(CONTEXT.names(self.codes))), np.float32)
         for number, shares in votes.items():
             at, rows = self.samples.of_cloud(number)
             out[at] = self._context(number, shares, rows)
@@ -129,7 +132,9 @@ class GroupsLeftOut:
         self, number: int, shares: npt.NDArray[np.uint16], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float32]:
         """Return the context (m, columns) of some of a cloud's points."""
-        return CONTEXT.cell_means(self.clouds[number].xyz, shares).columns(rows)
+        cloud = self.clouds[number]
+        height = cloud.dimensions[HEIGHT]
+        return CONTEXT.cell_means(cloud.xyz, shares, None, self.codes, height).columns(rows)
 
     def _training(self, without: str) -> dict[str, Any]:
         """Return what a model file stores about its training."""

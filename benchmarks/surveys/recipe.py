@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from clouds import Cloud, load, one_return, thinned, without_returns
-from surveys import SURVEYS
+from surveys import FEW, SURVEYS
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.base.hashing import hash_rows
@@ -21,10 +21,10 @@ DENSITIES = (8.0, 2.0, 0.6)
 ONE_RETURN = (12.0, 3.0)
 #: Height in meters below which a label of something standing is not believed.
 BELOW = 0.3
-#: Points of a copy at most: a strip of it, each copy's somewhere else.
-MOST = 15_000
-#: Steps by this share of a whole, over and over, fall evenly everywhere.
-GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+#: Points of a copy at most: a square of it, each copy's somewhere else, wide enough for whole houses.
+MOST = 45_000
+#: The same of surveys that give few samples.
+MOST_OF_FEW = 16_000
 OPTIONS = TrainingOptions(
     neighborhoods="s5,k10,k20,k50",
     feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest,"
@@ -43,7 +43,7 @@ OPTIONS = TrainingOptions(
     min_samples_leaf=10,
     prior_weight=0.0,
     passes=2,
-    context=("own", "box1", "box4", "columnvotes2", "columnvotes4"),
+    context=("own", "box1", "box4", "columnvotes2", "columnvotes4", "segments6"),
     folds=0,
     voxel=0.25,
 )
@@ -66,12 +66,16 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
 
 
 def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
-    """A survey's copy of this number as it is trained on: as dense, a strip of it, with a mask of as many points of
-    each class as the survey gives from a copy, chosen by their coordinates."""
+    """Return a survey's copy of this number as it is trained on: a square of it, with a mask of samples.
+
+    The mask has as many points of each class as the survey gives from a copy, chosen by their
+    coordinates.
+    """
     representatives = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
     if representatives is not None:
         cloud = cloud.taken(representatives.rows)
-    cloud = cloud.taken(strip(cloud.xyz, MOST, number * GOLDEN % 1.0))
+    few = SURVEYS[cloud.survey].samples == FEW
+    cloud = cloud.taken(square(cloud, MOST_OF_FEW if few else MOST, number))
     order = np.argsort(hash_rows(cloud.xyz.T, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
     whole = TrainingCloud(
@@ -93,11 +97,24 @@ def contradicted(cloud: Cloud | TrainingCloud) -> np.ndarray:
     return low & np.isin(cloud.labels, (4, 5, 6))
 
 
-def strip(xyz: np.ndarray, most: int, where: float) -> np.ndarray:
-    """Rows, ascending, of at most `most` points: a strip across the longer axis, `where` along it from 0 to 1."""
-    along = xyz[:, int(np.argmax(np.ptp(xyz[:, :2], axis=0)))]
-    first = int(max(len(xyz) - most, 0) * where)
-    return np.sort(np.argsort(along, kind="stable")[first : first + most])
+def square(cloud: Cloud, most: int, number: int) -> np.ndarray:
+    """Return rows, ascending, of a square of at most `most` points around a labeled point.
+
+    The `number` of a copy decides around which: a building, vegetation and ground in turn, as far
+    as there are any. The square lies inside the cloud where it fits.
+    """
+    if len(cloud.xyz) <= most:
+        return np.arange(len(cloud.xyz))
+    codes = [code for code in (6, 5, 2) if (cloud.labels == code).any()]
+    labeled = np.flatnonzero(cloud.labels == codes[number % len(codes)])
+    order = np.argsort(hash_rows(cloud.xyz[labeled].T, 7), kind="stable")
+    center = cloud.xyz[labeled[order[number * 17 % len(labeled)]], :2]
+    low, high = cloud.xyz[:, :2].min(axis=0), cloud.xyz[:, :2].max(axis=0)
+    half = 0.5 * np.sqrt(most / max(cloud.density, 1e-3))
+    middle = 0.5 * (low + high)
+    center = np.clip(center, np.minimum(low + half, middle), np.maximum(high - half, middle))
+    away = np.abs(cloud.xyz[:, :2] - center).max(axis=1)
+    return np.sort(np.argsort(away, kind="stable")[:most])
 
 
 def training_clouds(data: Path, survey: str) -> list[TrainingCloud]:
