@@ -1,12 +1,12 @@
-"""How well a per-point confidence separates right from wrong: reliability curve, error against margin.
+"""Calibration of a confidence: reliability curve, errors by margin, separation of right and wrong.
 
-A :class:`Grading` is a histogram of a confidence in [0, 1] with the share of right points in each
-bin. Histograms add, so tiles graded one by one give the figures of the whole.
+A :class:`Calibration` is a histogram of a confidence in [0, 1] with the number of right points in
+each bin. Histograms add, so those of tiles give the measures of the whole.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
@@ -20,51 +20,57 @@ BINS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Grading:
-    """A histogram of a confidence, with the points whose class is right: 1000 bins of width 0.001."""
+class Calibration:
+    """Histogram of a confidence and of the points whose class is right, in bins of 0.001."""
 
     count: npt.NDArray[np.int64]  #: (1000,) points of each bin
-    right: npt.NDArray[np.int64]  #: (1000,) those with the right class
-    total: npt.NDArray[np.float64]  #: (1000,) the sum of their confidence
+    right: npt.NDArray[np.int64]  #: (1000,) points of each bin with the right class
+    total: npt.NDArray[np.float64]  #: (1000,) sum of the confidence of each bin
 
     @classmethod
-    def empty(cls) -> Grading:
+    def empty(cls) -> Calibration:
+        """Return a histogram of no points."""
         return cls(np.zeros(BINS, np.int64), np.zeros(BINS, np.int64), np.zeros(BINS))
 
     @classmethod
     def from_values(
         cls, values: npt.ArrayLike, right: npt.ArrayLike, name: str = "reliability"
-    ) -> Grading:
-        """Grade (n,) confidences by whether the class is right, (n,) bool.
+    ) -> Calibration:
+        """Return the histogram of confidences (n,) and of those whose class is right, (n,) bool.
 
-        StageError, which calls them `name`, where one is not a number between 0 and 1.
+        Raises
+        ------
+        StageError
+            Where a confidence, called `name`, is not a number between 0 and 1.
         """
-        v = np.asarray(values, dtype=np.float64)
-        ok = np.asarray(right, dtype=bool)
+        v, is_right = np.asarray(values, dtype=np.float64), np.asarray(right, dtype=bool)
         bad = ~((v >= 0) & (v <= 1 + 1e-6))
         if bad.any():
             raise StageError(
                 f"{int(bad.sum()):,} of {len(v):,} values of {name} are not between 0 and 1",
                 found=float(v[bad][0]),
-                cure="Give the probabilities a classifier writes, unscaled, for every compared point",
+                cure="Give the classifier's probabilities, unscaled, for every compared point",
             )
         place = np.minimum((v * BINS).astype(np.int64), BINS - 1)
         return cls(
             np.bincount(place, minlength=BINS),
-            np.bincount(place[ok], minlength=BINS),
+            np.bincount(place[is_right], minlength=BINS),
             np.bincount(place, weights=v, minlength=BINS).astype(np.float64),
         )
 
-    def __add__(self, other: Grading) -> Grading:
-        return Grading(self.count + other.count, self.right + other.right, self.total + other.total)
+    def __add__(self, other: Calibration) -> Calibration:
+        """Return the histogram of both sets of points together."""
+        sums = (getattr(self, f.name) + getattr(other, f.name) for f in fields(self))
+        return Calibration(*sums)
 
     @property
     def points(self) -> int:
+        """Number of points."""
         return int(self.count.sum())
 
     @property
     def mean(self) -> float | None:
-        """Mean confidence of all points."""
+        """Mean confidence of all points, None without points."""
         return float(self.total.sum() / self.points) if self.points else None
 
     def _group(self, start: int, stop: int) -> dict[str, Any]:
@@ -81,12 +87,12 @@ class Grading:
         }
 
     def curve(self) -> list[dict[str, Any]]:
-        """Ten equally wide bins: the reliability curve (mean confidence against share right)."""
+        """Return ten equally wide bins: the reliability curve (confidence against share right)."""
         edges = np.linspace(0, BINS, 11).round().astype(int)
         return [self._group(int(a), int(b)) for a, b in pairwise(edges)]
 
     def deciles(self) -> list[dict[str, Any]]:
-        """Ten equally filled groups, from the least to the most confident points.
+        """Return ten equally filled groups, from the least to the most confident points.
 
         A histogram bin is never split, so many points of one value make fewer, unequal groups.
         """
@@ -99,7 +105,7 @@ class Grading:
         return [g for g in (self._group(a, b) for a, b in pairwise(edges)) if g["points"]]
 
     def expected_calibration_error(self) -> float | None:
-        """Mean distance between confidence and share right over the curve's bins, weighted by points.
+        """Return the mean distance of confidence and share right, over bins weighted by points.
 
         Source: Naeini, Cooper, Hauskrecht 2015, AAAI (ECE).
         """
@@ -110,9 +116,12 @@ class Grading:
         return float(sum(b["points"] * abs(b["mean"] - b["share_right"]) for b in filled) / n)
 
     def separation(self) -> float | None:
-        """Area under the ROC curve: the chance that a right point is more confident than a wrong one.
+        """Return the area under the ROC curve.
 
-        0.5 means no information, 1 that every error is marked; None where all points are right or all are wrong.
+        It is the chance that a right point has a higher confidence than a wrong one.
+
+        0.5 means no information, 1 that every error has a lower confidence than any right point;
+        None where all points are right or all are wrong.
         """
         wrong = (self.count - self.right).astype(np.float64)
         right = self.right.astype(np.float64)
@@ -122,7 +131,7 @@ class Grading:
         return float((right * (below + 0.5 * wrong)).sum() / (right.sum() * wrong.sum()))
 
     def to_dict(self, kind: str) -> dict[str, Any] | None:
-        """As JSON types, with the "curve" or the "deciles"; None without points."""
+        """Return measures as JSON types, with the "curve" or the "deciles"; None without points."""
         if not self.points:
             return None
         out: dict[str, Any] = {"mean": self.mean, "separation": self.separation()}

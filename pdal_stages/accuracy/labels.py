@@ -1,4 +1,4 @@
-"""Class labels: checked, counted in pairs, merged and named, for comparing two classifications."""
+"""Class labels of two classifications: check, merge, name and count them in pairs."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.asprs import NAMES, class_name
+from ..base.asprs import NAMES, UNINFORMATIVE, class_name
 from ..base.errors import StageError
 
-#: The largest label; LAS itself stops at 255, other dimensions that hold classes do not.
+#: Largest label: that of uint16; Classification itself ends at 255.
 MAX_LABEL = 65535
 #: A dimension with more different values than this is not a class dimension.
 MAX_CLASSES = 256
-#: Points looked at in one go, which bounds the memory.
+#: Points counted at a time, which bounds the memory.
 CHUNK = 1 << 20
 
 
 def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
-    """The labels as an (n,) uint16 array, or an error that says what is wrong with them."""
+    """Return labels as an (n,) uint16 array; StageError, which calls them `what`, for others."""
     a = np.asarray(labels)
     if a.ndim != 1:
         raise StageError(f"the {what} must be one label per point", found=f"shape {a.shape}")
@@ -42,8 +42,10 @@ def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
     return a.astype(np.uint16, copy=False)
 
 
-def same_length(reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Refuse arrays that are not as long as the reference; `others` says what each is."""
+def refuse_other_lengths(
+    reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[Any]]
+) -> None:
+    """Raise StageError for an array, by its name, that is not as long as the reference."""
     for what, values in others.items():
         if len(values) != len(reference):
             raise StageError(
@@ -54,37 +56,39 @@ def same_length(reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[An
 
 
 def code_of(what: str, value: Any, most: int = MAX_LABEL) -> int:
-    """A class code; digits as text (JSON keys) are allowed."""
+    """Return a class code; digits as text (JSON keys) are allowed."""
     if isinstance(value, str) and value.strip().isdecimal():
         value = int(value)
     return checks.whole(what, value, 0, most)
 
 
 def code_list(codes: Iterable[Any], option: str) -> list[int]:
-    """Class codes as ints."""
+    """Return class codes as ints."""
     return [code_of(f"a class in '{option}'", code) for code in codes]
 
 
-def class_names(codes: Iterable[int], given: Mapping[Any, str] | None) -> dict[int, str]:
-    """The names of codes: those given, whose keys may be text, then ASPRS's own."""
-    own = (
-        dict(zip(code_list(given, "names"), map(str, given.values()), strict=True)) if given else {}
-    )
-    return {code: own.get(code) or class_name(code) for code in sorted(set(codes))}
+def class_names(codes: Iterable[int], names: Mapping[Any, str] | None) -> dict[int, str]:
+    """Return the names of codes: those in `names`, whose keys may be text, or ASPRS's."""
+    names = names or {}
+    custom = dict(zip(code_list(names, "names"), map(str, names.values()), strict=True))
+    return {code: custom.get(code) or class_name(code) for code in sorted(set(codes))}
 
 
 @dataclass(frozen=True)
 class Merge:
     """Classes taken as one, on both sides of a comparison."""
 
-    target_of: npt.NDArray[np.int64]  #: (65536,) the class that every code becomes
-    names: dict[int, str]  #: of the classes made of several
+    target_of: npt.NDArray[np.int64]  #: (65536,) the class that each code becomes
+    names: dict[int, str]  #: names of merged classes
 
     @classmethod
     def parse(cls, mapping: Mapping[Any, Any] | None) -> Merge:
-        """Read ``{5: [3, 4]}``; keys and codes may be text.
+        """Read a mapping ``{5: [3, 4]}``; keys and codes may be text.
 
-        StageError for what is not a list of class codes, or a class sent to two others.
+        Raises
+        ------
+        StageError
+            For values that are not lists of class codes, or a class merged into two others.
         """
         to = np.arange(MAX_LABEL + 1)
         members: dict[int, set[int]] = {}
@@ -106,12 +110,12 @@ class Merge:
             members.setdefault(target, set()).update(sources)
         names = {}
         for target, codes in members.items():
-            # An ASPRS target keeps its own points (3, 4 -> 5); a user's own code is a new class.
+            # A target of ASPRS keeps its points (3, 4 -> 5); a code of the user is a new class.
             if target in NAMES and to[target] == target:
                 codes.add(target)
             if len(codes) > 1:
                 words = {class_name(code).split()[-1] for code in codes}
-                # Low, medium and high vegetation are vegetation; others have no word in common.
+                # Low, medium and high vegetation are vegetation; other classes share no word.
                 common = len(words) == 1 and all(code in NAMES for code in codes)
                 listed = ", ".join(map(str, sorted(codes)))
                 names[target] = words.pop().capitalize() if common else f"Classes {listed}"
@@ -119,21 +123,57 @@ class Merge:
 
     @property
     def changed(self) -> dict[int, int]:
-        """The codes that become another class, and which."""
+        """The codes that become another class, and that class."""
         codes = np.flatnonzero(self.target_of != np.arange(len(self.target_of)))
         return {int(code): int(self.target_of[code]) for code in codes}
+
+
+@dataclass(frozen=True)
+class ComparedClasses:
+    """The classes that a comparison is about."""
+
+    #: classes of the reference to compare, after merging; points of other classes are left out and
+    #: counted. By default every class that occurs
+    classes: Iterable[int] | None = None
+    names: Mapping[Any, str] | None = None  #: code to name, where it is not ASPRS's
+    #: reference codes, before merging, whose points are left out and counted. By default those that
+    #: training leaves out: 0 and 1 (unclassified), 7 and 18 (noise), 12 (overlap); none where
+    #: `classes` is set
+    ignore: Iterable[int] | None = None
+    #: classes to take as one, on both sides: ``{5: [3, 4]}``
+    merge: Mapping[Any, Any] | None = None
+
+    def select(
+        self, codes: npt.NDArray[np.int64], merge: Merge
+    ) -> tuple[tuple[int, ...], npt.NDArray[np.bool_]]:
+        """Return the classes to compare, and which codes (n,) of the reference belong to them."""
+        default = UNINFORMATIVE if self.classes is None else ()
+        ignored = default if self.ignore is None else self.ignore
+        kept = ~np.isin(codes, code_list(ignored, "ignore"))
+        if self.classes is None:
+            return tuple(np.unique(merge.target_of[codes[kept]]).tolist()), kept
+        rows = tuple(sorted(set(code_list(self.classes, "classes"))))
+        return rows, kept & np.isin(merge.target_of[codes], rows)
 
 
 def pair_counts(
     reference: npt.NDArray[Any], predicted: npt.NDArray[Any]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Codes of the reference (R,) and of the prediction (C,), ascending, and how often each pair occurs (R, C)."""
+    """Count pairs of labels.
+
+    Returns
+    -------
+    rows, columns : (R,), (C,) int64
+        Codes of the reference and of the prediction, ascending.
+    counts : (R, C) int64
+        Points of each pair.
+    """
     codes, positions = [], []
     for what, labels in (("reference", reference), ("prediction", predicted)):
-        there = np.zeros(MAX_LABEL + 1, bool)
-        there[labels] = True
-        codes.append(np.flatnonzero(there))
-        positions.append(np.cumsum(there) - 1)
+        occurs = np.zeros(MAX_LABEL + 1, bool)
+        occurs[labels] = True
+        codes.append(np.flatnonzero(occurs))
+        positions.append(np.cumsum(occurs) - 1)
         if len(codes[-1]) > MAX_CLASSES:
             raise StageError(
                 f"the {what} has too many different values for class codes",
@@ -149,14 +189,18 @@ def pair_counts(
     return rows, columns, counts.reshape(len(rows), len(columns))
 
 
-def regroup(
+def sum_tables(
     rows: Sequence[int], *tables: tuple[npt.NDArray[np.int64], Iterable[int], Iterable[int]]
 ) -> tuple[tuple[int, ...], npt.NDArray[np.int64]]:
-    """One matrix of several tables of counts with the classes of their rows and columns, those of one class added up.
+    """Add tables of counts, each with the classes of its rows and of its columns.
 
-    Its columns are `rows`, among which every table's are, then the other classes of the tables' columns, ascending.
+    Returns
+    -------
+    columns : tuple of int
+        `rows`, among which the rows of every table are, then other classes of columns, ascending.
+    matrix : (rows, columns) int64
     """
-    columns = (*rows, *sorted({int(c) for _, _, given in tables for c in given} - set(rows)))
+    columns = (*rows, *sorted({int(c) for *_, classes in tables for c in classes} - set(rows)))
     place = {code: k for k, code in enumerate(columns)}
     out = np.zeros((len(rows), len(columns)), np.int64)
     for counts, *sides in tables:

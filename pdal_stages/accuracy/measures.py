@@ -1,17 +1,18 @@
 """Accuracy of a classification against reference labels: confusion matrix and all measures of it.
 
-Measures of [B16] section 4.3 and [W18] section 4.3: overall accuracy, Cohen's kappa, mean class recall
-and precision, per-class recall, precision, F1, and mean F1; intersection over union beside them.
+Measures of [B16] section 4.3 and [W18] section 4.3: overall accuracy, Cohen's kappa, mean class
+recall and precision, per-class recall, precision, F1, and mean F1; intersection over union beside
+them.
 
-Rules for what is not defined, so that no figure is ever NaN:
+Rules for what is not defined, so that no measure is ever NaN:
 
 - Means are over the classes present in the reference.
 - A class present in the reference that was never predicted has precision 0 and F1 0.
 - A class with no reference points (named in `classes`, or predicted only) has recall None; its
   precision, where it was predicted, is 0.
 - Kappa is None where chance alone would agree on everything (one class, predicted throughout).
-- A predicted class that is not a class of the reference (1 where points were rejected, say) gets a column
-  of its own, and its points count as errors.
+- A predicted class that is not a class of the reference (1 where points were rejected, say) gets
+  a column of its own, and its points count as errors.
 """
 
 from __future__ import annotations
@@ -24,28 +25,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.asprs import UNINFORMATIVE, class_name
+from ..base.asprs import class_name
 from ..base.errors import StageError
-from .calibration import Grading
+from .calibration import Calibration
 from .labels import (
-    CHUNK,
+    ComparedClasses,
     Merge,
     as_codes,
     class_names,
     code_list,
     pair_counts,
-    regroup,
-    same_length,
+    refuse_other_lengths,
+    sum_tables,
 )
 from .text import table
 
 FORMAT = "pdal-stages accuracy"
 VERSION = 1
+#: Points graded at a time, which bounds the memory.
+CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
-class ClassFigures:
-    """The figures of one class; shares are between 0 and 1, None where they are not defined."""
+class ClassMeasures:
+    """Measures of one class; shares are between 0 and 1, None where they are not defined."""
 
     code: int
     name: str
@@ -60,38 +63,31 @@ class ClassFigures:
 
 @dataclass(frozen=True, eq=False)
 class Accuracy:
-    """A confusion matrix and the measures drawn from it.
+    """A confusion matrix and its measures.
 
     Make one with :meth:`from_labels` or :meth:`from_confusion`. Two of them add (tiles), and
     ``sum(tiles)`` works.
     """
 
-    classes: tuple[int, ...]  #: codes of the matrix's rows: the classes of the reference, ascending
-    #: of the columns after those: classes that were predicted but are not in the reference
-    extra: tuple[int, ...]
-    matrix: npt.NDArray[
-        np.int64
-    ]  #: (K, K + E) points; rows are the reference, columns the prediction
+    classes: tuple[int, ...]  #: codes of the rows: the classes of the reference, ascending
+    extra: tuple[int, ...]  #: codes of further columns: predicted, but not in the reference
+    matrix: npt.NDArray[np.int64]  #: (K, K + E) points; rows are the reference
     names: Mapping[int, str] = field(default_factory=dict)
-    #: reference points that were not compared, by their reference class before any merge
-    left_out: Mapping[int, int] = field(default_factory=dict)
-    reliability: Grading | None = None  #: how well it separates right from wrong
-    margin: Grading | None = None
-    #: classes that were taken as another one on both sides
-    merged: Mapping[int, int] = field(default_factory=dict)
+    left_out: Mapping[int, int] = field(default_factory=dict)  #: points by class before any merge
+    reliability: Calibration | None = None  #: how well it separates right from wrong
+    margin: Calibration | None = None
+    merged: Mapping[int, int] = field(default_factory=dict)  #: classes taken as another one
 
     @classmethod
     def from_labels(
         cls,
         reference: npt.ArrayLike,
         predicted: npt.ArrayLike,
-        classes: Iterable[int] | None = None,
-        names: Mapping[int, str] | None = None,
-        ignore: Iterable[int] | None = None,
+        *,
         reliability: npt.ArrayLike | None = None,
         margin: npt.ArrayLike | None = None,
-        merge: Mapping[Any, Any] | None = None,
         allow_empty: bool = False,
+        **rules: Any,
     ) -> Accuracy:
         """Compare two label arrays.
 
@@ -99,85 +95,51 @@ class Accuracy:
         ----------
         reference, predicted : (n,) arrays
             Class codes, whole numbers from 0 to 65535.
-        classes : iterable of int, optional
-            Classes of the reference to compare, after merging; points of any other class are left out and counted.
-            By default every class found.
-        names : mapping, optional
-            Code to name, where it is not ASPRS's own.
-        ignore : iterable of int, optional
-            Reference codes, before merging, whose points are left out and counted. By default those that training
-            leaves out as well: 0 and 1 (unclassified), 7 and 18 (noise) and 12 (overlap); none where `classes` is
-            given.
         reliability, margin : (n,) arrays, optional
             Winning probability, and winning minus second, both from 0 to 1.
-        merge : mapping, optional
-            Classes to take as one, on both sides: ``{5: [3, 4]}``.
         allow_empty : bool
-            Whether no point to compare is allowed (a tile without reference points, to be added to others).
+            Whether no point to compare is allowed (a tile without reference points).
+        **rules
+            Fields of :class:`.labels.ComparedClasses`: classes, names, ignore, merge.
 
         Raises
         ------
         StageError
-            Arrays of different lengths, labels that are not class codes, or nothing left to compare.
+            Arrays of different lengths, labels that are not class codes, or nothing to compare.
         """
-        ref, pred = as_codes(reference, "reference"), as_codes(predicted, "prediction")
-        given = {"reliability": reliability, "margin": margin}
-        confidences = {key: np.asarray(v).reshape(-1) for key, v in given.items() if v is not None}
-        same_length(ref, {"prediction": pred, **confidences})
-
-        merged = Merge.parse(merge)
-        found, found_predicted, counts = pair_counts(ref, pred)
-        if ignore is None:
-            ignore = UNINFORMATIVE if classes is None else ()
-        kept = ~np.isin(found, code_list(ignore, "ignore"))
-        if classes is None:
-            rows = tuple(np.unique(merged.target_of[found[kept]]).tolist())
-        else:
-            rows = tuple(sorted(set(code_list(classes, "classes"))))
-            kept &= np.isin(merged.target_of[found], rows)
-        points = dict(zip(found.tolist(), counts.sum(axis=1).tolist(), strict=True))
-        left = {code: points[code] for code in found[~kept].tolist()}
+        true, labels = as_codes(reference, "reference"), as_codes(predicted, "prediction")
+        values = {"reliability": reliability, "margin": margin}
+        confidences = {key: np.asarray(v).reshape(-1) for key, v in values.items() if v is not None}
+        refuse_other_lengths(true, {"prediction": labels, **confidences})
+        compared = ComparedClasses(**rules)
+        merge = Merge.parse(compared.merge)
+        codes, predicted_codes, counts = pair_counts(true, labels)
+        rows, kept = compared.select(codes, merge)
+        points = dict(zip(codes.tolist(), counts.sum(axis=1).tolist(), strict=True))
+        left_out = {code: points[code] for code in codes[~kept].tolist()}
         if not allow_empty and not kept.any():
-            listed = ", ".join(f"{code}: {n:,}" for code, n in list(points.items())[:12])
-            raise StageError(
-                "no point to compare: every reference point is left out"
-                if left
-                else "no point to compare",
-                found=f"reference classes {listed}{', ...' * (len(points) > 12)}"
-                if points
-                else "0 points",
-                cure="Name classes the reference has, or ignore fewer" if left else None,
-            )
-        counts = counts[kept]
-        given_to = counts.any(axis=0)
-        of_rows, of_columns = (
-            merged.target_of[found[kept]],
-            merged.target_of[found_predicted[given_to]],
-        )
-        columns, matrix = regroup(rows, (counts[:, given_to], of_rows, of_columns))
-
-        compared = np.isin(np.arange(len(merged.target_of)), found[kept])
-        graded = {key: Grading.empty() for key in confidences}
-        for start in range(0, len(ref) if graded else 0, CHUNK):
+            raise _nothing_to_compare(points, left_out)
+        occurs = counts[kept].any(axis=0)
+        merged_rows = merge.target_of[codes[kept]]
+        merged_columns = merge.target_of[predicted_codes[occurs]]
+        columns, matrix = sum_tables(rows, (counts[kept][:, occurs], merged_rows, merged_columns))
+        is_compared = np.isin(np.arange(len(merge.target_of)), codes[kept])
+        graded = {key: Calibration.empty() for key in confidences}
+        for start in range(0, len(true) if graded else 0, CHUNK):
             part = slice(start, start + CHUNK)
-            chosen = compared[ref[part]]
-            right = merged.target_of[ref[part][chosen]] == merged.target_of[pred[part][chosen]]
-            for key, values in confidences.items():
-                graded[key] += Grading.from_values(values[part][chosen], right, key)
+            chosen = is_compared[true[part]]
+            right = np.equal(*(merge.target_of[side[part][chosen]] for side in (true, labels)))
+            for key, confidence in confidences.items():
+                graded[key] += Calibration.from_values(confidence[part][chosen], right, key)
+        names = class_names((*columns, *left_out), {**merge.names, **(compared.names or {})})
         return cls(
-            rows,
-            columns[len(rows) :],
-            matrix,
-            class_names((*columns, *left), {**merged.names, **(names or {})}),
-            left,
-            graded.get("reliability"),
-            graded.get("margin"),
-            merged.changed,
+            *(rows, columns[len(rows) :], matrix, names, left_out),
+            *(graded.get("reliability"), graded.get("margin"), merge.changed),
         )
 
     @classmethod
     def from_confusion(cls, matrix: npt.ArrayLike, classes: Sequence[int]) -> Accuracy:
-        """Take a confusion matrix as it is: whole numbers, rows are the reference, columns the prediction."""
+        """Take a confusion matrix of counts; rows are the reference, columns the prediction."""
         rows, counts = code_list(classes, "classes"), np.asarray(matrix)
         if counts.shape != (len(rows), len(rows)) or len(set(rows)) != len(rows) or not rows:
             raise StageError(
@@ -188,20 +150,21 @@ class Accuracy:
         whole = counts.astype(np.int64)
         if (whole != counts).any() or (whole < 0).any():
             raise StageError("a confusion matrix holds counts: whole numbers of 0 or more")
-        columns, whole = regroup(sorted(rows), (whole, rows, rows))
+        columns, whole = sum_tables(sorted(rows), (whole, rows, rows))
         return cls(columns, (), whole, class_names(columns, None))
 
     def __add__(self, other: Accuracy) -> Accuracy:
+        """Return the accuracy of both sets of points together."""
         if not isinstance(other, Accuracy):
             return NotImplemented
         rows = tuple(sorted(set(self.classes) | set(other.classes)))
-        tables = ((one.matrix, one.classes, one.columns) for one in (self, other))
-        columns, matrix = regroup(rows, *tables)
+        tables = ((each.matrix, each.classes, each.columns) for each in (self, other))
+        columns, matrix = sum_tables(rows, *tables)
         left = {
             c: self.left_out.get(c, 0) + other.left_out.get(c, 0)
             for c in sorted(set(self.left_out) | set(other.left_out))
         }
-        # A code that others were merged into may be both: its own points left out, theirs compared.
+        # A merge target may be both: its own points left out, those merged into it compared.
         if clash := sorted(set(left) & set(rows) - set(self.merged.values())):
             raise StageError(
                 "two accuracies do not add: one compares a class that the other leaves out",
@@ -214,30 +177,21 @@ class Accuracy:
                 found=f"{dict(self.merged)} and {dict(other.merged)}",
                 cure="Compare both with the same 'merge'",
             )
-        # An empty tile has nothing to grade; anything else that lacks one would make it a curve of some points.
-        graded: dict[str, Grading | None] = {}
+        # An empty tile has no calibration; where another part lacks one, the sum has none either.
+        graded: dict[str, Calibration | None] = {}
         for key in ("reliability", "margin"):
-            parts = [
-                getattr(one, key)
-                for one in (self, other)
-                if one.points or getattr(one, key) is not None
-            ]
+            both = ((each.points, getattr(each, key)) for each in (self, other))
+            parts = [value for points, value in both if points or value is not None]
             graded[key] = None if None in parts or not parts else sum(parts[1:], parts[0])
-        return Accuracy(
-            rows,
-            columns[len(rows) :],
-            matrix,
-            {**other.names, **self.names},
-            left,
-            graded["reliability"],
-            graded["margin"],
-            {**other.merged, **self.merged},
-        )
+        names, merged = {**other.names, **self.names}, {**other.merged, **self.merged}
+        return Accuracy(rows, columns[len(rows) :], matrix, names, left, **graded, merged=merged)
 
     def __radd__(self, other: object) -> Accuracy:
-        return self if other == 0 else NotImplemented  # sum() starts with 0
+        """Return itself added to 0, which sum() starts with."""
+        return self if other == 0 else NotImplemented
 
     def __repr__(self) -> str:
+        """Return the number of points, the classes and the overall accuracy."""
         what = f"overall_accuracy={self.overall_accuracy:.4f}" if self.points else "empty"
         return f"<Accuracy of {self.points:,} points, classes {list(self.classes)}: {what}>"
 
@@ -268,67 +222,61 @@ class Accuracy:
 
     @cached_property
     def by_reference(self) -> npt.NDArray[np.float64]:
-        """Each row as shares of the reference class: its diagonal is recall. Empty rows are 0."""
+        """Shares of the reference class (K, K + E), whose diagonal is recall; 0 in empty rows."""
         total = self.matrix.sum(axis=1, keepdims=True)
         return np.divide(self.matrix, total, out=np.zeros(self.matrix.shape), where=total > 0)
 
-    def _checked(self) -> None:
+    def _refuse_empty(self) -> None:
         if self.points == 0:
             raise StageError("no point was compared, so there is no accuracy", found="0 points")
 
     @property
     def overall_accuracy(self) -> float:
         """Share of points whose class is right."""
-        self._checked()
+        self._refuse_empty()
         return self.correct / self.points
 
     @property
     def kappa(self) -> float | None:
         """Cohen's kappa: agreement beyond chance; None where chance agrees on everything."""
-        self._checked()
+        self._refuse_empty()
         n, k = self.points, len(self.classes)
         rows = [int(v) for v in self.matrix.sum(axis=1)]
         columns = [int(v) for v in self.matrix.sum(axis=0)[:k]]
         chance = sum(r * c for r, c in zip(rows, columns, strict=True))  # exact whole numbers
         return (self.correct * n - chance) / (n * n - chance) if chance != n * n else None
 
-    #: MCR and MCP [B16], mean F1 [W18], mean intersection over union: unweighted means of the classes'.
+    #: Unweighted means over classes: MCR and MCP [B16], mean F1 [W18], intersection over union.
     mean_class_recall = property(lambda self: self._mean("recall"))
     mean_class_precision = property(lambda self: self._mean("precision"))
     mean_f1 = property(lambda self: self._mean("f1"))
     mean_iou = property(lambda self: self._mean("iou"))
 
     def _mean(self, name: str) -> float:
-        self._checked()
+        self._refuse_empty()
         values = [getattr(f, name) for f in self.per_class if f.support]
         return float(sum(0.0 if v is None else v for v in values) / len(values))
 
     @cached_property
-    def per_class(self) -> tuple[ClassFigures, ...]:
-        """The figures of every class of the reference."""
-        figures = []
+    def per_class(self) -> tuple[ClassMeasures, ...]:
+        """Measures of every class of the reference."""
+        measures = []
         for i, code in enumerate(self.classes):
-            support, given = int(self.matrix[i].sum()), int(self.matrix[:, i].sum())
-            hit = int(self.matrix[i, i])
-            figures.append(
-                ClassFigures(
-                    code=code,
-                    name=self.name(code),
-                    support=support,
-                    predicted=given,
-                    correct=hit,
-                    recall=hit / support if support else None,
-                    precision=hit / given if given else (0.0 if support else None),
-                    f1=2 * hit / (support + given) if support + given else None,
-                    iou=hit / (support + given - hit) if support + given else None,
-                )
+            support, predicted = int(self.matrix[i].sum()), int(self.matrix[:, i].sum())
+            hit, both = int(self.matrix[i, i]), support + predicted
+            recall = hit / support if support else None
+            precision = hit / predicted if predicted else (0.0 if support else None)
+            shares = (2 * hit / both, hit / (both - hit)) if both else (None, None)
+            counts = (support, predicted, hit)
+            measures.append(
+                ClassMeasures(code, self.name(code), *counts, recall, precision, *shares)
             )
-        return tuple(figures)
+        return tuple(measures)
 
     def _by_class(self, name: str) -> dict[int, Any]:
         return {f.code: getattr(f, name) for f in self.per_class}
 
-    #: Class code to recall (completeness), precision (correctness), F1, intersection over union, reference points.
+    #: By class code: recall (completeness), precision (correctness), F1, IoU, reference points.
     recall = property(lambda self: self._by_class("recall"))
     precision = property(lambda self: self._by_class("precision"))
     f1 = property(lambda self: self._by_class("f1"))
@@ -336,7 +284,7 @@ class Accuracy:
     support = property(lambda self: self._by_class("support"))
 
     def confusions(self, most: int) -> list[tuple[int, int, int]]:
-        """The errors, largest first: reference class, predicted class, points; for the page's template."""
+        """Return the `most` frequent errors: reference class, predicted class, points."""
         k = len(self.classes)
         wrong = self.matrix.copy()
         wrong[np.arange(k), np.arange(k)] = 0
@@ -346,11 +294,11 @@ class Accuracy:
         return [(self.classes[a], self.columns[b], int(wrong[a, b])) for a, b in pairs]
 
     def name(self, code: int) -> str:
-        """A class's name."""
+        """Return the name of a class."""
         return self.names.get(code) or class_name(code)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as JSON types; ``accuracy-1.json`` describes it."""
+        """Return everything as JSON types; ``accuracy-1.json`` describes it."""
 
         def described(codes: Iterable[int]) -> list[dict[str, Any]]:
             return [{"code": c, "name": self.name(c)} for c in codes]
@@ -387,5 +335,15 @@ class Accuracy:
         }
 
     def table(self) -> str:
-        """The figures as aligned text, in percent."""
+        """Return the measures as aligned text, in percent."""
         return table(self.to_dict(), self.name)
+
+
+def _nothing_to_compare(points: Mapping[int, int], left_out: Mapping[int, int]) -> StageError:
+    listed = ", ".join(f"{code}: {n:,}" for code, n in list(points.items())[:12])
+    more = ", ..." * (len(points) > 12)
+    return StageError(
+        "no point to compare" + ": every reference point is left out" * bool(left_out),
+        found=f"reference classes {listed}{more}" if points else "0 points",
+        cure="Name classes the reference has, or ignore fewer" if left_out else None,
+    )

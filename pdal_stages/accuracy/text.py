@@ -1,44 +1,42 @@
-"""The figures of a comparison as a console table."""
+"""Measures of a comparison as text tables."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+#: Measures of the tables of several files.
+_MAIN = ("overall_accuracy", "kappa", "mean_f1")
+
 
 def percent(share: float | None, digits: int = 2) -> str:
-    """A share in percent, without its sign; ``-`` where it is not defined."""
+    """Return a share in percent, without its sign; ``-`` where it is not defined."""
     return "-" if share is None else f"{100 * share:.{digits}f}"
 
 
 def summary(accuracy: Any) -> dict[str, Any]:
-    """The figures of an ``Accuracy`` that one line holds."""
-    shares = ("overall_accuracy", "kappa", "mean_f1")
-    return {"points": accuracy.points} | {
-        name: getattr(accuracy, name) if accuracy.points else None for name in shares
-    }
+    """Return the main measures of an ``Accuracy``, None without points."""
+    shares = {name: getattr(accuracy, name) if accuracy.points else None for name in _MAIN}
+    return {"points": accuracy.points, **shares}
 
 
 def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
-    """A line for each file, the worst first."""
-    rows = [(name, summary(one)) for name, one in zip(names, each, strict=True)]
-    rows.sort(
-        key=lambda row: (
-            row[1]["overall_accuracy"] is None,
-            row[1]["overall_accuracy"] or 0.0,
-            row[0],
-        )
-    )
+    """Return a table with a line for each file, the worst first."""
+    rows = [(name, summary(accuracy)) for name, accuracy in zip(names, each, strict=True)]
+    rows.sort(key=lambda row: (_share_or_last(row[1]["overall_accuracy"]), row[0]))
     header = ["", "File", "Points", "Accuracy %", "Kappa %", "Mean F1 %"]
-    shares = ("overall_accuracy", "kappa", "mean_f1")
     lines = [
-        ["", name, f"{d['points']:,}", *(percent(d[key]) for key in shares)] for name, d in rows
+        ["", name, f"{d['points']:,}", *(percent(d[key]) for key in _MAIN)] for name, d in rows
     ]
     return _aligned(header, lines) + "\n"
 
 
+def _share_or_last(share: float | None) -> float:
+    return 2.0 if share is None else share
+
+
 def table(figures: Mapping[str, Any], name: Callable[[int], str]) -> str:
-    """What ``accuracy-1.json`` describes as aligned text, in percent."""
+    """Return the measures of ``Accuracy.to_dict`` as aligned text, in percent."""
     blocks = [_headline(figures, name), _classes(figures), _confusion(figures["confusion"])]
     return "\n\n".join([*blocks, *_confidence(figures)])
 
@@ -92,12 +90,9 @@ def _confusion(d: Mapping[str, Any]) -> str:
         [str(c["code"]), c["name"], *map(percent, values)]
         for c, values in zip(d["rows"], d["by_reference"], strict=True)
     ]
-    text = "Confusion: rows reference, columns prediction, % of the reference class; the diagonal is recall\n"
-    return (
-        text
-        + _aligned(header, rows)
-        + "\n* not a class of the reference" * (len(d["columns"]) > known)
-    )
+    text = "Confusion: rows reference, columns prediction, % of the reference class; "
+    note = "\n* not a class of the reference" * (len(d["columns"]) > known)
+    return f"{text}the diagonal is recall\n{_aligned(header, rows)}{note}"
 
 
 def _confidence(d: Mapping[str, Any]) -> list[str]:
@@ -115,14 +110,14 @@ def _confidence(d: Mapping[str, Any]) -> list[str]:
             for g in (groups[0], groups[-1])
         )
         lines.append(
-            f"Margin: of the {least} % least certain points {wrong} % are wrong, of the {most} % most certain "
-            f"{wrong_of_most} %"
+            f"Margin: of the {least} % least certain points {wrong} % are wrong, "
+            f"of the {most} % most certain {wrong_of_most} %"
         )
     return ["\n".join(lines)] if lines else []
 
 
 def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Text in columns: the second to the left, all others to the right."""
+    """Return text in columns, the second aligned to the left, all others to the right."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     lines = []
     for row in [header, *rows]:

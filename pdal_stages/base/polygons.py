@@ -1,4 +1,4 @@
-"""Points inside the polygons of an OGR file: a map's lakes, roads or bridges laid over a cloud (extra ``vector``)."""
+"""Points inside polygons of an OGR file, such as lakes, roads or bridges (extra ``vector``)."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _LAYER = "|layername="
 _POLYGONS = re.compile("Polygon|Surface|^Unknown$|^GeometryCollection$")
 #: West, south, east, north.
 Box = tuple[float, float, float, float]
-#: What surfaces are made of: the class that a polygon changes unless told otherwise.
+#: ASPRS class that polygons change by default.
 GROUND = 2
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """A file of polygons, the class of points inside, and the classes that it is put in place of (empty: all)."""
+    """A file of polygons, the class for points inside, and the classes it replaces (empty: all)."""
 
     file: str
     layer: str
@@ -34,25 +34,29 @@ class Overlay:
 
     @classmethod
     def parse(cls, text: str) -> Overlay:
-        """From ``FILE=CODE``, ``FILE=CODE:FROM,FROM`` or ``FILE=CODE:all``; FILE may be ``FILE|layername=NAME``."""
+        """Parse ``FILE=CODE``, ``FILE=CODE:FROM,FROM`` or ``FILE=CODE:all``.
+
+        FILE may be ``FILE|layername=NAME``.
+        """
         source, _, codes = text.rpartition("=")
         file, _, layer = source.partition(_LAYER)
-        code, told, over = codes.partition(":")
-        given = [one.strip() for one in over.split(",")] if told else [str(GROUND)]
-        given = [] if given == ["all"] else given
+        code, colon, over = codes.partition(":")
+        replaced = [each.strip() for each in over.split(",")] if colon else [str(GROUND)]
+        replaced = [] if replaced == ["all"] else replaced
         if not file.strip() or not all(
-            c.strip().isdecimal() and int(c) <= 255 for c in [code, *given]
+            c.strip().isdecimal() and int(c) <= 255 for c in [code, *replaced]
         ):
             raise OptionError(
                 "polygons are written FILE=CODE",
                 found=text,
-                cure="For example lakes.gpkg=9, which makes ground inside water; bridges.gpkg=17:2,6 is for ground and "
-                "buildings, 17:all for all classes; a layer is named as in lakes.gpkg|layername=canals=9",
+                cure="For example lakes.gpkg=9, which makes ground inside water; "
+                "bridges.gpkg=17:2,6 is for ground and buildings, 17:all for all classes; a layer "
+                "is named as in lakes.gpkg|layername=canals=9",
             )
-        return cls(file.strip(), layer.strip(), int(code), tuple(map(int, given)))
+        return cls(file.strip(), layer.strip(), int(code), tuple(map(int, replaced)))
 
     def check(self) -> str:
-        """The layer that will be read."""
+        """Return the layer to read; StageError where there is not exactly one."""
         if "://" not in self.file and not Path(self.file).exists():
             raise StageError(
                 "the file of polygons does not exist", where=self.file, cure="Check the path"
@@ -76,15 +80,16 @@ class Overlay:
 def inside_of(
     overlay: Overlay, wkt: str, x: NDArray[np.float64], y: NDArray[np.float64], box: Box
 ) -> tuple[NDArray[np.bool_], int, str]:
-    """Which points (n,) lie inside an overlay's polygons near a box, how many these are, and what the user should know."""
+    """Return which points (n,) lie inside polygons, the number of polygons, and a warning."""
     shapes, note = polygons_of(overlay, wkt, box)
     return points_inside(x, y, shapes), len(shapes), note
 
 
 def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[list[Any], str]:
-    """Polygons near a box, in the reference system of `wkt`, as the box is; and what the user should know.
+    """Return the polygons near a box, and a warning or an empty text.
 
-    `where`: a condition on the file's columns, in SQL.
+    Polygons and box are in the reference system `wkt`. `where` is a condition on the file's
+    columns, in SQL.
     """
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
     layer = overlay.check()
@@ -94,7 +99,8 @@ def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[
     if crs and wkt:
         forward, box = _transform(overlay.file, crs, wkt, box)
     else:
-        note = f"{overlay.file}: {'the points have' if crs else 'it has'} no reference system: the same was assumed"
+        side = "the points have" if crs else "it has"
+        note = f"{overlay.file}: {side} no reference system: the same was assumed"
     with reading(overlay.file) as name:
         _, _, geometry, _ = pyogrio.raw.read(
             name, layer=layer, columns=[], bbox=box, where=where or None
@@ -107,13 +113,16 @@ def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[
 
 
 def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
-    """How to get from the file's reference system to the points', and their box in the file's; None where they are one."""
+    """Return the transformation from the file's reference system to the points', and the box in it.
+
+    The transformation is None where both are the same.
+    """
     pyproj = vector("pyproj")
     try:
-        mine, theirs = (_flat(pyproj.CRS.from_user_input(one)) for one in (wkt, crs))
-        if mine.equals(theirs, ignore_axis_order=True):
+        to, theirs = (_horizontal(pyproj.CRS.from_user_input(each)) for each in (wkt, crs))
+        if to.equals(theirs, ignore_axis_order=True):
             return None, box
-        forward = pyproj.Transformer.from_crs(theirs, mine, always_xy=True)
+        forward = pyproj.Transformer.from_crs(theirs, to, always_xy=True)
         west, south, east, north = forward.transform_bounds(*box, direction="INVERSE")
     except Exception as error:  # pyproj's own
         raise StageError(
@@ -122,30 +131,22 @@ def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
             found=str(error),
             cure="Reproject the file first: ogr2ogr -t_srs",
         ) from None
-    aside = 0.01 * max(east - west, north - south)
-    return lambda x, y: forward.transform(x, y), (
-        west - aside,
-        south - aside,
-        east + aside,
-        north + aside,
-    )
+    rim = 0.01 * max(east - west, north - south)
+    padded = (west - rim, south - rim, east + rim, north + rim)
+    return lambda x, y: forward.transform(x, y), padded
 
 
-def _flat(crs: Any) -> Any:
-    """The horizontal part of a reference system."""
-    return (
-        _flat(crs.sub_crs_list[0])
-        if crs.is_compound
-        else crs.to_2d()
-        if len(crs.axis_info) > 2
-        else crs
-    )
+def _horizontal(crs: Any) -> Any:
+    """Return the horizontal part of a reference system."""
+    if crs.is_compound:
+        return _horizontal(crs.sub_crs_list[0])
+    return crs.to_2d() if len(crs.axis_info) > 2 else crs
 
 
 def points_inside(
     x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]
 ) -> NDArray[np.bool_]:
-    """Which points (n,) lie inside polygons, or on their edge."""
+    """Return which points (n,) lie inside polygons, or on their edge."""
     shapely, inside = vector("shapely"), np.zeros(len(x), bool)
     whole = shapely.union_all(polygons)
     west, south, east, north = whole.bounds

@@ -1,4 +1,4 @@
-"""Vector data through shapely, pyogrio and pyproj (extra ``vector``): import, file names, processes."""
+"""Vector data through shapely, pyogrio and pyproj (extra ``vector``): import, names, processes."""
 
 from __future__ import annotations
 
@@ -19,12 +19,16 @@ from .errors import StageError, optional_import
 
 
 def vector(name: str) -> Any:
-    """shapely, pyogrio or pyproj; an error says how to get it."""
+    """Import shapely, pyogrio or pyproj, or raise DependencyError with the way to install it."""
     return optional_import(name, "vector", "work with vector data")
 
 
 def is_odd(path: str) -> bool:
-    """Whether pyogrio takes a file for another: up to '!' it sees an archive, after ';' parameters, and only UTF-8."""
+    """Return whether pyogrio misreads a path.
+
+    It takes the part before '!' for an archive, that after ';' for parameters, and reads UTF-8
+    only.
+    """
     return "://" not in path and bool(re.search("[!\ud800-\udfff]|;[^/]*$", os.path.abspath(path)))
 
 
@@ -32,9 +36,9 @@ def is_odd(path: str) -> bool:
 def reading(
     path: str,
     what: str = "the vector file cannot be read",
-    cure: str = "See whether ogrinfo -al reads it; ogr2ogr -makevalid new.gpkg FILE often mends what can be mended",
+    cure: str = "Check it with ogrinfo -al; ogr2ogr -makevalid new.gpkg FILE often repairs it",
 ) -> Iterator[str]:
-    """A name by which pyogrio finds a file; what GDAL, GEOS and PROJ raise over it is made an error of ours."""
+    """Yield a name by which pyogrio finds a file; errors of GDAL and GEOS become StageError."""
     with TemporaryDirectory() if is_odd(path) else nullcontext("") as links:
         try:
             yield _linked(Path(path).absolute(), Path(links)) if links else path
@@ -47,19 +51,19 @@ def reading(
 
 
 def _linked(file: Path, folder: Path) -> str:
-    """A link to a file, of a plain name, beside links to what belongs to it."""
+    """Return a link with a plain name to a file, beside links to files that belong to it."""
     plain = re.sub("[!;\ud800-\udfff]", "_", file.stem)
-    for one in file.parent.glob(f"{glob.escape(file.stem)}.*"):
-        (folder / (plain + one.name.removeprefix(file.stem))).symlink_to(one)
+    for part in file.parent.glob(f"{glob.escape(file.stem)}.*"):
+        (folder / (plain + part.name.removeprefix(file.stem))).symlink_to(part)
     return str(folder / (plain + file.suffix))
 
 
 def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function that uses the extra ``vector``, in its own process inside a program that is linked to GEOS or GDAL.
+    """Call a function that uses the extra ``vector``, where necessary in a process of its own.
 
-    On Linux the libraries of the program itself come first for all that it loads. A Python package
-    with a GEOS or GDAL of its own would mix both and crash. So it is in the program `pdal`; Python
-    is linked to neither.
+    On Linux the libraries that a program is linked to come first for everything it loads. Inside
+    the program `pdal`, which is linked to GEOS and GDAL, a Python package with other versions of
+    them would mix both and crash. Python itself is linked to neither.
     """
     linked = sys.platform.startswith("linux") and any(
         hasattr(ctypes.CDLL(None), name) for name in ("GEOSversion", "GDALVersionInfo")
@@ -73,12 +77,14 @@ def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _interpreter() -> str:
-    """The program of the Python that this is, inside a program that embeds it."""
+    """Return the path of Python's own program, also inside a program that embeds Python."""
     names = (f"python3.{sys.version_info.minor}", "python3")
     inside = (
         os.path.join(prefix, "bin", name)
         for prefix in (sys.prefix, sys.base_prefix)
         for name in names
     )
-    given = [sys.executable] if os.path.basename(sys.executable or "").startswith("python") else []
-    return next((path for path in (*given, *inside) if os.access(path, os.X_OK)), "python3")
+    running = (
+        [sys.executable] if os.path.basename(sys.executable or "").startswith("python") else []
+    )
+    return next((path for path in (*running, *inside) if os.access(path, os.X_OK)), "python3")

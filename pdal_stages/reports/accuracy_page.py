@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..accuracy.labels import as_codes, same_length
+from ..accuracy.labels import as_codes, refuse_other_lengths
 from ..accuracy.measures import Accuracy
 from ..base.asprs import class_color
 from ..base.errors import StageError
@@ -147,7 +147,7 @@ def _maps(a: Accuracy, xyz: Any, reference: Any, predicted: Any) -> dict[str, An
     to = np.arange(1 << 16)
     to[list(a.merged)] = list(a.merged.values())
     true, given = as_codes(reference, "reference"), as_codes(predicted, "prediction")
-    same_length(true, {"prediction": given, "list of coordinates": points})
+    refuse_other_lengths(true, {"prediction": given, "list of coordinates": points})
     compared = np.isin(to[true], a.classes) & ~np.isin(true, list(a.left_out))
     true, given = to[true], to[given]
     wrong = compared & (true != given)
