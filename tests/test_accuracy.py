@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sklearn import metrics
 
-from pdal_stages.accuracy.calibration import BINS, Calibration
+from pdal_stages.accuracy.calibration import BINS, ConfidenceHistogram
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.base.errors import StageError
 
@@ -111,7 +111,7 @@ def test_grading_equals_scikit_learn():
 def test_deciles_of_the_margin():
     rng = np.random.default_rng(3)
     margin, right = rng.random(20_000), rng.random(20_000) < 0.9
-    deciles = Calibration.from_values(margin, right).deciles()
+    deciles = ConfidenceHistogram.from_values(margin, right).deciles()
     assert len(deciles) == 10
     order = np.argsort(margin)
     for i, group in enumerate(deciles):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las import records_of
-from pdal_stages.review.corrections import near_any, partners, write_corrections
+from pdal_stages.review.corrections import is_near, match_points, write_corrections
 from pdal_stages.synthetic import write_town
 
 
@@ -48,10 +48,10 @@ def test_partners_are_the_points_themselves(seed, n, places):
     xyz = random.integers(0, places, (n, 3)) * 0.01 + 500_000.0
     time = random.permutation(n).astype(float)
     order = random.permutation(n)
-    found = partners(xyz, xyz[order], 0.01, [(time, time[order])])
+    found = match_points(xyz, xyz[order], 0.01, [(time, time[order])])
     assert np.array_equal(order[found], np.arange(n))
     # Without anything that tells them apart: points of the same place, each taken once.
-    found = partners(xyz, xyz[order], 0.01)
+    found = match_points(xyz, xyz[order], 0.01)
     assert sorted(found) == list(range(n))
     assert np.abs(xyz[order][found] - xyz).max() < 1e-6
 
@@ -59,17 +59,17 @@ def test_partners_are_the_points_themselves(seed, n, places):
 def test_points_left_over_take_the_nearest():
     before = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
     after = np.array([[2.004, 0, 0], [0.0, 0, 0], [1.006, 0, 0]])
-    assert partners(before, after, 0.001, apart=0.01).tolist() == [1, 2, 0, -1]
-    assert partners(before, after, 0.001, apart=0.005).tolist() == [1, -1, 0, -1]
-    assert partners(before, after, 0.001).tolist() == [1, -1, -1, -1]
+    assert match_points(before, after, 0.001, max_distance=0.01).tolist() == [1, 2, 0, -1]
+    assert match_points(before, after, 0.001, max_distance=0.005).tolist() == [1, -1, 0, -1]
+    assert match_points(before, after, 0.001).tolist() == [1, -1, -1, -1]
 
 
 def test_near_any_is_what_distances_say():
     random = np.random.default_rng(3)
     xyz, chosen = random.random((300, 3)) * 10, random.random(300) < 0.02
     far = np.linalg.norm(xyz[:, None] - xyz[chosen][None], axis=2).min(axis=1)
-    assert np.array_equal(near_any(xyz, chosen, 1.5), far <= 1.5)
-    assert np.array_equal(near_any(xyz, chosen, 0.0), chosen)
+    assert np.array_equal(is_near(xyz, chosen, 1.5), far <= 1.5)
+    assert np.array_equal(is_near(xyz, chosen, 0.0), chosen)
 
 
 @pytest.mark.parametrize("how", [{}, {"drop": 30}, {"scale": 0.01}])
@@ -93,9 +93,7 @@ def test_all_around_a_change_was_seen(town, tmp_path):
     corner, _ = changed_copy(town, tmp_path / "after.laz")
     write_corrections(str(town), str(tmp_path / "o.laz"), str(tmp_path / "after.laz"), around=2.0)
     las = laspy.read(tmp_path / "o.laz")
-    assert np.array_equal(
-        np.asarray(las["Checked"]) > 0, near_any(np.asarray(las.xyz), corner, 2.0)
-    )
+    assert np.array_equal(np.asarray(las["Checked"]) > 0, is_near(np.asarray(las.xyz), corner, 2.0))
     # A second time adds to the first.
     again = laspy.read(tmp_path / "o.laz")
     again.classification[:5] = 21

@@ -16,7 +16,7 @@ from PIL import Image
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
-from pdal_stages.reports.accuracy_page import write_accuracy_report
+from pdal_stages.reports.accuracy_page import Place, write_accuracy_report
 from pdal_stages.reports.run_page import run_page
 
 VOID = {"meta", "img", "br"}
@@ -99,9 +99,7 @@ def full(scene, accuracy):
     xyz, reference, predicted, _ = scene
     return accuracy_page(
         accuracy,
-        xyz=xyz,
-        reference=reference,
-        predicted=predicted,
+        places=[Place("", xyz, reference, predicted)],
         title="Town <test> & more",
         subtitle='A "quoted" line',
         importances={"Planarity_c2": 0.6, "<b>bold</b>": 0.4},
@@ -217,25 +215,22 @@ def test_degenerate_clouds(xyz, maps):
     predicted = reference.copy()
     predicted[-1] = 6
     a = Accuracy.from_labels(reference, predicted)
-    page = Page(accuracy_page(a, xyz=xyz, reference=reference, predicted=predicted))
+    page = Page(accuracy_page(a, places=[Place("", xyz, reference, predicted)]))
     assert len([i for i in page.all("img") if i["alt"].startswith("Map")]) == maps
     assert ("No map: " in page.text) == (maps == 0)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("xyz", "labels", "message"),
     [
-        ({"xyz": np.zeros((2, 3))}, "the reference must be one label per point"),
-        ({"xyz": np.zeros((2, 2)), "reference": [2, 2], "predicted": [2, 2]}, "n x 3"),
-        (
-            {"xyz": [[0, 0, np.nan], [1, 1, 1]], "reference": [2, 2], "predicted": [2, 2]},
-            "1 of 2 points",
-        ),
+        (np.zeros((2, 3)), 2, "the reference must be one label per point"),
+        (np.zeros((2, 2)), [2, 2], "n x 3"),
+        ([[0, 0, np.nan], [1, 1, 1]], [2, 2], "1 of 2 points"),
     ],
 )
-def test_misuse_is_told(accuracy, arguments, message):
+def test_misuse_is_reported(accuracy, xyz, labels, message):
     with pytest.raises(StageError, match=message):
-        accuracy_page(accuracy, **arguments)
+        accuracy_page(accuracy, places=[Place("", xyz, labels, labels)])
 
 
 # ---- writing ---------------------------------------------------------------------------------------------
@@ -245,7 +240,7 @@ def test_or_not_at_all(tmp_path, accuracy):
     path = tmp_path / "report.html"
     path.write_text("before")
     with pytest.raises(StageError):
-        write_accuracy_report(path, accuracy, xyz=np.zeros((1, 2)), reference=[2], predicted=[2])
+        write_accuracy_report(path, accuracy, places=[Place("", np.zeros((1, 2)), [2], [2])])
     assert path.read_text() == "before" and len(list(tmp_path.iterdir())) == 1
 
 

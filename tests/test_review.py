@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from pdal_stages.base.errors import StageError
 from pdal_stages.review import review_output
-from pdal_stages.review.expected_errors import BLOCK, ReviewCells, find_patches
+from pdal_stages.review.expected_errors import RULES, ReviewCells, find_patches
 from pdal_stages.review.review_files import Review
 from pdal_stages.review.review_output import styles
 
@@ -34,9 +34,9 @@ def cloud(seed, n=3000, wide=60.0):
 def test_order_and_cuts_change_nothing(seed, n, parts):
     points, random = cloud(seed, n, 20.0), np.random.default_rng(seed)
     order, of = random.permutation(n), random.integers(0, parts, n)
-    whole = ReviewCells.of(*points, 2.0)
+    whole = ReviewCells.from_points(*points, 2.0)
     several = [
-        ReviewCells.of(*(values[order[of[order] == k]] for values in points), 2.0)
+        ReviewCells.from_points(*(values[order[of[order] == k]] for values in points), 2.0)
         for k in range(parts)
         if (of == k).any()
     ]
@@ -49,7 +49,7 @@ def test_cells_are_what_they_say():
     xyz, codes, reliability = cloud(3)
     given = np.where(np.arange(len(codes)) % 50, reliability, np.nan)  # not known: never right
     reliability = np.nan_to_num(given)
-    made = ReviewCells.of(xyz, codes, given, 2.0, file=4)
+    made = ReviewCells.from_points(xyz, codes, given, 2.0, file=4)
     place = np.floor(xyz[:, :2] / 2.0)
     groups = [codes == 2, np.isin(codes, (3, 4, 5)), codes == 6]
     assert made.points.sum() == sum(group.sum() for group in groups)
@@ -63,7 +63,7 @@ def test_cells_are_what_they_say():
 
 def test_places_are_told_in_the_coordinates_of_the_files():
     shapely = pytest.importorskip("shapely")
-    cells, foot = ReviewCells.of(*cloud(3), 2.0), 0.3048
+    cells, foot = ReviewCells.from_points(*cloud(3), 2.0), 0.3048
     meters, feet = (
         Review(cells, find_patches(cells), 1, ["a.laz"], across) for across in (1.0, foot)
     )
@@ -75,7 +75,7 @@ def test_places_are_told_in_the_coordinates_of_the_files():
 
 def test_patches_hold_each_cell_once_and_come_best_first():
     assert all("looked at" in styles(np.full(n, 0.2))["patches"] for n in (0, 1, 5))
-    cells = ReviewCells.of(*cloud(9, 6000, 150.0), 2.0)
+    cells = ReviewCells.from_points(*cloud(9, 6000, 150.0), 2.0)
     found = find_patches(cells)
     assert np.array_equal(np.unique(found.of_cell), np.arange(len(found)))
     assert (
@@ -85,7 +85,7 @@ def test_patches_hold_each_cell_once_and_come_best_first():
     assert (np.diff(found.errors / found.minutes) <= 1e-6).all()
     for number in range(len(found)):
         mine = np.flatnonzero(found.of_cell == number)
-        assert (np.ptp(cells.corners[mine][:, :2], axis=0) < BLOCK).all()
+        assert (np.ptp(cells.corners[mine][:, :2], axis=0) < RULES.block).all()
         errors = cells.errors[mine].sum(axis=1)
         worst = cells.corners[mine[errors == errors.max()]]
         assert found.at[number].tolist() in (0.5 * (worst[:, :2] + worst[:, 2:])).tolist()
@@ -160,7 +160,7 @@ def test_all_files_are_written_or_none(folder, tmp_path, monkeypatch, run, last)
 def test_what_is_missing_is_made_and_said(folder, tmp_path, run):
     pytest.importorskip("pyogrio")
     code, _, err = run("review", folder / "town.laz", tmp_path / "r.gpkg")
-    assert code == 0 and "has no Reliability: now computed by the model standard" in err
+    assert code == 0 and "has no Reliability: it is computed with the model standard" in err
 
 
 @pytest.mark.pdal

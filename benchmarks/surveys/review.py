@@ -21,7 +21,7 @@ from clouds import model_without, slug, true_classes
 from surveys import SURVEYS
 
 from pdal_stages import cli
-from pdal_stages.review.expected_errors import ReviewCells, find_patches, side_for
+from pdal_stages.review.expected_errors import ReviewCells, cell_side, find_patches
 
 #: The part of the area that is looked at first.
 FIRST = 0.1
@@ -93,10 +93,10 @@ def judged(one: Classified) -> tuple[int, int, float, float, float]:
     known = (one.truth > 0) & np.isin(one.codes, (2, 3, 4, 5, 6))
     codes, wrong = one.codes[known], one.codes[known] != one.truth[known]
     xyz, reliability = one.xyz[known], one.reliability[known]
-    side = side_for(len(xyz), 16.0 * len(np.unique(np.floor(xyz[:, :2] / 4.0), axis=0)))
+    side = cell_side(len(xyz), 16.0 * len(np.unique(np.floor(xyz[:, :2] / 4.0), axis=0)))
     cells, truth = (
-        ReviewCells.of(xyz, codes, reliability, side),
-        ReviewCells.of(xyz, codes, 1.0 - wrong, side),
+        ReviewCells.from_points(xyz, codes, reliability, side),
+        ReviewCells.from_points(xyz, codes, 1.0 - wrong, side),
     )
     true = truth.errors.sum(axis=1)
     found = [_first(each, true) for each in (cells, truth)]

@@ -1,6 +1,6 @@
 """Calibration of a confidence: reliability curve, errors by margin, separation of right and wrong.
 
-A :class:`Calibration` is a histogram of a confidence in [0, 1] with the number of right points in
+A :class:`ConfidenceHistogram` is a histogram of a confidence in [0, 1] with the number of right points in
 each bin. Histograms add, so those of tiles give the measures of the whole.
 """
 
@@ -20,7 +20,7 @@ BINS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class ConfidenceHistogram:
     """Histogram of a confidence and of the points whose class is right, in bins of 0.001."""
 
     count: npt.NDArray[np.int64]  #: (1000,) points of each bin
@@ -28,14 +28,14 @@ class Calibration:
     total: npt.NDArray[np.float64]  #: (1000,) sum of the confidence of each bin
 
     @classmethod
-    def empty(cls) -> Calibration:
+    def empty(cls) -> ConfidenceHistogram:
         """Return a histogram of no points."""
         return cls(np.zeros(BINS, np.int64), np.zeros(BINS, np.int64), np.zeros(BINS))
 
     @classmethod
     def from_values(
         cls, values: npt.ArrayLike, right: npt.ArrayLike, name: str = "reliability"
-    ) -> Calibration:
+    ) -> ConfidenceHistogram:
         """Return the histogram of confidences (n,) and of those whose class is right, (n,) bool.
 
         Raises
@@ -58,10 +58,10 @@ class Calibration:
             np.bincount(place, weights=v, minlength=BINS).astype(np.float64),
         )
 
-    def __add__(self, other: Calibration) -> Calibration:
+    def __add__(self, other: ConfidenceHistogram) -> ConfidenceHistogram:
         """Return the histogram of both sets of points together."""
         sums = (getattr(self, f.name) + getattr(other, f.name) for f in fields(self))
-        return Calibration(*sums)
+        return ConfidenceHistogram(*sums)
 
     @property
     def points(self) -> int:

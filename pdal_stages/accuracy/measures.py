@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from ..base.asprs import class_name
 from ..base.errors import StageError
-from .calibration import Calibration
+from .calibration import ConfidenceHistogram
 from .labels import (
     ComparedClasses,
     Merge,
@@ -74,8 +74,8 @@ class Accuracy:
     matrix: npt.NDArray[np.int64]  #: (K, K + E) points; rows are the reference
     names: Mapping[int, str] = field(default_factory=dict)
     left_out: Mapping[int, int] = field(default_factory=dict)  #: points by class before any merge
-    reliability: Calibration | None = None  #: how well it separates right from wrong
-    margin: Calibration | None = None
+    reliability: ConfidenceHistogram | None = None  #: how well it separates right from wrong
+    margin: ConfidenceHistogram | None = None
     merged: Mapping[int, int] = field(default_factory=dict)  #: classes taken as another one
 
     @classmethod
@@ -124,13 +124,13 @@ class Accuracy:
         merged_columns = merge.target_of[predicted_codes[occurs]]
         columns, matrix = sum_tables(rows, (counts[kept][:, occurs], merged_rows, merged_columns))
         is_compared = np.isin(np.arange(len(merge.target_of)), codes[kept])
-        graded = {key: Calibration.empty() for key in confidences}
+        graded = {key: ConfidenceHistogram.empty() for key in confidences}
         for start in range(0, len(true) if graded else 0, CHUNK):
             part = slice(start, start + CHUNK)
             chosen = is_compared[true[part]]
             right = np.equal(*(merge.target_of[side[part][chosen]] for side in (true, labels)))
             for key, confidence in confidences.items():
-                graded[key] += Calibration.from_values(confidence[part][chosen], right, key)
+                graded[key] += ConfidenceHistogram.from_values(confidence[part][chosen], right, key)
         names = class_names((*columns, *left_out), {**merge.names, **(compared.names or {})})
         return cls(
             *(rows, columns[len(rows) :], matrix, names, left_out),
@@ -178,7 +178,7 @@ class Accuracy:
                 cure="Compare both with the same 'merge'",
             )
         # An empty tile has no calibration; where another part lacks one, the sum has none either.
-        graded: dict[str, Calibration | None] = {}
+        graded: dict[str, ConfidenceHistogram | None] = {}
         for key in ("reliability", "margin"):
             both = ((each.points, getattr(each, key)) for each in (self, other))
             parts = [value for points, value in both if points or value is not None]

@@ -1,4 +1,1 @@
-"""Pages and pictures for people: the accuracy page, the page about a model, maps of a cloud.
-
-Importing this package is light: drawing libraries are loaded by the modules that need them.
-"""
+"""Reports for people: web pages, pictures of a cloud, vector files of objects."""

@@ -1,4 +1,4 @@
-"""Pages from templates: single self-contained HTML files, escaped throughout, without scripts."""
+"""Render web pages from templates: self-contained HTML, escaped throughout, without scripts."""
 
 from __future__ import annotations
 
@@ -17,32 +17,35 @@ from ..base.version import __version__
 
 
 def render(template: str, **context: Any) -> str:
-    """A page from a template of ``templates/``, whose every value is escaped: a `title`, maybe a `subtitle`, and its own.
+    """Return a page from a template of ``templates/``; all values are escaped.
 
-    The date is today's by default, or ``SOURCE_DATE_EPOCH`` where the environment sets it.
+    Every template needs a `title`; `subtitle` is empty and `date` today by default, or the day
+    that the environment sets with ``SOURCE_DATE_EPOCH``.
     """
     context = {"subtitle": "", "version": __version__, "date": _today(), **context}
     page = _templates().get_template(template).render(context)
-    # Names that are not UTF-8, or command a terminal
+    # Names of files may hold bytes that are not UTF-8, or control characters.
     return plain(page.encode(errors="backslashreplace").decode())
 
 
 @lru_cache(maxsize=1)
 def _templates() -> Environment:
-    made = Environment(
+    environment = Environment(
         loader=PackageLoader(__package__),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters.update(percent=percent, count=lambda n: f"{n:,}", flat=flat, duration=duration)
-    made.globals.update(class_color=class_color)
-    return made
+    environment.filters.update(
+        percent=percent, count=lambda n: f"{n:,}", flat=flat, duration=duration
+    )
+    environment.globals.update(class_color=class_color)
+    return environment
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Names and values as text: nested mappings get dotted names, numbers six digits."""
+    """Return names and values as text: nested mappings get dotted names, numbers six digits."""
     out: list[tuple[str, str]] = []
     for key, value in values.items():
         if isinstance(value, Mapping) and value:

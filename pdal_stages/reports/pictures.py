@@ -22,26 +22,32 @@ from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
 
-RIGHT, WRONG, IGNORED = (196, 196, 192), (204, 24, 32), (232, 232, 228)
-#: The color of each class code, (256, 3) uint8.
-CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
-#: Heights like a tinted map, as a few anchors.
-_TINTS = (
-    (38, 84, 106), (62, 128, 112), (132, 170, 104), (208, 200, 130), (206, 152, 98), (172, 102, 84), (233, 204, 186)
-)  # fmt: skip
-_GAP = 12
+#: Colors (red, green, blue) of points with the right class, the wrong one, and not compared.
+RIGHT = (196, 196, 192)
+WRONG = (204, 24, 32)
+IGNORED = (232, 232, 228)
+#: Color of pixels without points.
 BACKGROUND = (246, 246, 243)
+#: Color of each class code, (256, 3) uint8.
+CLASS_COLORS = np.array([class_color(code) for code in range(256)], dtype=np.uint8)
+#: Colors of heights, from low to high, between which others are interpolated.
+HEIGHT_COLORS = (
+    (38, 84, 106), (62, 128, 112), (132, 170, 104), (208, 200, 130), (206, 152, 98),
+    (172, 102, 84), (233, 204, 186),
+)  # fmt: skip
+#: Pixels between the panels of a picture.
+PANEL_GAP = 12
 
 
 def png(rgb: npt.NDArray[np.uint8]) -> bytes:
-    """A (height, width, 3) uint8 image as a PNG file of at most 256 colors, rare ones among them."""
+    """Return a (height, width, 3) uint8 image as a PNG file of at most 256 colors."""
     file, image = io.BytesIO(), Image.fromarray(np.ascontiguousarray(rgb))
     image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(file, "PNG")
     return file.getvalue()
 
 
-def embedded(rgb: npt.NDArray[np.uint8]) -> dict[str, Any]:
-    """An image for a template: its file as text, its size."""
+def embed(rgb: npt.NDArray[np.uint8]) -> dict[str, Any]:
+    """Return an image for a template: its file as text, and its size in pixels."""
     return {
         "base64": base64.b64encode(png(rgb)).decode("ascii"),
         "tall": rgb.shape[0],
@@ -50,7 +56,7 @@ def embedded(rgb: npt.NDArray[np.uint8]) -> dict[str, Any]:
 
 
 def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8]) -> Path:
-    """Write an image as a PNG file of all its colors, whole or not at all."""
+    """Write a (height, width, 3) uint8 image as a PNG file, whole or not at all."""
     file = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(rgb)).save(file, "PNG")
     return write_whole(path, file.getvalue(), what="picture")
@@ -58,25 +64,21 @@ def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8]) -> Path:
 
 @dataclass(frozen=True)
 class Surface:
-    """The highest point of each pixel of a map that is `pixel` units fine and whose lower left corner is (x0, y0).
+    """The highest point of each pixel of a map."""
 
-    ``which`` is the row of the point (-1: none), ``z`` its height (NaN: none), ``spacing`` the typical distance of
-    neighboring points in pixels, 1 at least.
-    """
-
-    x0: float
+    x0: float  #: lower left corner
     y0: float
-    pixel: float
-    which: np.ndarray
-    z: np.ndarray
-    spacing: float
+    pixel: float  #: side of a pixel, in the unit of x and y
+    which: np.ndarray  #: (height, width) int64 index of the point, -1 for none
+    z: np.ndarray  #: (height, width) its height, NaN for none
+    spacing: float  #: typical distance of neighboring points in pixels, at least 1
 
     def spread(self, values: np.ndarray, missing) -> np.ndarray:
-        """Values of points as values of pixels."""
+        """Return values of points as values of pixels."""
         return np.where(self.which >= 0, values[self.which], np.array(missing, values.dtype))
 
     def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of finite places on the map."""
+        """Return rows and columns of pixels of places, whose coordinates are finite."""
         height, width = self.which.shape
         row = height - 1 - np.floor((y - self.y0) / self.pixel).astype(np.int64)
         return row.clip(0), np.floor((x - self.x0) / self.pixel).astype(np.int64).clip(
@@ -85,9 +87,11 @@ class Surface:
 
 
 def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
-    """The map of points, (n,) float each, `width` pixels wide (narrower where it would be more than 2.5 times as tall).
+    """Return the map of points, (n,) float each.
 
-    An empty pixel takes the nearest point within 1.6 times the points' spacing; points that are not finite are left out.
+    It is `width` pixels wide, or narrower where it would be more than 2.5 times as tall. An empty
+    pixel takes the nearest point within 1.6 times the spacing of points. Points that are not finite
+    are left out.
     """
     if not 16 <= int(width) <= 3000:
         raise StageError("'width' must be from 16 to 3000 pixels", where="picture", found=width)
@@ -104,48 +108,47 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
     wide, tall = max(float(x.max()) - x0, 1e-3), max(float(y.max()) - y0, 1e-3)
     pixel = max(wide / width, tall / (2.5 * width))
     shape = max(2, math.ceil(tall / pixel)), max(2, math.ceil(wide / pixel))
-    made = Surface(x0, y0, pixel, np.full(shape, -1), np.full(shape, np.nan), 1.0)
+    full = Surface(x0, y0, pixel, np.full(shape, -1), np.full(shape, np.nan), 1.0)
     order = np.argsort(z, kind="stable")
-    cells = made.cells(x[order], y[order])
-    made.which[cells], made.z[cells] = (
-        good[order],
-        z[order],
-    )  # of several the last stays: the highest
-    seen = made.which >= 0
+    cells = full.cells(x[order], y[order])
+    # Of several points of a pixel the last one stays: the highest.
+    full.which[cells], full.z[cells] = good[order], z[order]
+    seen = full.which >= 0
     if seen.all():
-        return made
-    away, at = ndimage.distance_transform_edt(~seen, return_indices=True)
-    # Spacing inside the cloud: pixels near some point, per pixel that has one.
-    share = math.sqrt(seen.size / seen.sum())
-    spacing = max(1.0, math.sqrt((away <= share).sum() / seen.sum()))
-    near = np.where(away <= 1.6 * spacing, made.which[tuple(at)], -1)
-    return Surface(x0, y0, pixel, near, np.where(near >= 0, made.z[tuple(at)], np.nan), spacing)
+        return full
+    distance, at = ndimage.distance_transform_edt(~seen, return_indices=True)
+    # Spacing inside the cloud: pixels near a point, per pixel that has one.
+    expected = math.sqrt(seen.size / seen.sum())
+    spacing = max(1.0, math.sqrt((distance <= expected).sum() / seen.sum()))
+    near = np.where(distance <= 1.6 * spacing, full.which[tuple(at)], -1)
+    return Surface(x0, y0, pixel, near, np.where(near >= 0, full.z[tuple(at)], np.nan), spacing)
 
 
 def shading(s: Surface) -> np.ndarray:
-    """Light on the surface, about 0.4 (dark) to 1.2: sun from the north-west, and less sky where surroundings are higher."""
+    """Return the light on each pixel, about 0.4 (dark) to 1.2.
+
+    The sun is in the north-west, and there is less sky where the surroundings are higher.
+    """
     known = np.isfinite(s.z)
-    above, weight = (
-        np.where(known, s.z - np.nanmedian(s.z), 0.0).astype(np.float32),
-        known.astype(np.float32),
-    )
+    above = np.where(known, s.z - np.nanmedian(s.z), 0.0).astype(np.float32)
 
     def smooth(size: float) -> np.ndarray:
-        soft, of = (
-            ndimage.gaussian_filter(a, size, mode="nearest", truncate=2.0) for a in (above, weight)
+        total, weight = (
+            ndimage.gaussian_filter(values, size, mode="nearest", truncate=2.0)
+            for values in (above, known.astype(np.float32))
         )
-        return soft / np.maximum(of, 1e-6)
+        return total / np.maximum(weight, 1e-6)
 
     fine = smooth(0.45 * s.spacing)
     south, east = np.gradient(fine, s.pixel)
     sun = (0.5 * east + 0.5 * south + 0.75) / np.sqrt(1 + east**2 + south**2) / 0.75
-    around = smooth(min(max(4.0 / s.pixel, 1.2 * s.spacing), 0.1 * max(s.z.shape)))
-    light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * np.clip((fine - around) / 4.8, -1, 1)
+    surroundings = smooth(min(max(4.0 / s.pixel, 1.2 * s.spacing), 0.1 * max(s.z.shape)))
+    light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * np.clip((fine - surroundings) / 4.8, -1, 1)
     return np.where(known, np.clip(light, 0.42, 1.18), 1.0)
 
 
 def paint(s: Surface, colors: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Pixels from per-pixel colors and light; empty ones get the background."""
+    """Return an image from colors and light of pixels; empty ones get the background."""
     light, out = light[..., None], colors.astype(float)
     out = np.where(light <= 1, out * light, 255 - (255 - out) / light)
     out[s.which < 0] = BACKGROUND
@@ -155,7 +158,10 @@ def paint(s: Surface, colors: np.ndarray, light: np.ndarray) -> np.ndarray:
 def ramp(
     values: np.ndarray, anchors: npt.ArrayLike, limits: tuple[float, float] | None = None
 ) -> np.ndarray:
-    """Colors, (..., 3) uint8, of values between limits, by default the 1st and 99th percentile; NaN becomes mid gray."""
+    """Return colors (..., 3) uint8 of values between limits; NaN becomes gray.
+
+    Limits are the 1st and 99th percentile by default.
+    """
     good, colors = np.isfinite(values), np.asarray(anchors, dtype=float)
     low, high = limits or (np.percentile(values[good], [1, 99]) if good.any() else (0.0, 1.0))
     share = np.where(good, values - low, 0.0) / max(high - low, 1e-12) * (len(colors) - 1)
@@ -169,16 +175,16 @@ def ramp(
 def verdict(
     s: Surface, x: np.ndarray, y: np.ndarray, z: np.ndarray, wrong: np.ndarray, left_out: np.ndarray
 ) -> np.ndarray:
-    """Colors of the pixels of a surface, (height, width, 3) uint8: right, wrong or left out.
+    """Return colors of the pixels of a surface, (height, width, 3) uint8.
 
-    A wrong point is drawn over right ones of the same pixel, so that no error hides under a roof or a crown.
+    A wrong point is drawn over right ones of its pixel, so that no error hides under a roof.
     """
     kinds = s.spread(np.where(left_out, 2, wrong).astype(np.int64), 0)
     shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[kinds]
     good = wrong & np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     mask = np.zeros(s.which.shape, bool)
     mask[s.cells(x[good], y[good])] = True
-    grow = min(int(0.4 * s.spacing), 5)  # about as large as a point's share of the surface
+    grow = min(int(0.4 * s.spacing), 5)  # about as large as a point
     shown[ndimage.binary_dilation(mask, iterations=grow) if grow else mask] = WRONG
     return shown
 
@@ -192,23 +198,24 @@ def triptych(
     *,
     width: int = 1500,
 ) -> np.ndarray:
-    """Heights, classes and errors (wrong points red) side by side, (height, width, 3) uint8.
+    """Return an image of heights, classes and errors side by side, (height, width, 3) uint8.
 
-    Without `truth`, the reference classes (n,), there is no panel of errors; `width` is of all panels, about, in pixels.
+    Without `truth`, the reference classes (n,), there is no panel of errors. `width` is that of all
+    panels together, about, in pixels.
     """
     panels = 2 if truth is None else 3
-    s = surface(x, y, z, (int(width) - _GAP * (panels - 1)) // panels)
-    shown = [ramp(s.z, _TINTS), CLASS_COLORS[s.spread(predicted, 0)]]
+    s = surface(x, y, z, (int(width) - PANEL_GAP * (panels - 1)) // panels)
+    shown = [ramp(s.z, HEIGHT_COLORS), CLASS_COLORS[s.spread(predicted, 0)]]
     if truth is not None:
         wrong = predicted != truth
         shown.append(verdict(s, x, y, z, wrong, np.zeros_like(wrong)))
-    light, gap = shading(s), np.full((len(s.z), _GAP, 3), BACKGROUND, np.uint8)
+    light, gap = shading(s), np.full((len(s.z), PANEL_GAP, 3), BACKGROUND, np.uint8)
     return np.concatenate(
         [part for colors in shown for part in (gap, paint(s, colors, light))][1:], axis=1
     )
 
 
 def nice_step(rough: float) -> float:
-    """1, 2 or 5 times a power of ten, at least about `rough`."""
+    """Return 1, 2 or 5 times a power of ten, at least about `rough`."""
     power = 10.0 ** math.floor(math.log10(rough))
     return next(m * power for m in (1, 2, 5, 10) if m * power >= rough * 0.999)

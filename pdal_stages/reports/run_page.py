@@ -1,4 +1,4 @@
-"""The report of a tiled run as one self-contained HTML page, made from its JSON report."""
+"""Web page about a tiled run, made from its JSON report."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ..base.asprs import class_name
 from ..base.messages import count_of, duration
 from .page import render
 
-#: Most rows of the table of times.
-ROWS = 200
-#: Settings shown, by their names in the report.
-_SETTINGS = {
+#: Rows of the table of the slowest tiles.
+MAX_ROWS = 200
+#: Titles of the settings on the page, by their names in the JSON report.
+_TITLES = {
     "pipeline": "pipeline",
     "models": "models",
     "started": "started",
@@ -32,9 +32,11 @@ _SETTINGS = {
 
 
 def run_page(run: Mapping[str, Any]) -> str:
-    """The page about a tiled run; `run` is the result of ``TiledRun.to_dict``."""
+    """Return the page about a tiled run; `run` is the result of ``TiledRun.to_dict``."""
     done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
+    objects = dict(run.get("objects") or {})
+    objects.pop("files", None)
     pipeline = f"{Path(run['pipeline']).name}, " if run.get("pipeline") else ""
     return render(
         "run.html",
@@ -42,20 +44,18 @@ def run_page(run: Mapping[str, Any]) -> str:
         subtitle=f"{pipeline}{count_of(len(run['tiles']), 'tile')} of {run['tile']:g}",
         run=run,
         figures=_figures(run),
-        what=_what(run),
+        what=_settings(run),
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
-        slowest=[(t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:ROWS]],
+        slowest=[
+            (t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:MAX_ROWS]
+        ],
         done=len(done),
-        objects={
-            k: one
-            for k, one in (run.get("objects") or {}).items()
-            if k != "files" and one["objects"]
-        },
+        objects={kind: counts for kind, counts in objects.items() if counts["objects"]},
     )
 
 
 def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """The headline figures: what this run did, and what it kept of an earlier one."""
+    """Return the headline figures: what this run did, and what it kept of an earlier one."""
     states = run["states"]
     named = {"kept": "kept from an earlier run", "failed": "failed", "waiting": "to do"}
     rest = ", ".join(f"{states[k]:,} {text}" for k, text in named.items() if states.get(k))
@@ -74,13 +74,12 @@ def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     return out
 
 
-def _what(run: Mapping[str, Any]) -> dict[str, Any]:
-    shown = {
-        name: run[key] for key, name in _SETTINGS.items() if run.get(key) not in (None, "", [])
-    }
+def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of the run by title."""
+    shown = {name: run[key] for key, name in _TITLES.items() if run.get(key) not in (None, "", [])}
     if run.get("bounds"):
         x0, y0, x1, y1 = run["bounds"]
-        shown[_SETTINGS["bounds"]] = f"x {x0:.2f} to {x1:.2f}, y {y0:.2f} to {y1:.2f}"
+        shown[_TITLES["bounds"]] = f"x {x0:.2f} to {x1:.2f}, y {y0:.2f} to {y1:.2f}"
     if "cpu_seconds" in run:
-        shown[_SETTINGS["cpu_seconds"]] = duration(run["cpu_seconds"])
+        shown[_TITLES["cpu_seconds"]] = duration(run["cpu_seconds"])
     return {key: f"{value:,}" if isinstance(value, int) else value for key, value in shown.items()}

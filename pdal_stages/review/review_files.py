@@ -24,29 +24,31 @@ from ..pipeline.las_chunks import can_read_chunks, read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..stages.points import Points
-from .expected_errors import Patches, ReviewCells, find_patches, side_for
+from .expected_errors import Patches, ReviewCells, cell_side, find_patches
 
-#: Dimensions that are read where they are there.
-WANTED = ("Reliability", "ReturnNumber", "NumberOfReturns")
+#: Dimensions that are read where they exist.
+DIMENSIONS = ("Reliability", "ReturnNumber", "NumberOfReturns")
+#: Patches in the JSON file.
+MAX_ROWS = 1000
 
 
 @dataclass
 class Review:
-    """The result; the first `listed` patches are written. Coordinates are reported in units of `across` meters, as in the
-    files."""
+    """Patches of classified files; the first `listed` are written."""
 
     cells: ReviewCells
     patches: Patches
     listed: int
     files: list[str]
-    across: float = 1.0
+    unit: float = 1.0  #: of the files' coordinates, in which places are reported, meters
 
     @cached_property
     def tiles(self) -> list[dict[str, Any]]:
-        """A row for each file: points, expected errors, patches listed, minutes to check them; worst first."""
-        n, listed, of = len(self.files), self.patches.file[: self.listed], self.cells.place[:, 0]
-        points = np.bincount(of, self.cells.points.sum(axis=1), n)
-        errors = np.bincount(of, self.cells.errors.sum(axis=1), n)
+        """A row for each file, the one with most expected errors first."""
+        n, listed = len(self.files), self.patches.file[: self.listed]
+        file = self.cells.place[:, 0]
+        points = np.bincount(file, self.cells.points.sum(axis=1), n)
+        errors = np.bincount(file, self.cells.errors.sum(axis=1), n)
         minutes = np.bincount(listed, self.patches.minutes[: self.listed], n)
         rows = [
             {
@@ -64,7 +66,7 @@ class Review:
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
-        """The patches listed, as plain values."""
+        """A row for each listed patch."""
         p = self.patches
         return [
             {
@@ -76,13 +78,13 @@ class Review:
                 "seconds": round(60.0 * float(p.minutes[k]), 1),
                 "per_minute": round(float(p.errors[k] / p.minutes[k]), 1),
                 "reason": p.reason[k],
-                "at": [round(float(v) / self.across, 3) for v in p.at[k]],
+                "at": [round(float(v) / self.unit, 3) for v in p.at[k]],
             }
             for k in range(self.listed)
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Figures, for JSON."""
+        """Return counts, tiles and the first patches as JSON types."""
         return {
             "version": __version__,
             "points": int(self.cells.points.sum()),
@@ -91,7 +93,7 @@ class Review:
             "listed": self.listed,
             "cell": self.cells.side,
             "tiles": self.tiles,
-            "worst": self.rows[:1000],
+            "worst": self.rows[:MAX_ROWS],
         }
 
 
@@ -102,10 +104,25 @@ def review_files(
     model: str = STANDARD,
     workers: int = 1,
 ) -> Review:
-    """Read classified files and find the patches.
+    """Read classified files and find the patches to check.
 
-    They are listed until they hold a `share` of the expected errors. Cells are `cell` meters wide, or as the density says
-    (0). The `model` gives reliabilities where files have none; `workers` read files at the same time.
+    Parameters
+    ----------
+    inputs : sequence of str
+        Files, folders or patterns.
+    share : float
+        Patches are listed until they hold this share of the expected errors.
+    cell : float
+        Side of a cell, meters; 0 chooses by the density of points.
+    model : str
+        Model that computes the reliabilities of files without.
+    workers : int
+        Files read at the same time.
+
+    Raises
+    ------
+    StageError
+        Where no point is ground, vegetation or a building.
     """
     if cell:
         checks.number("'--cell'", cell, 0.5, 100, unit="m")
@@ -113,68 +130,66 @@ def review_files(
     files = input_files(inputs)
     references = {path: reference_of_file(path) for path in files}
     print_messages(*check_one_reference(references))
-    side = cell or side_for(*_extent(files, references))
-    found: list[ReviewCells] = []
+    side = cell or cell_side(*_points_and_area(files, references))
     work = [(path, references[path].wkt, model, side, number) for number, path in enumerate(files)]
-    for cells_of_file in each_file(cells_of, work, workers):
-        found += cells_of_file
+    parts = [part for cells in each_file(cells_of_file, work, workers) for part in cells]
     headers = map(read_header, files)
     if all(header is not None and not header.count for header in headers):
-        nothing = np.empty(0)
-        found = [ReviewCells.of(np.empty((0, 3)), nothing.astype(np.uint8), nothing, side)]
-    elif not any(map(len, found)):
+        nothing = np.empty(0, np.uint8)
+        parts = [ReviewCells.from_points(np.empty((0, 3)), nothing, nothing, side)]
+    elif not any(map(len, parts)):
         raise StageError(
             "no point is ground, vegetation or a building",
             found=", ".join(files[:3]),
             cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
         )
-    cells = ReviewCells.join(found)
+    cells = ReviewCells.join(parts)
     patches = find_patches(cells)
-    held = np.cumsum(patches.errors)
-    some = len(held) and held[-1] > 0
-    listed = int(np.searchsorted(held, share * held[-1])) + 1 if some else 0
-    return Review(
-        cells, patches, min(listed, len(patches)), files, references[files[0]].units.horizontal
-    )
+    errors = np.cumsum(patches.errors)
+    listed = 0
+    if len(errors) and errors[-1] > 0:
+        listed = min(int(np.searchsorted(errors, share * errors[-1])) + 1, len(patches))
+    return Review(cells, patches, listed, files, references[files[0]].units.horizontal)
 
 
-def cells_of(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
-    """The cells of a file with its number; missing reliabilities are computed, with a message."""
-    found: list[ReviewCells] = []
-    whole: list[dict[str, NDArray]] = []
-    for part in parts_of(path, wkt):
+def cells_of_file(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
+    """Return the cells of a file; reliabilities that it lacks are computed, with a message."""
+    cells: list[ReviewCells] = []
+    unrated: list[dict[str, NDArray]] = []
+    for part in read_points(path, wkt):
         if "Reliability" not in part:
-            whole.append(part)
+            unrated.append(part)
         elif len(part["codes"]):
-            found.append(
-                ReviewCells.of(part["xyz"], part["codes"], part["Reliability"], side, number)
-            )
-    if whole:
+            values = part["xyz"], part["codes"], part["Reliability"]
+            cells.append(ReviewCells.from_points(*values, side, number))
+    if unrated:
         print_messages(
-            f"{path} has no Reliability: now computed by the model {model}, which takes as long as classifying"
+            f"{path} has no Reliability: it is computed with the model {model}, which takes as "
+            "long as classifying"
         )
-        every = {name: np.concatenate([part[name] for part in whole]) for name in whole[0]}
-        found.append(
-            ReviewCells.of(every["xyz"], every["codes"], reliability_of(every, model), side, number)
-        )
-    return [ReviewCells.join(found)] if found else []
+        points = {name: np.concatenate([part[name] for part in unrated]) for name in unrated[0]}
+        values = points["xyz"], points["codes"], compute_reliability(points, model)
+        cells.append(ReviewCells.from_points(*values, side, number))
+    return [ReviewCells.join(cells)] if cells else []
 
 
-def parts_of(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
-    """The points of a file that are neither noise nor withheld, in its order.
+def read_points(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
+    """Yield the points of a file that are neither noise nor withheld, in its order.
 
-    Each part has ``xyz`` (n, 3) in meters, ``codes`` (n,), and those of the dimensions :data:`WANTED` that exist.
+    Each part has ``xyz`` (n, 3) in meters, ``codes`` (n,), and those of :data:`DIMENSIONS` that
+    exist.
     """
-    for arrays, flags in read_columns(path, WANTED):
+    for arrays, flags in read_columns(path, DIMENSIONS):
         points = Points(arrays, wkt=wkt, legacy_flags=flags)
         codes = points.class_codes
         kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
-        more = {name: np.asarray(points.dimension(name))[kept] for name in WANTED if name in arrays}
-        yield {"xyz": points.xyz[kept], "codes": codes[kept], **more}
+        existing = [name for name in DIMENSIONS if name in arrays]
+        columns = {name: np.asarray(points.dimension(name))[kept] for name in existing}
+        yield {"xyz": points.xyz[kept], "codes": codes[kept], **columns}
 
 
-def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, float]:
-    """Points and square meters of the files, as their headers say."""
+def _points_and_area(files: Sequence[str], references: dict[str, Any]) -> tuple[int, float]:
+    """Return the number of points and the area, m2, that headers of files report."""
     points, area = 0, 0.0
     for path in files:
         header = read_header(path) if can_read_chunks(path) else None
@@ -185,15 +200,19 @@ def _extent(files: Sequence[str], references: dict[str, Any]) -> tuple[int, floa
     return (points, area) if area > 0 else (1, 1e-9)
 
 
-def reliability_of(points: Mapping[str, NDArray], model: str) -> NDArray[np.float32]:
-    """The probability that a model gives to the class of each point; 1 for classes that it does not know."""
-    loaded = loaded_model(model)
-    given = {name: points[name] for name in loaded.optional_dimensions if name in points}
-    found: Any = loaded.predict(points["xyz"], given, probabilities=True).probabilities
-    place = np.full(256, -1)
-    place[loaded.codes] = np.arange(len(loaded.codes))
-    lower = [code for code in (3, 4) if place[code] < 0]
-    place[lower] = place[5]  # vegetation as one class
-    mine = place[points["codes"]]
-    own = np.take_along_axis(found, np.maximum(mine, 0)[:, None], axis=1)[:, 0]
-    return np.where(mine >= 0, own, 1.0).astype(np.float32)
+def compute_reliability(points: Mapping[str, NDArray], name: str) -> NDArray[np.float32]:
+    """Return the probability (n,) that a model gives to the class of each point.
+
+    It is 1 for classes that the model does not know.
+    """
+    model = loaded_model(name)
+    dimensions = {name: points[name] for name in model.optional_dimensions if name in points}
+    result: Any = model.predict(points["xyz"], dimensions, probabilities=True)
+    column_of_code = np.full(256, -1)
+    column_of_code[model.codes] = np.arange(len(model.codes))
+    lower = [code for code in (3, 4) if column_of_code[code] < 0]
+    column_of_code[lower] = column_of_code[5]  # vegetation as one class
+    column = column_of_code[points["codes"]]
+    known = np.maximum(column, 0)[:, None]
+    probability = np.take_along_axis(result.probabilities, known, axis=1)[:, 0]
+    return np.where(column >= 0, probability, 1.0).astype(np.float32)

@@ -37,15 +37,17 @@ class WriteObjects(ObjectOptions, Stage):
     )
 
     def check(self) -> None:
-        from ..reports.object_layers import check_target
+        from ..reports.object_layers import LAYERS
+        from ..reports.vector_files import check_target
 
         super().check()
-        with_vector(check_target, self.filename)
+        with_vector(check_target, self.filename, LAYERS)
 
     def outputs(self) -> list[Output]:
-        from ..reports.object_layers import target_files
+        from ..reports.object_layers import LAYERS
+        from ..reports.vector_files import target_files
 
-        return [Output(str(file), "objects") for file in target_files(self.filename)]
+        return [Output(str(file), "objects") for file in target_files(self.filename, LAYERS)]
 
     def reads(self) -> list[str]:
         return ["Classification"]
