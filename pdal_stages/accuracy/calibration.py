@@ -1,7 +1,7 @@
 """Calibration of a confidence: reliability curve, errors by margin, separation of right and wrong.
 
-A :class:`ConfidenceHistogram` is a histogram of a confidence in [0, 1] with the number of right points in
-each bin. Histograms add, so those of tiles give the measures of the whole.
+A :class:`ConfidenceHistogram` is a histogram of a confidence in [0, 1] with the number of right
+points in each bin. Histograms add, so those of tiles give the measures of the whole.
 """
 
 from __future__ import annotations
