@@ -18,7 +18,7 @@ from ..features import FeaturePlan
 from ..features.cell_means import density
 from ..features.point_grid import check_xyz
 from ..features.registry import ALGORITHM_VERSION
-from ..features.voxels import represent
+from ..features.voxels import Representatives, represent
 from . import model_description, model_file
 from .auto_context import WeightedPass, classify, plan_of
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
@@ -36,28 +36,28 @@ from .prediction import (
 )
 from .registry import preprocessing
 
-#: How many times sparser or denser a cloud may be than those trained on before that is said.
-TOLERANCE = 2.0
+#: How many times sparser or denser than those trained on a cloud may be without a warning.
+DENSITY_TOLERANCE = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
     """A trained classifier. Make one with :func:`train` or :func:`load_model`."""
 
-    #: the classifiers, e.g. a :class:`FeatureForest`; each but the first reads what the one before said
+    #: the classifiers; each but the first reads the probabilities of the one before
     passes: tuple[Any, ...]
     classes: list[tuple[int, str]]  #: code and name, in the order of the columns of probabilities
-    #: the rest of the manifest: how it was trained, scores; ``info["passes"]`` has the importances of each pass
+    #: the rest of the manifest: how it was trained, scores, by pass its importances
     info: dict[str, Any] = field(default_factory=dict)
 
     @property
     def algorithm(self) -> Any:
-        """The last pass, whose answer is the model's."""
+        """The last pass, whose probabilities are the model's."""
         return self.passes[-1]
 
     @cached_property
     def plan(self) -> FeaturePlan | InputPlan:
-        """Features and dimensions it needs."""
+        """Features and dimensions that all passes read."""
         return plan_of(self.passes)
 
     @property
@@ -67,116 +67,132 @@ class Model:
 
     @property
     def codes_of(self) -> list[list[int]]:
-        """The classes of each pass: the model's own, but for passes of a base, which have theirs."""
-        own = self.codes.tolist()
-        return [list(one.get("codes") or own) for one in self.info["passes"]]
+        """Class codes of each pass: the model's own, but for the passes of a base."""
+        codes = self.codes.tolist()
+        return [list(entry.get("codes") or codes) for entry in self.info["passes"]]
 
     @property
     def factors(self) -> npt.NDArray[np.float64] | None:
-        """What each class's probability is multiplied by for being frequent (``prior_weight``), or None."""
+        """Factors of the classes' probabilities by their frequency (``prior_weight``), or None."""
         priors = self.info.get("priors")
         return None if priors is None else np.array(priors["factors"])
 
     @property
     def weighted_passes(self) -> list[WeightedPass]:
-        """Its passes, each with what its probabilities are weighted by."""
-        given = [one.get("factors") for one in self.info["passes"][:-1]]
-        factors = [*(None if one is None else np.array(one) for one in given), self.factors]
+        """The passes, each with the factors of its probabilities."""
+        stored = [entry.get("factors") for entry in self.info["passes"][:-1]]
+        factors = [*(None if each is None else np.array(each) for each in stored), self.factors]
         return list(map(WeightedPass, self.passes, self.codes_of, factors))
 
     @property
     def required_dimensions(self) -> tuple[str, ...]:
-        """Dimensions a cloud must have beside its coordinates."""
+        """Dimensions that a cloud must have beside its coordinates."""
         return required_dimensions(self.plan.dimensions)
 
     @property
     def optional_dimensions(self) -> tuple[str, ...]:
-        """Dimensions it uses where a cloud has them: return numbers."""
+        """Dimensions that are used where a cloud has them: return numbers."""
         return optional_dimensions(self.plan.dimensions)
 
     @property
+    def preparation(self) -> list[dict[str, Any]]:
+        """Stages that computed the training's dimensions; empty where the model does not say."""
+        return self.info.get("preparation") or []
+
+    @property
     def voxel(self) -> float:
-        """Side in meters of voxels that one point represents; 0: each point stands for itself."""
+        """Side in meters of the voxels that one point each stands for; 0 for none."""
         return float(self.info.get("voxel") or 0.0)
 
     @property
     def halo_m(self) -> float:
-        """Meters around a tile whose points a tile's results depend on."""
+        """Meters around a tile whose points the tile's results depend on."""
         return self.plan.halo_m + self.voxel
 
     @property
+    def gives_variance(self) -> bool:
+        """Whether the model is a network alone, which sees each point in several batches."""
+        return len(self.passes) == 1 and self.passes[0].features is None
+
+    @property
     def algorithm_versions(self) -> dict[str, int]:
-        """Stages that compute what the model reads -> version of their algorithm in this release."""
-        computed = any(one.features is not None for one in self.passes)
-        features = {"filters.multiscalefeatures": ALGORITHM_VERSION} if computed else {}
-        preparation = self.info.get("preparation") or []
-        return preprocessing().algorithm_versions(preparation) | features
+        """This release's version of each algorithm that computes what the model reads, by stage."""
+        reads_features = any(each.features is not None for each in self.passes)
+        features = {"filters.multiscalefeatures": ALGORITHM_VERSION} if reads_features else {}
+        return preprocessing().algorithm_versions(self.preparation) | features
 
     def record_preprocessing(self, preparation: Sequence[Mapping[str, Any]]) -> None:
-        """Store the stages that made the training's dimensions, and the versions of the algorithms in this release."""
+        """Store the stages that computed the training's dimensions, and their versions."""
         self.info["preparation"] = [dict(stage) for stage in preparation]
         self.info["algorithms"] = self.algorithm_versions
 
     @property
     def outdated(self) -> list[str]:
-        """Warnings: algorithms of this release that differ from those the model was trained with."""
-        stored, told = self.info.get("algorithms", {}), []
+        """Warnings about algorithms that have changed since the model was trained."""
+        stored, warnings = self.info.get("algorithms", {}), []
+        release = self.info["created_by"].get("pdal_stages", "unknown")
         for kind, version in self.algorithm_versions.items():
-            if (then := stored.get(kind)) != version:
-                what, may = (
-                    ("an unknown version", "may ") if then is None else (f"version {then}", "")
-                )
-                told.append(
-                    f"the model was trained with {what} of {kind}, and this release has version {version}, whose "
-                    f"results {may}differ: expect lower accuracy. Train the model again, or install the release that it was "
-                    f"trained with (pdal_stages {self.info['created_by'].get('pdal_stages', 'unknown')})"
-                )
-        return told
+            if stored.get(kind) == version:
+                continue
+            trained, may = f"version {stored.get(kind)}", ""
+            if kind not in stored:
+                trained, may = "an unknown version", "may "
+            warnings.append(
+                f"the model was trained with {trained} of {kind}, and this release has version "
+                f"{version}, whose results {may}differ: expect lower accuracy. Train the model "
+                f"again, or install the release that it was trained with (pdal_stages {release})"
+            )
+        return warnings
 
     def importances(self, by: str = "feature", number: int = -1) -> dict[str, float]:
-        """Mean decrease in impurity, summing to 1, largest first.
+        """Return the mean decrease in impurity by input, summing to 1, largest first.
 
-        `by` column, feature (over all neighborhoods, a histogram's bins together), group (covariance, geometry, shape
-        features and context), neighborhood, or dimension (of the points, against all others); `number` is the pass's
-        place in ``passes``.
+        Parameters
+        ----------
+        by : str
+            column, feature (over all neighborhoods, a histogram's bins together), group
+            (covariance, geometry, shape features and context), neighborhood, or dimension (of the
+            points, against all others).
+        number : int
+            Which of the `passes`.
         """
         values = self.info["passes"][number]["importances"]
-        return model_description.importances(
-            values, self.passes[number].columns(self.codes_of[number]), by
-        )
+        columns = self.passes[number].columns(self.codes_of[number])
+        return model_description.importances(values, columns, by)
 
     def describe(self) -> dict[str, Any]:
-        """Everything about the model as plain data; ``str(model)`` is the same as text."""
+        """Return everything about the model as plain data; ``str(model)`` is the same as text."""
         more = {
             "required_dimensions": list(self.required_dimensions),
             "optional_dimensions": list(self.optional_dimensions),
             "halo_m": self.halo_m,
             "outdated": self.outdated,
         }
-        return model_description.describe(
-            {**self.manifest(), **more},
-            [one.columns(codes) for one, codes in zip(self.passes, self.codes_of, strict=True)],
-        )
+        columns = [
+            each.columns(codes) for each, codes in zip(self.passes, self.codes_of, strict=True)
+        ]
+        return model_description.describe({**self.manifest(), **more}, columns)
 
     def __repr__(self) -> str:
+        """Return the kind and the codes in a line."""
         return f"<Model {self.algorithm.name} of classes {self.codes.tolist()}>"
 
     def __str__(self) -> str:
+        """Return a page of text about the model."""
         return model_description.text(self.describe())
 
     def manifest(self) -> dict[str, Any]:
-        """What the model file says beside its arrays."""
+        """Return what the model file holds beside arrays."""
+        entries = zip(self.passes, self.codes_of, self.info["passes"], strict=True)
         passes = [
-            {"algorithm": one.name, **one.to_file(codes), **scores}
-            for one, codes, scores in zip(
-                self.passes, self.codes_of, self.info["passes"], strict=True
-            )
+            {"algorithm": each.name, **each.to_file(codes), **scores}
+            for each, codes, scores in entries
         ]
         return {**self.info, "passes": passes}
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the model file: whole, or not at all."""
-        model_file.write(path, self.manifest(), [one.arrays() for one in self.passes])
+        model_file.write(path, self.manifest(), [each.arrays() for each in self.passes])
 
     def predict(
         self,
@@ -192,74 +208,45 @@ class Model:
     ) -> Prediction:
         """Classify a cloud, block by block.
 
-        Memory holds the cloud's index, the results and a few blocks of features, whatever the cloud's size.
+        Memory holds the cloud's index, the results and a few blocks, whatever the cloud's size.
 
         Parameters
         ----------
         xyz : (n, 3) float64
             Coordinates in meters.
         dimensions : mapping, optional
-            Name to (n,) values, e.g. return numbers. Without any of the heights in ``required_dimensions``, these are
-            made as in training, where the model says how.
+            Name to (n,) values, e.g. return numbers. Without any of the heights in
+            ``required_dimensions``, these are computed as in training, where the model says how.
         where : (n,) bool, optional
             Points to classify. The others keep their class but still serve as neighbors.
         current : (n,) int, optional
-            Classes the points have now: what points outside `where`, and rejected ones, keep. Without it
-            the former get 0 (never classified) and the latter 1 (unclassified).
+            Class codes that points outside `where`, and rejected ones, keep; default 0 and 1.
         ignore : (n,) bool, optional
-            Points that are not there for the model: not classified, and not even neighbors. For noise.
+            Points, such as noise, that are neither classified nor neighbors.
         may_be_ground : (n,) bool, optional
-            Points that may become class 2. Others for which it wins get the second class, with its probability as
-            reliability and a margin of 0.
+            Points that may become class 2. Others for which it wins get the second class, with
+            its probability as reliability and a margin of 0.
         progress : object, optional
-            Its ``update`` is called with the points done.
+            Its ``update`` is called with the number of points done.
         **options
             See :class:`PredictionOptions`.
         """
-        how = PredictionOptions(**options)
-        if how.variance and not self.gives_variance:
-            raise OptionError(
-                "only a network gives a variance over batches",
-                found=", ".join(one.name for one in self.passes),
-                cure="Ask for the margin, which every model gives",
-            )
+        how = self._check_options(PredictionOptions(**options))
         xyz = check_xyz(xyz)
         roles = PointRoles.check(len(xyz), where, ignore, current, may_be_ground)
-        given = self._add_preprocessed(xyz, dict(dimensions or {}), roles, how.threads)
-        columns = empty_columns(roles, len(self.codes), how)
-        values = list_values(self.plan.dimensions, given, len(xyz), roles.present)
-        representatives = represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
-        del values
+        dimensions = self._add_preprocessed(xyz, dict(dimensions or {}), roles, how.threads)
+        columns = empty_columns(roles, len(self.classes), how)
+        representatives = self._represent(xyz, dimensions, roles)
         if representatives is not None:  # the coordinates of the others are not needed any more
             xyz = xyz[representatives.rows]
         work = WorkingCloud.sort(xyz, self._cell, representatives, roles.wanted_rows)
         del xyz
-        request = PredictRequest(
-            work.xyz,
-            work.take((*self.required_dimensions, *self.optional_dimensions), given),
-            work.wanted,
-            how.threads,
-            how.memory_mb,
-            progress if representatives is None else None,
-            work.grid,
-            how.variance,
-            how.device,
-        )
-        del given
-        # Here and not later: search structures take more memory than is free beside them.
-        measure = self.info.get("densities") is not None and request.count
-        points_per_m2 = density(work.xyz) if measure else None
-        for block in classify(self.weighted_passes, request):
-            rows_in_cloud, rows_in_block = work.members(block.rows)
-            for name, values_of_block in decide(block, self.codes, columns).items():
-                columns[name][rows_in_cloud] = values_of_block[rows_in_block]
-            if progress is not None and representatives is not None:
-                progress.update(len(rows_in_cloud))
+        request = self._request(work, dimensions, how, progress)
+        del dimensions
+        self._classify(work, request, columns, progress)
         if roles.not_ground is not None:
-            request.report.figures["too_far_for_ground"] = move_from_ground(columns, roles)
-        if points_per_m2 is not None:
-            self._report_density(request.report, points_per_m2, request.count)
-        request.report.warnings.extend(self.outdated)
+            moved = move_from_ground(columns, roles)
+            request.report.figures["too_far_for_ground"] = moved
         if len(work.xyz) < len(roles.wanted) - roles.ignored:
             request.report.figures["representatives"] = len(work.xyz)
         rejected = reject(columns, roles, how)
@@ -267,53 +254,114 @@ class Model:
         report.merge(request.report)
         return Prediction(**columns, unsure=rejected, report=report)
 
-    @property
-    def gives_variance(self) -> bool:
-        """Whether the model is a network alone, which sees each point in several batches."""
-        return len(self.passes) == 1 and self.passes[0].features is None
+    def _check_options(self, options: PredictionOptions) -> PredictionOptions:
+        if options.variance and not self.gives_variance:
+            raise OptionError(
+                "only a network gives a variance over batches",
+                found=", ".join(each.name for each in self.passes),
+                cure="Ask for the margin, which every model gives",
+            )
+        return options
 
     def _add_preprocessed(
         self,
         xyz: npt.NDArray[np.float64],
-        given: dict[str, npt.ArrayLike],
+        dimensions: dict[str, npt.ArrayLike],
         roles: PointRoles,
         threads: int | None,
     ) -> dict[str, npt.ArrayLike]:
-        """Return the dimensions (n,), with heights computed as in training where they are missing and the model says how."""
-        missing = [name for name in self.required_dimensions if name not in given]
-        stages = self.info.get("preparation") or []
+        """Return the dimensions (n,), with heights computed as in training where they are missing.
+
+        DimensionError where only a part of what the stages compute is there: heights of two kinds
+        would be mixed.
+        """
+        missing = [name for name in self.required_dimensions if name not in dimensions]
         if not missing:
-            return given
-        usable = None
-        if roles.present is not None:
-            usable = np.zeros(len(xyz), np.bool_)
-            usable[roles.present] = True
-        computed = preprocessing().made_of_coordinates(stages, xyz, usable, threads, roles.current)
-        both = sorted(computed.keys() & given.keys())
-        if both and computed.keys() & set(missing):  # heights of two kinds would be mixed
+            return dimensions
+        computed = preprocessing().made_of_coordinates(
+            self.preparation, xyz, roles.usable, threads, roles.current
+        )
+        both = sorted(computed.keys() & dimensions.keys())
+        if both and computed.keys() & set(missing):
             raise DimensionError(
                 f"the dimension {missing[0]} is missing",
-                found=", ".join(given),
-                cure=f"Leave out {', '.join(both)}: all are then made as in training, by {json.dumps(stages[0])}",
+                found=", ".join(dimensions),
+                cure=f"Leave out {', '.join(both)}: all are then made as in training, by "
+                f"{json.dumps(self.preparation[0])}",
             )
-        return {**computed, **given}
+        return {**computed, **dimensions}
+
+    def _represent(
+        self,
+        xyz: npt.NDArray[np.float64],
+        dimensions: Mapping[str, npt.ArrayLike],
+        roles: PointRoles,
+    ) -> Representatives | None:
+        """Return the points that stand for the others of their voxel, after a check of all values."""
+        values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.present)
+        return represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
 
     @property
     def _cell(self) -> float | None:
-        """Of the grid that its features are computed by; None where it has none."""
-        return next(
-            (one.features.plan.cell for one in self.passes if one.features is not None), None
-        )
+        """Side in meters of the grid that features are computed by; None without features."""
+        features = (each.features for each in self.passes if each.features is not None)
+        return next((each.plan.cell for each in features), None)
 
-    def _report_density(self, report: Report, points_per_m2: float, count: int) -> None:
-        """Report the density of a cloud, and warn where it is not what the model was trained for."""
-        trained = self.info["densities"]
-        report.figures["density"] = round(points_per_m2, 3)
-        if trained["low"] / TOLERANCE <= points_per_m2 <= trained["high"] * TOLERANCE:
+    def _request(
+        self,
+        work: WorkingCloud,
+        dimensions: Mapping[str, npt.ArrayLike],
+        options: PredictionOptions,
+        progress: Any,
+    ) -> PredictRequest:
+        """Return the request for the points in work; its report holds how dense they are."""
+        names = (*self.required_dimensions, *self.optional_dimensions)
+        request = PredictRequest(
+            work.xyz,
+            work.take(names, dimensions),
+            work.wanted,
+            options.threads,
+            options.memory_mb,
+            None if work.stands_for_others else progress,
+            work.grid,
+            options.variance,
+            options.device,
+        )
+        if self.info.get("densities") is not None and request.count:
+            request.report.figures["density"] = density(work.xyz)
+        return request
+
+    def _classify(
+        self,
+        work: WorkingCloud,
+        request: PredictRequest,
+        columns: dict[str, npt.NDArray[Any]],
+        progress: Any,
+    ) -> None:
+        """Fill the columns (n, ...) of all points of the cloud, block by block."""
+        for block in classify(self.weighted_passes, request):
+            rows_in_cloud, rows_in_block = work.members(block.rows)
+            for name, values in decide(block, self.codes, columns).items():
+                columns[name][rows_in_cloud] = values[rows_in_block]
+            if progress is not None and work.stands_for_others:
+                progress.update(len(rows_in_cloud))
+        self._check_density(request)
+        request.report.warnings.extend(self.outdated)
+
+    def _check_density(self, request: PredictRequest) -> None:
+        """Warn where the cloud is not as dense as those that the model was trained on."""
+        figures, trained = request.report.figures, self.info.get("densities")
+        if trained is None or "density" not in figures:
             return
-        few = max(report.figures.get("fewer_than_three", {}).values(), default=0)
-        lonely = f"; {100 * few / count:.3g} % have fewer than three neighbors" if few else ""
-        report.warnings.append(
-            f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
-            f"{model_description.range_text(trained)}{lonely}. Expect lower accuracy, or train with 'thin'"
+        found = figures["density"]
+        figures["density"] = round(found, 3)
+        low, high = trained["low"] / DENSITY_TOLERANCE, trained["high"] * DENSITY_TOLERANCE
+        if low <= found <= high:
+            return
+        few = max(figures.get("fewer_than_three", {}).values(), default=0)
+        lonely = f"; {100 * few / request.count:.3g} % have fewer than three neighbors"
+        request.report.warnings.append(
+            f"the cloud has {found:.3g} points/m2, the model was trained on "
+            f"{model_description.range_text(trained)}{lonely if few else ''}. Expect lower accuracy, "
+            "or train with 'thin'"
         )

@@ -105,13 +105,22 @@ class PointRoles:
         return None if self.wanted.all() else np.flatnonzero(self.wanted)
 
     @property
+    def usable(self) -> npt.NDArray[np.bool_] | None:
+        """(n,) points that are not ignored; None: all."""
+        if self.present is None:
+            return None
+        usable = np.zeros(len(self.wanted), np.bool_)
+        usable[self.present] = True
+        return usable
+
+    @property
     def ignored(self) -> int:
         """Number of points that are ignored."""
         return 0 if self.present is None else len(self.wanted) - len(self.present)
 
 
-def _mask(name: str, given: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
-    array = np.asarray(given)
+def _mask(name: str, values: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
+    array = np.asarray(values)
     if array.shape != (n,) or array.dtype.kind != "b":
         raise OptionError(
             f"'{name}' must be one true or false per point",
@@ -120,14 +129,15 @@ def _mask(name: str, given: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
     return array
 
 
-def _codes(name: str, given: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:
-    array = np.asarray(given)
-    found = f"{array.dtype} of shape {array.shape}"
-    valid = array.shape == (n,) and array.dtype.kind in "iu"
-    if valid and n and (array.min() < 0 or array.max() > 255):
-        valid, found = False, f"{array.min()} to {array.max()}"
-    if not valid:
-        raise OptionError(f"'{name}' must be one class code per point", found=found)
+def _codes(name: str, values: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:
+    array = np.asarray(values)
+    wrong = None
+    if array.shape != (n,) or array.dtype.kind not in "iu":
+        wrong = f"{array.dtype} of shape {array.shape}"
+    elif n and (array.min() < 0 or array.max() > 255):
+        wrong = f"{array.min()} to {array.max()}"
+    if wrong:
+        raise OptionError(f"'{name}' must be one class code per point", found=wrong)
     return array.astype(np.uint8)
 
 
@@ -181,6 +191,11 @@ class WorkingCloud:
         rows_in_cloud = order if rows_in_cloud is None else rows_in_cloud[order]
         sorted_grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
         return cls(grid.coordinates, wanted, sorted_grid, rows_in_cloud, order, representatives)
+
+    @property
+    def stands_for_others(self) -> bool:
+        """Whether a point in work may stand for other points of the cloud, or for none."""
+        return self._representatives is not None
 
     def take(
         self, names: Iterable[str], dimensions: Mapping[str, npt.ArrayLike]
