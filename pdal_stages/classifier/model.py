@@ -353,15 +353,15 @@ class Model:
         figures, trained = request.report.figures, self.info.get("densities")
         if trained is None or "density" not in figures:
             return
-        found = figures["density"]
-        figures["density"] = round(found, 3)
+        points_per_m2 = figures["density"]
+        figures["density"] = round(points_per_m2, 3)
         low, high = trained["low"] / DENSITY_TOLERANCE, trained["high"] * DENSITY_TOLERANCE
-        if low <= found <= high:
+        if low <= points_per_m2 <= high:
             return
         few = max(figures.get("fewer_than_three", {}).values(), default=0)
         lonely = f"; {100 * few / request.count:.3g} % have fewer than three neighbors"
         request.report.warnings.append(
-            f"the cloud has {found:.3g} points/m2, the model was trained on "
+            f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
             f"{model_description.range_text(trained)}{lonely if few else ''}. Expect lower accuracy, "
             "or train with 'thin'"
         )
