@@ -1,7 +1,9 @@
-"""Circular batches [WM19]: the points nearest to grid points, so spaced that every point is in several.
+"""Circular batches [WM19]: the points nearest to grid points, so spaced that every point is in
+several.
 
-The grid is anchored to absolute coordinates and its spacing is fixed when a model is trained, so a tile sees the
-same circles as the whole cloud. What a circle holds follows from the coordinates, never from the points' order.
+The grid is anchored to absolute coordinates and its spacing is fixed when a model is trained, so a
+tile sees the same circles as the whole cloud. What a circle holds follows from the coordinates,
+never from the points' order.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ DEEPEST = 24
 
 
 def spacing_for(points: int, per_square_meter: float) -> float:
-    """Spacing in meters at which circles of `points` points cover each point :data:`COVERAGE` times.
+    """Spacing in meters at which circles of `points` points cover each point :data:`COVERAGE`
+    times.
 
     A circle covers points / density square meters and each grid point stands for spacing^2 of them.
     """
@@ -33,9 +36,9 @@ def spacing_for(points: int, per_square_meter: float) -> float:
 def halo_m(spacing: float) -> float:
     """Meters around a tile that its results depend on.
 
-    A point's circles have their grid points within ``REACH`` spacings of it and take points as far again; which
-    grid points there are depends on the cell they were halved from, whose center is up to half a cell's diagonal
-    away, and on what lies within reach of that.
+    A point's circles have their grid points within ``REACH`` spacings of it and take points as far
+    again; which grid points there are depends on the cell they were halved from, whose center is up
+    to half a cell's diagonal away, and on what lies within reach of that.
     """
     return (2.0 * REACH + math.sqrt(0.5)) * spacing
 
@@ -43,8 +46,9 @@ def halo_m(spacing: float) -> float:
 class Circles:
     """The circular batches of a cloud.
 
-    A cell of the grid is quartered, and its grid point replaced by four, while it holds more than half a batch, or
-    while its own circle does not hold all of its points: so each point is in at least one circle, always.
+    A cell of the grid is quartered, and its grid point replaced by four, while it holds more than
+    half a batch, or while its own circle does not hold all of its points: so each point is in at
+    least one circle, always.
 
     Parameters
     ----------

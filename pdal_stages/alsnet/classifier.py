@@ -20,7 +20,8 @@ from .configuration import Configuration, parse_configuration
 from .network import Folded, Weights, check
 from .sampling_and_grouping import Pyramid, build, scramble
 
-#: A network whose batch would need more megabytes is not loaded; the published ones need a few thousand.
+#: A network whose batch would need more megabytes is not loaded; the published ones need a few
+#: thousand.
 MOST_MB = 32_768
 #: Meters that become 1 where X, Y or Z is an input.
 METERS = 10.0
@@ -160,7 +161,8 @@ class AlsNet:
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
         """Return the mean probabilities over the batches, their variance, and counts.
 
-        The variance (n,) of a class's probability over the batches, mean over the classes, marks errors [WM19 5].
+        The variance (n,) of a class's probability over the batches, mean over the classes, marks
+        errors [WM19 5].
         """
         from threadpoolctl import threadpool_limits
 
@@ -186,7 +188,8 @@ class AlsNet:
             return members[order], apply(pyramid)
 
         seen = 0
-        # BLAS on one thread: a batch's result then does not depend on how many are computed side by side.
+        # BLAS on one thread: a batch's result then does not depend on how many are computed side by
+        # side.
         with threadpool_limits(1):
             for members, p in map_blocks(one, numbers.tolist(), side_by_side, ahead=1):
                 at = place[members]
@@ -219,7 +222,8 @@ def scaled(
     mean: Sequence[float],
     scale: Sequence[float],
 ) -> npt.NDArray[np.float32]:
-    """(n, inputs) float32: (value - mean) / scale of each dimension, 0 where X, Y and Z come later."""
+    """(n, inputs) float32: (value - mean) / scale of each dimension, 0 where X, Y and Z come
+    later."""
     out = np.zeros((len(xyz), len(inputs)), np.float32)
     for k, name in enumerate(inputs):
         if name not in ("X", "Y", "Z"):
@@ -243,8 +247,8 @@ def make_pyramid(
     members : (k,) int64
         Rows of the cloud in the canonical order.
     center : (2,) float64
-        Coordinates are taken from it, heights from the batch's first percentile: near its ground, whatever few
-        strays lie below.
+        Coordinates are taken from it, heights from the batch's first percentile: near its ground,
+        whatever few strays lie below.
     change : function, optional
         Augmentation: from coordinates (k, 3) to (coordinates, rows kept).
     """

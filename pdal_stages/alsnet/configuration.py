@@ -1,8 +1,10 @@
-"""Network configurations and options of training, as data: what a model file stores and an option names.
+"""Network configurations and options of training, as data: what a model file stores and an option
+names.
 
-A configuration lists the levels of set abstraction [WM19; Qi et al. 2017, PointNet++]: how many centers are
-sampled, the radius of the ball around each, how many points are taken from it, the widths of the shared
-perceptron that describes the ball, and the widths of the one that carries features back up to the level above.
+A configuration lists the levels of set abstraction [WM19; Qi et al. 2017, PointNet++]: how many
+centers are sampled, the radius of the ball around each, how many points are taken from it, the
+widths of the shared perceptron that describes the ball, and the widths of the one that carries
+features back up to the level above.
 """
 
 from __future__ import annotations
@@ -67,7 +69,8 @@ class Configuration(Settings):
             raise OptionError(f"a network may have {MAX_LAYERS} layers", found=layers)
 
     def _linear(self, inputs: int) -> Iterator[tuple[str, int, int, int, int]]:
-        """Of every layer but the last, in the order of the computation: name, rows, inputs, outputs, depth below."""
+        """Of every layer but the last, in the order of the computation: name, rows, inputs,
+        outputs, depth below."""
         width, rows = [inputs], [self.points]
         for number, level in enumerate(self.levels, 1):
             rows.append(min(level.centers, rows[-1]))
@@ -90,14 +93,16 @@ class Configuration(Settings):
     def shapes(self, inputs: int, classes: int) -> dict[str, tuple[int, int]]:
         """Array name to shape, in the order of the computation.
 
-        A layer with batch normalization is (out, in + 4): the weights, then per output the scale, shift, running
-        mean and running variance. The last, ``scores``, is (classes, in + 1): weights, then bias.
+        A layer with batch normalization is (out, in + 4): the weights, then per output the scale,
+        shift, running mean and running variance. The last, ``scores``, is (classes, in + 1):
+        weights, then bias.
         """
         out = {name: (after, before + 4) for name, _, before, after, _ in self._linear(inputs)}
         return {**out, "scores": (classes, self.head[-1] + 1)}
 
     def memory_mb(self, inputs: int) -> float:
-        """Megabytes one batch takes at most where the network is applied, counted from the sizes of its arrays."""
+        """Megabytes one batch takes at most where the network is applied, counted from the sizes of
+        its arrays."""
         most = max(
             rows * (before + 2 * after + 3 * below)
             for _, rows, before, after, below in self._linear(inputs)
@@ -116,10 +121,11 @@ class Configuration(Settings):
 def parse_configuration(
     given: str | Mapping[str, Any] | Configuration, points: int | None = None
 ) -> Configuration:
-    """A configuration from its name or from data, or an OptionError; `points` of a batch instead of its own.
+    """A configuration from its name or from data, or an OptionError; `points` of a batch instead of
+    its own.
 
-    A mapping has ``points``, ``levels`` (each ``centers``, ``radius``, ``samples``, ``mlp``, ``up``) and optionally
-    ``name``, ``head``, ``dropout``.
+    A mapping has ``points``, ``levels`` (each ``centers``, ``radius``, ``samples``, ``mlp``,
+    ``up``) and optionally ``name``, ``head``, ``dropout``.
     """
     if isinstance(given, str):
         if given not in CONFIGURATIONS:
@@ -152,7 +158,8 @@ def _from_mapping(given: Mapping[str, Any]) -> Configuration:
 
 
 def _only(given: Any, kind: type, what: str, needed: Sequence[str] = ()) -> None:
-    """Refuse what is not a mapping with the names of a dataclass's fields, with all that are needed."""
+    """Refuse what is not a mapping with the names of a dataclass's fields, with all that are
+    needed."""
     if not isinstance(given, Mapping):
         raise OptionError(f"{what} must be a mapping", found=repr(given)[:60])
     known = [one.name for one in fields(kind)]
@@ -167,7 +174,8 @@ def _only(given: Any, kind: type, what: str, needed: Sequence[str] = ()) -> None
             raise OptionError(f"{what} needs '{name}'")
 
 
-#: The named ones. ``alsnet4`` and ``alsnet3`` are those of [WM19]'s program; the others are ours, for CPUs.
+#: The named ones. ``alsnet4`` and ``alsnet3`` are those of [WM19]'s program; the others are ours,
+#: for CPUs.
 CONFIGURATIONS = {
     name: Configuration(name, points, tuple(Level(*row) for row in levels), head)
     for name, points, head, levels in (

@@ -1,4 +1,5 @@
-"""A network's weights as named arrays: made, checked, and applied with NumPy alone; only training needs PyTorch."""
+"""A network's weights as named arrays: made, checked, and applied with NumPy alone; only training
+needs PyTorch."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ def fresh(configuration: Configuration, inputs: int, classes: int, seed: int) ->
 def check(
     weights: Mapping[str, npt.NDArray[Any]], configuration: Configuration, inputs: int, classes: int
 ) -> None:
-    """Refuse, as a ModelError, arrays that are missing, unknown, of other shapes, not finite, or of negative variance."""
+    """Refuse, as a ModelError, arrays that are missing, unknown, of other shapes, not finite, or of
+    negative variance."""
     shapes = configuration.shapes(inputs, classes)
     if odd := sorted(set(weights) ^ set(shapes)):
         raise ModelError(
@@ -64,10 +66,11 @@ def forward(
     join: Callable,
     highest: Callable,
 ) -> Any:
-    """What enters the last layer, (n, width): PointNet++ with the levels of a configuration [WM19; Qi et al. 2017].
+    """What enters the last layer, (n, width): PointNet++ with the levels of a configuration [WM19;
+    Qi et al. 2017].
 
-    `pyramid` holds arrays of NumPy or tensors of PyTorch; the functions are those of the one or the other: a named
-    layer, rows by number, columns side by side, the maximum over the middle axis.
+    `pyramid` holds arrays of NumPy or tensors of PyTorch; the functions are those of the one or the
+    other: a named layer, rows by number, columns side by side, the maximum over the middle axis.
     """
 
     def shared(prefix: str, values: Any, widths: tuple[int, ...]) -> Any:
@@ -90,7 +93,8 @@ def forward(
 
 
 class Folded:
-    """A network for applying: weights that :func:`check` accepts, batch normalization folded into the linear layers."""
+    """A network for applying: weights that :func:`check` accepts, batch normalization folded into
+    the linear layers."""
 
     def __init__(
         self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration
@@ -134,6 +138,7 @@ class Folded:
         if not np.isfinite(scores).all():
             raise ModelError(
                 "the network gave probabilities that are not numbers",
-                cure="Its weights or the points' dimensions are out of all proportion; train the model again",
+                cure="Its weights or the points' dimensions are out of all proportion; train the "
+                "model again",
             )
         return scores

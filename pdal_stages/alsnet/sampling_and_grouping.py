@@ -1,6 +1,8 @@
-"""The geometry of a batch, level by level: who is sampled, who is in which ball, who passes features back up.
+"""The geometry of a batch, level by level: who is sampled, who is in which ball, who passes
+features back up.
 
-It follows from the coordinates alone, so it is computed once, and the network only gathers and multiplies.
+It follows from the coordinates alone, so it is computed once, and the network only gathers and
+multiplies.
 """
 
 from __future__ import annotations
@@ -23,11 +25,12 @@ BUCKET = 64
 def farthest_points(
     xyz: npt.NDArray[np.float64], count: int, start: int = 0
 ) -> npt.NDArray[np.int64]:
-    """Farthest point sampling, exact: each of `count` points is the one farthest from those chosen before, from `start` on.
+    """Farthest point sampling, exact: each of `count` points is the one farthest from those chosen
+    before, from `start` on.
 
-    Indices come in the order they were chosen, each once (points that coincide included). Points are kept in buckets, in
-    the order of a tree; one whose box is farther from the new point than its own farthest point cannot change and is passed
-    over (the idea of QuickFPS, Han et al. 2023).
+    Indices come in the order they were chosen, each once (points that coincide included). Points
+    are kept in buckets, in the order of a tree; one whose box is farther from the new point than
+    its own farthest point cannot change and is passed over (the idea of QuickFPS, Han et al. 2023).
     """
     n = len(xyz)
     if not 0 < count <= n or not 0 <= start < n:
@@ -86,10 +89,11 @@ def _farthest(p, order, count, first):
 def ball_query(
     xyz: npt.NDArray[np.float64], centers: npt.NDArray[np.int64], radius: float, samples: int
 ) -> npt.NDArray[np.int32]:
-    """(m, samples) int32 rows of the first `samples` points, by index, within `radius` (included) of each center (m,).
+    """(m, samples) int32 rows of the first `samples` points, by index, within `radius` (included)
+    of each center (m,).
 
-    A center is within its own ball, so none is empty. A ball with fewer points repeats its first one, which a
-    maximum over the ball does not notice (as PointNet++ does).
+    A center is within its own ball, so none is empty. A ball with fewer points repeats its first
+    one, which a maximum over the ball does not notice (as PointNet++ does).
     """
     out = np.empty((len(centers), samples), np.int32)
     balls = cKDTree(xyz).query_ball_point(xyz[centers], radius, return_sorted=True)
@@ -102,11 +106,12 @@ def ball_query(
 def three_nearest(
     xyz: npt.NDArray[np.float64], coarse: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """Rows (n, 3) of the three nearest coarse points of each point, and weights (n, 3) by inverse squared distance.
+    """Rows (n, 3) of the three nearest coarse points of each point, and weights (n, 3) by inverse
+    squared distance.
 
-    They sum to 1. Where there are fewer than three coarse points the rest weigh nothing. [WM19] says inverse distance, but
-    its authors' program, which gave the published figures, takes the squared distances of its search as they are, as
-    PointNet++ does; so do we.
+    They sum to 1. Where there are fewer than three coarse points the rest weigh nothing. [WM19]
+    says inverse distance, but its authors' program, which gave the published figures, takes the
+    squared distances of its search as they are, as PointNet++ does; so do we.
     """
     k = min(3, len(coarse))
     distance, near = cKDTree(coarse).query(xyz, k=[1, 2, 3][:k])
@@ -140,7 +145,8 @@ class Pyramid:
 
 
 def scramble(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """An order that looks random and follows from the coordinates, whatever order the points come in.
+    """An order that looks random and follows from the coordinates, whatever order the points come
+    in.
 
     A ball takes its first points by index: in this order that is a fair sample of it.
     """

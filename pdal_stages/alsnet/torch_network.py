@@ -14,8 +14,8 @@ from .configuration import Configuration
 from .network import EPSILON, Weights, forward
 from .sampling_and_grouping import Pyramid, Step
 
-# OpenMP's threads spin while they wait, a third of all CPU time beside threads that prepare batches;
-# on a busy machine training took many times as long. Read when PyTorch loads its OpenMP.
+# OpenMP's threads spin while they wait, a third of all CPU time beside threads that prepare
+# batches; on a busy machine training took many times as long. Read when PyTorch loads its OpenMP.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 torch: Any = optional_import("torch", "deep", "training an alsNet, or applying one on a GPU")
 nn: Any = torch.nn
@@ -25,7 +25,8 @@ MOMENTUM = 0.05
 
 
 class Network(nn.Module):
-    """The layers of a configuration, each linear, normalized and cut at 0, by the names of their arrays."""
+    """The layers of a configuration, each linear, normalized and cut at 0, by the names of their
+    arrays."""
 
     def __init__(self, configuration: Configuration, inputs: int, classes: int) -> None:
         super().__init__()
@@ -83,7 +84,8 @@ class Network(nn.Module):
 def applied_on(
     device: str, weights: Weights, configuration: Configuration, inputs: int, classes: int
 ) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
-    """Return what gives the class probabilities (n, classes) of a batch, computed on a device of PyTorch.
+    """Return what gives the class probabilities (n, classes) of a batch, computed on a device of
+    PyTorch.
 
     They equal those of ``weights.Folded`` up to rounding.
     """
@@ -98,7 +100,8 @@ def applied_on(
 
 
 def chosen_device(device: str) -> str:
-    """Return ``cuda`` or ``cpu`` for a device option; DependencyError for cuda where there is none."""
+    """Return ``cuda`` or ``cpu`` for a device option; DependencyError for cuda where there is
+    none."""
     cuda = torch.cuda.is_available()
     if device == "cuda" and not cuda:
         raise DependencyError(

@@ -1,4 +1,5 @@
-"""Training a network: epochs of chosen batches, scored on ground held out, resumable at any epoch."""
+"""Training a network: epochs of chosen batches, scored on ground held out, resumable at any
+epoch."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ from .configuration import NetworkOptions
 from .network import Weights, check, fresh
 from .sampling_and_grouping import stack
 
-#: Of a checkpoint: a file of PyTorch's own, read with ``weights_only`` (nothing in it is executed), and its SHA-256.
+#: Of a checkpoint: a file of PyTorch's own, read with ``weights_only`` (nothing in it is executed),
+#: and its SHA-256.
 FORMAT = "pdal-stages alsnet checkpoint 4"
 
 optional_inputs: dict[str, tuple[str, ...]] = {}
@@ -53,7 +55,8 @@ def own_options(given: Any) -> NetworkOptions:
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
-    """The network's inputs: coordinates from the batch's center, then dimensions; OptionError where there are none."""
+    """The network's inputs: coordinates from the batch's center, then dimensions; OptionError where
+    there are none."""
     names = tuple(dict.fromkeys([*options.alsnet.coordinates, *options.dimensions]))
     if not names:
         raise OptionError(
@@ -95,7 +98,8 @@ class _Session:
         self.torch, self.options, self.seed = torch, training.alsnet, training.seed
         self.threads, self.inputs = resolve_threads(training.threads), inputs(training)
         options, names = self.options, self.inputs
-        # Of all clouds, one after the other; the place of each point's class is -1 where it is only a neighbor.
+        # Of all clouds, one after the other; the place of each point's class is -1 where it is only
+        # a neighbor.
         self.clouds = [cloud.xyz for cloud in clouds]
         self.labeled = label_classes(clouds, training)
         self.position = position = np.concatenate([np.asarray(one) for _, one in self.labeled])
@@ -135,7 +139,8 @@ class _Session:
         if not count.all():
             k = int(np.argmin(count))
             raise OptionError(
-                f"class {classes.codes[k]} ({classes.names[k]}) has no points outside the ground held out",
+                f"class {classes.codes[k]} ({classes.names[k]}) has no points outside the ground "
+                "held out",
                 cure="Make block_size smaller, set validation to 0, or give more training data",
             )
         threshold = options.histogram_threshold
@@ -322,7 +327,8 @@ class _Session:
         write_whole(path, buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
 
     def _resume(self, path: str) -> None:
-        """Go on from a checkpoint of this very training; ModelError where it is damaged or of another."""
+        """Go on from a checkpoint of this very training; ModelError where it is damaged or of
+        another."""
         data = Path(path).read_bytes()
         cure = "Delete the checkpoint to begin anew, or name another file"
         if hashlib.sha256(data[:-32]).digest() != data[-32:]:

@@ -1,4 +1,5 @@
-"""Which batches are trained on and how they are changed, and which ground is held out. No PyTorch here."""
+"""Which batches are trained on and how they are changed, and which ground is held out. No PyTorch
+here."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ def side_by_side(
 
 
 def spread(histogram: npt.NDArray[Any]) -> float:
-    """Standard deviation of a batch's class shares, per cent: large where one class is nearly all [WM19].
+    """Standard deviation of a batch's class shares, per cent: large where one class is nearly all
+    [WM19].
 
     Infinite for a batch without labels.
     """
@@ -42,8 +44,8 @@ def choose(
 ) -> list[int]:
     """Batches whose classes are mixed; see ``NetworkOptions.histogram_threshold``.
 
-    Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels (n,) are class
-    positions; -1 is not looked at.
+    Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels
+    (n,) are class positions; -1 is not looked at.
     """
     mine = (labels[circles.members(number)] for number in range(len(circles)))
     histograms = [np.bincount(part[part >= 0], minlength=n_classes) for part in mine]
@@ -93,15 +95,17 @@ def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]
     return weight / (weight * share).sum()
 
 
-#: Augmentation: most that a batch's center moves, in spacings; standard deviation of noise on coordinates, meters, cut at
-#: three times that; most points a batch loses, and fewest that are left.
+#: Augmentation: most that a batch's center moves, in spacings; standard deviation of noise on
+#: coordinates, meters, cut at three times that; most points a batch loses, and fewest that are
+#: left.
 SHIFT, JITTER, THIN, LEAST = 0.5, 0.01, 0.4, 16
 
 
 def augmented(
     xyz: npt.NDArray[np.float64], random: np.random.Generator
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """A batch turned about z, shaken and thinned: from coordinates (n, 3) around its center to (m, 3), and the rows kept."""
+    """A batch turned about z, shaken and thinned: from coordinates (n, 3) around its center to (m,
+    3), and the rows kept."""
     share = 1.0 - random.uniform(0.0, THIN)
     kept = np.sort(
         random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))]

@@ -1,6 +1,7 @@
 """Calibration: how often a model was right at which reliability, on ground that it had not seen.
 
-It tells from which reliability on points keep their class, so that a wanted share of the points that keep it is right.
+It tells from which reliability on points keep their class, so that a wanted share of the points
+that keep it is right.
 """
 
 from __future__ import annotations
@@ -35,41 +36,48 @@ class ClassLimit(NamedTuple):
     accuracy: (
         float  #: share of these that are right; where none keeps it, the largest share there is
     )
-    #: where none keeps it: a lower accuracy, and the share of points that would keep the class with it
+    #: where none keeps it: a lower accuracy, and the share of points that would keep the class with
+    #: it
     instead: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
 class ReliabilityLimits:
-    """Limits by class that keep a wanted share of points right, as the option `keep_sure` asks for."""
+    """Limits by class that keep a wanted share of points right, as the option `keep_sure` asks
+    for."""
 
     accuracy: float  #: share of points of each class that should be right
     classes: Mapping[int, ClassLimit]  #: by code
     kept: float  #: share of all points that keep their class
 
     def least_reliability(self) -> npt.NDArray[np.float32]:
-        """Return the least reliability (256,) with which a point keeps a class, by its code; 0 for other classes."""
+        """Return the least reliability (256,) with which a point keeps a class, by its code; 0 for
+        other classes."""
         least = np.zeros(256, np.float32)
         for code, limit in self.classes.items():
             least[code] = limit.reliability
         return least
 
     def describe_cost(self, names: Mapping[int, str]) -> list[str]:
-        """Return lines of text: the share of points that is expected to lose its class, by class."""
+        """Return lines of text: the share of points that is expected to lose its class, by
+        class."""
         lines = [
             f"to be right in {100 * self.accuracy:g} % of the points of each class, about "
-            f"{100 * (1 - self.kept):.1f} % of all points are expected to become class 1 (unclassified):"
+            f"{100 * (1 - self.kept):.1f} % of all points are expected to become class 1 "
+            "(unclassified):"
         ]
         for code, limit in self.classes.items():
             name = f"{code} {names.get(code, '')}".strip()
             if limit.instead is None:
                 lines.append(
-                    f"  {name}: {100 * limit.kept:.1f} % keep it, from reliability {limit.reliability:.2f} on"
+                    f"  {name}: {100 * limit.kept:.1f} % keep it, from reliability "
+                    f"{limit.reliability:.2f} on"
                 )
             else:
                 accuracy, share = limit.instead
                 lines.append(
-                    f"  {name}: no point keeps it, as at most {100 * limit.accuracy:.1f} % of the most reliable were "
+                    f"  {name}: no point keeps it, as at most {100 * limit.accuracy:.1f} % of the "
+                    "most reliable were "
                     f"right; with {accuracy:g}, {100 * share:.1f} % would"
                 )
         return lines
@@ -90,7 +98,8 @@ class Calibration:
         reliability: npt.NDArray[np.floating],
         weight: npt.NDArray[np.floating] | None = None,
     ) -> None:
-        """Count points: (n,) codes predicted, true codes, reliabilities, and weights (default 1)."""
+        """Count points: (n,) codes predicted, true codes, reliabilities, and weights (default
+        1)."""
         place = np.floor(np.asarray(reliability, np.float64) * BINS)
         place = np.clip(place, 0, BINS - 1).astype(np.int64)
         for code in np.unique(predicted).tolist():
@@ -100,7 +109,8 @@ class Calibration:
                 table[code] = table.get(code, np.zeros(BINS)) + counts
 
     def limits(self, accuracy: float) -> ReliabilityLimits:
-        """Return the lowest limits from which on at least `accuracy` of the points of each class are right."""
+        """Return the lowest limits from which on at least `accuracy` of the points of each class
+        are right."""
         classes = {code: self._limit(code, accuracy) for code in sorted(self.right)}
         kept = sum(limit.kept * self.points([code]) for code, limit in classes.items())
         return ReliabilityLimits(accuracy, classes, kept / max(self.points(self.right), 1e-9))
@@ -124,7 +134,8 @@ class Calibration:
         return sum(float((self.right[code] + self.wrong[code]).sum()) for code in known)
 
     def accuracy(self, codes: Iterable[int]) -> float | None:
-        """Return the share of points given these classes that are right; None where there is no such point."""
+        """Return the share of points given these classes that are right; None where there is no
+        such point."""
         known = [code for code in codes if code in self.right]
         points = self.points(known)
         return sum(float(self.right[code].sum()) for code in known) / points if points else None
@@ -161,7 +172,8 @@ class Calibration:
 
 
 def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
-    """Return the calibration of a model: from its manifest `info`, or the file beside the model's `path`.
+    """Return the calibration of a model: from its manifest `info`, or the file beside the model's
+    `path`.
 
     Raises
     ------
@@ -184,7 +196,8 @@ def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
     if info.get("teacher"):
         cure = "Its labels are another model's answers; take a model that was scored on a person's labels"
     raise OptionError(
-        "how often this model is right at which Reliability is not known: it was never scored on ground held out",
+        "how often this model is right at which Reliability is not known: it was never scored on "
+        "ground held out",
         found=path,
         cure=f"{cure}; or set a limit by hand: --filters.modelclassifier.reject_below=0.8",
     )
@@ -195,8 +208,9 @@ def calibrate_on_base(
 ) -> Mapping[str, Any]:
     """Return the calibration of a model whose labels are a person's corrections of its base.
 
-    Corrections lie where the base was worst. So the counts of the `refined` model are taken for new classes alone, scaled
-    to the base's as its points of the base's classes are; for these the counts are the base's.
+    Corrections lie where the base was worst. So the counts of the `refined` model are taken for new
+    classes alone, scaled to the base's as its points of the base's classes are; for these the
+    counts are the base's.
 
     Parameters
     ----------

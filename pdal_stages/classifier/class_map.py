@@ -1,4 +1,5 @@
-"""Which labels become which classes: renaming, merging and dropping, and the two classes of a binary task."""
+"""Which labels become which classes: renaming, merging and dropping, and the two classes of a
+binary task."""
 
 from __future__ import annotations
 
@@ -55,10 +56,10 @@ class ClassMap:
         Parameters
         ----------
         spec : None, str, list of codes or mapping
-            None: every label found as it is, except those `left_out`. A list: those labels
-            as they are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
-            name (``"5 Trees"``), ``{"code": 5, "name": "Trees"}``, or ``"drop"``. Labels not mentioned are
-            dropped. Text is a comma-separated list, or JSON.
+            None: every label found as it is, except those `left_out`. A list: those labels as they
+            are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
+            name (``"5 Trees"``), ``{"code": 5, "name": "Trees"}``, or ``"drop"``. Labels not
+            mentioned are dropped. Text is a comma-separated list, or JSON.
         found : iterable of int
             Labels in the training clouds, for None.
         left_out : collection of int

@@ -17,7 +17,7 @@ from .fitted_features import Features
 from .interface import ArrayRule, Column
 from .random_forest import Forest
 from .refinement import Blend
-from .registry import REFINED_FOREST
+from .registry import FOREST, REFINED_FOREST
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,27 +26,26 @@ class FeatureForest:
 
     features: Features
     forest: Forest
-    context: Context | None = None  #: what it reads of the pass before, after the features
-    blend: Blend | None = None  #: of a forest on top of a base: how it changes what is said before
+    context: Context | None = None  #: read of the pass before; its columns follow the features
+    blend: Blend | None = None  #: of a forest on top of a base
 
     rules: ClassVar[Mapping[str, ArrayRule]] = Forest.rules
 
     @property
     def name(self) -> str:
-        return "random_forest" if self.blend is None else REFINED_FOREST
+        """The kind, as a manifest has it."""
+        return FOREST if self.blend is None else REFINED_FOREST
 
     @property
     def plan(self) -> FeaturePlan:
-        """Its features."""
+        """The features' plan."""
         return self.features.plan
-
-    # ---- file ----------------------------------------------------------------------------------------------
 
     @classmethod
     def from_file(
         cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
     ) -> FeatureForest:
-        """Return the forest that a model file describes as one of its passes, everything checked."""
+        """Return the forest that a pass of a manifest describes; ModelError for contradictions."""
         context = Context(tuple(entry["context"])) if entry["context"] else None
         blend = None
         if entry["algorithm"] == REFINED_FOREST:
@@ -56,22 +55,23 @@ class FeatureForest:
         before, labeled = (codes, codes) if blend is None else (blend.before, blend.labeled)
         names = entry["feature_names"]
         others = [*entry["dimensions"], *(() if context is None else context.names(before))]
-        if names[max(len(names) - len(others), 0) :] != others:
+        count = len(names) - len(others)
+        if names[max(count, 0) :] != others:
             raise ModelError(
-                "the model's last columns must be the points' dimensions and what it reads of the pass before",
+                "the model's last columns must be the points' dimensions and what it reads of the "
+                "pass before",
                 found=", ".join(names[-3:]),
             )
         if context is not None:
             context.check_segments(before, entry["dimensions"])
-        features = Features.from_dict(entry, names[: len(names) - len(others)])
-        forest = Forest.from_arrays(arrays, len(names), len(labeled))
-        return cls(features, forest, context, blend)
+        features = Features.from_dict(entry, names[:count])
+        return cls(features, Forest.from_arrays(arrays, len(names), len(labeled)), context, blend)
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
-        """What a model file says of it beside its arrays."""
+        """Return what a manifest says of it beside its arrays."""
+        blend = {} if self.blend is None else self.blend.to_dict()
         return {
-            "parameters": self.forest.parameters()
-            | ({} if self.blend is None else self.blend.to_dict()),
+            "parameters": {**self.forest.parameters(), **blend},
             "feature_names": [column.name for column in self.columns(codes)],
             "dimensions": list(self.plan.dimensions),
             "context": [] if self.context is None else list(self.context.tokens),
@@ -79,39 +79,36 @@ class FeatureForest:
         }
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays a model file stores."""
+        """Return the arrays that a model file stores."""
         return self.forest.arrays()
 
     def classes_before(self, codes: Sequence[int]) -> list[int]:
-        """Classes of the pass before, whose probabilities it reads; `codes` are its own."""
+        """Return the classes of the pass before; `codes` are its own."""
         return list(codes if self.blend is None else self.blend.before)
 
     def columns(self, codes: Sequence[int]) -> list[Column]:
-        """Return the features; a histogram's bins count as one feature."""
-        found = {}
+        """Return the inputs, in order; bins of a histogram are one feature."""
+        described: dict[int, tuple[str, str, str]] = {}
         for part in self.plan.layout:
-            for name, column in part.at.items():
+            for name, number in part.at.items():
                 group = BY_NAME[name].group
                 feature = name.split("_")[0] if group == "shapes" else name
-                found[column] = (feature, group, part.neighborhood.token)
-        columns = [Column(name, *found[number]) for number, name in enumerate(self.plan.features)]
+                described[number] = (feature, group, part.neighborhood.token)
+        columns = [
+            Column(name, *described[number]) for number, name in enumerate(self.plan.features)
+        ]
         columns += [Column(name, name, "dimension", "(dimension)") for name in self.plan.dimensions]
-        codes = self.classes_before(codes)
-        for name, feature, token in (
-            () if self.context is None else self.context.describe_columns(codes)
-        ):
-            columns.append(Column(name, feature, "context", token))
+        if self.context is not None:
+            read = self.context.describe_columns(self.classes_before(codes))
+            columns += [Column(name, feature, "context", token) for name, feature, token in read]
         return columns
-
-    # ---- applying it ---------------------------------------------------------------------------------------
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64] | None = None
     ) -> npt.NDArray[np.float64]:
-        """Probabilities (b, classes) of points by their features and context; `rows`, which they are, plays no part."""
-        grown = self.forest.predict_proba(values)
+        """Return probabilities (b, classes) from features and context (b, inputs)."""
+        by_forest = self.forest.predict_proba(values)
         if self.blend is None or self.context is None:
-            return grown
-        return self.blend(
-            self.context.own(values[:, len(self.plan.names) :], len(self.blend.before)), grown
-        )
+            return by_forest
+        read = values[:, len(self.plan.names) :]
+        return self.blend(self.context.own(read, len(self.blend.before)), by_forest)

@@ -1,4 +1,5 @@
-"""Features with what training fitted to compute them, and their values at the points of one cloud."""
+"""Features with what training fitted to compute them, and their values at the points of one
+cloud."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from .interface import PredictRequest
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features and what training fitted to compute them; ModelError where something is missing that they need."""
+    """Features and what training fitted to compute them; ModelError where something is missing that
+    they need."""
 
     plan: FeaturePlan
     bins: ShapeBins | None = None  #: thresholds of the shape distributions' histograms
@@ -49,7 +51,8 @@ class Features:
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any], names: Sequence[str]) -> Features:
-        """Return the features of a pass of a manifest, whose full `names` are in the order of its columns."""
+        """Return the features of a pass of a manifest, whose full `names` are in the order of its
+        columns."""
         bins = entry["shape_bins"]
         return cls(
             FeaturePlan.from_dict({**entry, "features": list(names)}),
@@ -60,7 +63,8 @@ class Features:
 
 
 class CloudFeatures:
-    """Features of the points of a request, computed in blocks; counts go into the request's report."""
+    """Features of the points of a request, computed in blocks; counts go into the request's
+    report."""
 
     def __init__(self, features: Features, request: PredictRequest) -> None:
         self.features, self._request = features, request
@@ -73,7 +77,8 @@ class CloudFeatures:
         take_dimensions(names, self._dimensions, len(request.xyz), request.rows)
 
     def run(self, rows: npt.NDArray[np.int64] | None, memory_share: float = 1.0) -> Run:
-        """Return the blocks of some rows (None: all) to compute, in `memory_share` of the request's memory."""
+        """Return the blocks of some rows (None: all) to compute, in `memory_share` of the request's
+        memory."""
         request, features = self._request, self.features
         if self._engine is None:
             grid = request.grid

@@ -1,4 +1,5 @@
-"""Dimensions of points that classifiers read: which a cloud must have, their values, and errors that name the cure."""
+"""Dimensions of points that classifiers read: which a cloud must have, their values, and errors
+that name the cure."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ _FROM_READER = "It comes from the reader; this source has none. Use a model trai
 #: Dimension -> what to do where it is missing.
 _CURES = {
     "HeightAboveGround": (
-        "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological before this stage, or "
+        "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological "
+        "before this stage, or "
         "what the model was trained with"
     ),
     **dict.fromkeys(("Intensity", *return_features.SOURCES), _FROM_READER),
@@ -32,7 +34,8 @@ _CURES = {
 
 
 def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the dimensions among feature names that a cloud must have: neither coordinates nor return features."""
+    """Return the dimensions among feature names that a cloud must have: neither coordinates nor
+    return features."""
     return tuple(
         dict.fromkeys(
             name
@@ -43,7 +46,8 @@ def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def optional_dimensions(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the dimensions that features are computed from where a cloud has them: return numbers."""
+    """Return the dimensions that features are computed from where a cloud has them: return
+    numbers."""
     if any(return_features.parse(name) is not None for name in names):
         return return_features.SOURCES
     return ()
@@ -56,7 +60,8 @@ def list_values(
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
 ) -> list[npt.NDArray[Any]]:
-    """Return the values (n,) of the dimensions that features require, and of the optional ones that are there.
+    """Return the values (n,) of the dimensions that features require, and of the optional ones that
+    are there.
 
     All are checked at `rows`, as by :func:`take_dimensions`.
     """
@@ -76,7 +81,8 @@ def add_return_features(
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
 ) -> Mapping[str, npt.ArrayLike]:
-    """Return the dimensions (n,), and those of `names` that are computed from return numbers and points (n, 3)."""
+    """Return the dimensions (n,), and those of `names` that are computed from return numbers and
+    points (n, 3)."""
     computed = return_features.return_features(names, xyz, dimensions, threads)
     return {**dimensions, **computed} if computed else dimensions
 
@@ -88,7 +94,8 @@ def take_dimensions(
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the values of dimensions at some rows of a cloud of n points, by name; coordinates are passed over.
+    """Return the values of dimensions at some rows of a cloud of n points, by name; coordinates are
+    passed over.
 
     Parameters
     ----------

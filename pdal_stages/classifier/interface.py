@@ -1,4 +1,5 @@
-"""Interface of all kinds of classifiers: what they are asked, what they return, and how a model file describes them."""
+"""Interface of all kinds of classifiers: what they are asked, what they return, and how a model
+file describes them."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ class InputPlan:
 
 
 class Column(NamedTuple):
-    """An input for people: its name, the feature it belongs to, that feature's group, and its neighborhood."""
+    """An input for people: its name, the feature it belongs to, that feature's group, and its
+    neighborhood."""
 
     name: str
     feature: str
@@ -65,7 +67,8 @@ class PredictRequest:
 
 
 class PassClassifier(Protocol):
-    """Classifier that is one pass of a model; each kind is a class of its own, and either of the two below."""
+    """Classifier that is one pass of a model; each kind is a class of its own, and either of the
+    two below."""
 
     #: arrays that the kind stores in a model file; a name that ends in ``*`` stands for many
     rules: ClassVar[Mapping[str, ArrayRule]]
@@ -90,7 +93,8 @@ class PassClassifier(Protocol):
     def from_file(
         cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
     ) -> PassClassifier:
-        """Return the classifier that a pass of a manifest describes; ModelError where it contradicts itself."""
+        """Return the classifier that a pass of a manifest describes; ModelError where it
+        contradicts itself."""
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """Return what a manifest says of it beside its arrays."""
@@ -108,7 +112,8 @@ class FeatureClassifier(PassClassifier, Protocol):
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float64]:
-        """Return probabilities (b, classes) from features and context (b, inputs) of the points at `rows`."""
+        """Return probabilities (b, classes) from features and context (b, inputs) of the points at
+        `rows`."""
 
 
 class CloudClassifier(PassClassifier, Protocol):
@@ -130,7 +135,8 @@ class Block(NamedTuple):
 def weigh(
     p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None
 ) -> npt.NDArray[np.float64]:
-    """Multiply the probabilities (b, classes) of each class by its factor; None leaves them as they are."""
+    """Multiply the probabilities (b, classes) of each class by its factor; None leaves them as they
+    are."""
     if factors is None:
         return p
     p = p * factors

@@ -1,10 +1,13 @@
-"""Loading a model: read its file, check what it says of itself, and make the classifiers of its passes."""
+"""Loading a model: its file is read, what it says is checked, and its classifiers are made."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
+
+import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError, suggest
 from ..features.voxels import check_side
@@ -14,24 +17,26 @@ from .registry import classifier_of, preprocessing
 
 
 def load_model(path: str | os.PathLike) -> Model:
-    """Read a model file, or a shipped model by its name. Nothing in it is executed or believed unchecked.
+    """Read a model file, or a shipped model by its name. Nothing in it is executed.
 
-    The stages that it wants before it (``info["preparation"]``) are of a short list, with options in bounds.
+    The stages that it wants before it (``info["preparation"]``) are of a short list, with options
+    in bounds.
 
     Raises
     ------
     ModelError
-        The file is missing, damaged, of a newer version, not what it says, or asks for what no model may ask for.
+        The file is missing, damaged, of a newer version, contradicts itself, or asks for what no
+        model may ask for.
     """
     name = os.fspath(path)
     file = model_file.find(name)
     try:
-        model = assemble(*model_file.read(file, lambda name: classifier_of(name).rules))
-        if asked := model.info.get("preparation"):
-            model.info["preparation"] = preprocessing().check(asked)
+        model = assemble(*model_file.read(file, lambda kind: classifier_of(kind).rules))
+        if model.preparation:
+            model.info["preparation"] = preprocessing().check(model.preparation)
         return model
     except ModelError as error:
-        others = [one for one in model_file.shipped() if one != name]
+        others = [shipped for shipped in model_file.shipped() if shipped != name]
         near = "" if os.path.lexists(name) else suggest(name, others)
         error.cure = f"{near}{error.cure or model_file.CURE}"
         raise error.at(file) from error.__cause__
@@ -42,12 +47,12 @@ def load_model(path: str | os.PathLike) -> Model:
 
 
 def loaded_model(path: str) -> Model:
-    """The same, read once per process as long as the file stays the same."""
+    """Return a model that this process has loaded before, or load it; a changed file is read anew."""
     path = model_file.find(path)
     try:
         stat = os.stat(path)
     except (OSError, ValueError):  # the latter for a name that holds a null
-        return load_model(path)  # says what is wrong
+        return load_model(path)  # raises
     return _loaded(path, stat.st_mtime_ns, stat.st_size)
 
 
@@ -57,7 +62,7 @@ def _loaded(path: str, *stamp: int) -> Model:
 
 
 def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
-    """The model that a file's manifest and arrays describe; what they say is checked against each other."""
+    """Return the model of a manifest and arrays; ModelError where they contradict each other."""
     classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
     codes = [code for code, _ in classes]
     if sorted(set(codes)) != codes:
@@ -70,34 +75,40 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
         )
     passes, before = [], codes
     for number, entry in enumerate(manifest["passes"]):
-        own = entry.get("codes") or codes
-        if sorted(set(own)) != own or len(entry.get("factors") or own) != len(own):
-            raise ModelError(
-                "a pass's classes must ascend, each once, with one factor each", found=own[:10]
-            )
-        if (number > 0) != bool(entry["context"]):
-            raise ModelError(
-                "every pass but the first must read context", found=f"pass {number + 1}"
-            )
-        made: Any = classifier_of(entry["algorithm"]).from_file(entry, arrays[number], own)
-        if number and made.classes_before(own) != before:
-            raise ModelError(
-                "a pass reads other classes than the one before gives", found=f"pass {number + 1}"
-            )
-        before = own
-        importances = entry["importances"]
-        if importances is not None and len(importances) != len(entry["feature_names"]):
-            raise ModelError(
-                "the manifest's importances must have one value per feature", found=len(importances)
-            )
-        passes.append(made)
-    info = {
-        key: value for key, value in manifest.items() if key not in ("format", "version", "arrays")
-    }
+        own_codes = entry.get("codes") or codes
+        passes.append(_make_pass(entry, number, arrays[number], own_codes, before))
+        before = own_codes
+    if before != codes:
+        raise ModelError("the last pass has other classes than the model", found=before[:10])
+    info = {k: value for k, value in manifest.items() if k not in ("format", "version", "arrays")}
     scores = ("importances", "codes", "factors")
     info["passes"] = [
         {key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]
     ]
-    if before != codes:
-        raise ModelError("the last pass has other classes than the model", found=before[:10])
     return Model(tuple(passes), classes, info)
+
+
+def _make_pass(
+    entry: Mapping[str, Any],
+    number: int,
+    arrays: Mapping[str, npt.NDArray[Any]],
+    codes: list[int],
+    codes_before: list[int],
+) -> Any:
+    """Return the classifier of a pass, the `number`-th from 0, whose classes are `codes`."""
+    here = f"pass {number + 1}"
+    if sorted(set(codes)) != codes or len(entry.get("factors") or codes) != len(codes):
+        raise ModelError(
+            "a pass's classes must ascend, each once, with one factor each", found=codes[:10]
+        )
+    if (number > 0) != bool(entry["context"]):
+        raise ModelError("every pass but the first must read context", found=here)
+    classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, arrays, codes)
+    if number and classifier.classes_before(codes) != codes_before:
+        raise ModelError("a pass reads other classes than the one before gives", found=here)
+    importances = entry["importances"]
+    if importances is not None and len(importances) != len(entry["feature_names"]):
+        raise ModelError(
+            "the manifest's importances must have one value per feature", found=len(importances)
+        )
+    return classifier

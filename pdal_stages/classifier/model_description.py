@@ -1,4 +1,5 @@
-"""A model in words: classes, accuracy, what it reads and where that comes from, training, importances."""
+"""A model in words: classes, accuracy, what it reads and where that comes from, training,
+importances."""
 
 from __future__ import annotations
 
@@ -9,13 +10,15 @@ from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
 from ..features.neighborhoods import parse_neighborhoods
 from .calibration import Calibration
+from .context_features import CELLS, OWN, SEGMENTS
 from .interface import Column
 from .registry import REFINED_FOREST
 
 #: The dimension in which the command `train` numbers its files.
 FILE_NUMBER = "FileNumber"
-#: How many surveys a model's text names.
+#: Most surveys that the text names, and most inputs by importance.
 _SURVEYS = 40
+_TOP = 10
 #: Kind of neighborhood -> its words.
 _KINDS = {
     "cylinder": "vertical cylinder of {0:g} m radius",
@@ -33,7 +36,7 @@ GROUPINGS = ("column", "feature", "group", "neighborhood", "dimension")
 def importances(
     values: Sequence[float] | None, columns: Sequence[Column], by: str = "feature"
 ) -> dict[str, float]:
-    """See ``Model.importances``; one value per column."""
+    """Return importances by a grouping, see ``Model.importances``; `values` has one per column."""
     if by not in GROUPINGS:
         raise OptionError(
             "importances are grouped by something unknown", found=by, cure=f"One of {GROUPINGS}"
@@ -51,14 +54,24 @@ def importances(
 
 
 def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -> dict[str, Any]:
-    """A manifest for people: importances grouped, long tables left out; `columns` of each pass."""
+    """Return a manifest without long tables, and with importances by group.
+
+    Parameters
+    ----------
+    manifest : mapping
+    columns : sequence of sequence of Column
+        Inputs of each pass.
+    """
     passes = []
-    for entry, its in zip(manifest["passes"], columns, strict=True):
+    for entry, inputs in zip(manifest["passes"], columns, strict=True):
         kept = {k: v for k, v in entry.items() if k not in ("shape_bins", "importances")}
-        kept["features"] = by_neighborhood(its)
+        kept["features"] = by_neighborhood(inputs)
         if entry["importances"] is not None:
             kept["importances"] = {
-                by: {k: round(v, 6) for k, v in importances(entry["importances"], its, by).items()}
+                by: {
+                    name: round(share, 6)
+                    for name, share in importances(entry["importances"], inputs, by).items()
+                }
                 for by in GROUPINGS[1:]
             }
         passes.append(kept)
@@ -66,15 +79,15 @@ def describe(manifest: Mapping[str, Any], columns: Sequence[Sequence[Column]]) -
 
 
 def by_neighborhood(columns: Sequence[Column]) -> dict[str, list[str]]:
-    """Return token -> features of that neighborhood, without its suffix; a histogram's bins as one."""
-    found: dict[str, dict[str, int]] = {}
+    """Return the names of each neighborhood's features; the bins of a histogram are one."""
+    counts: dict[str, dict[str, int]] = {}
     for column in columns:
         if column.group not in ("dimension", "context"):
-            bins = found.setdefault(column.neighborhood, {})
+            bins = counts.setdefault(column.neighborhood, {})
             bins[column.feature] = bins.get(column.feature, 0) + 1
     return {
         token: [name if count == 1 else f"{name} ({count} bins)" for name, count in bins.items()]
-        for token, bins in found.items()
+        for token, bins in counts.items()
     }
 
 
@@ -84,39 +97,39 @@ def text(info: Mapping[str, Any]) -> str:
     several = len(info["passes"]) > 1
     every = list(enumerate(info["passes"], 1))
     # A base's own file describes its passes.
-    passes = [(number, one) for number, one in every if one["algorithm"] == REFINED_FOREST] or every
+    refined = [each for each in every if each[1]["algorithm"] == REFINED_FOREST]
+    passes = refined or every
     rows = [*_measured(info), *_inputs(info, passes), *_passes(passes, several), *_training(info)]
-    rows += [("warning", one) for one in info["outdated"]]
-    lines = [score(info), "", *(f"{name:<16}{said}".rstrip() for name, said in rows), ""]
+    rows += [("warning", warning) for warning in info["outdated"]]
+    lines = [score(info), "", *(f"{name:<16}{value}".rstrip() for name, value in rows), ""]
     lines += [*_classes(info), ""]
-    for number, one in passes:
-        for by in ("neighborhood", "group", "feature") if "importances" in one else ():
-            top = ", ".join(
-                f"{k} {100 * v:.1f} %" for k, v in list(one["importances"][by].items())[:10]
-            )
+    for number, entry in passes:
+        for by in ("neighborhood", "group", "feature") if "importances" in entry else ():
+            largest = list(entry["importances"][by].items())[:_TOP]
+            top = ", ".join(f"{name} {100 * share:.1f} %" for name, share in largest)
             lines.append(f"pass {number}: " * several + f"importance by {by:<13}{top}")
     return "\n".join(lines)
 
 
-#: Rows of the page: what they are called, what they hold.
+#: Rows of the page: heading and text.
 _Rows = list[tuple[str, str]]
 
 
 def _measured(info: Mapping[str, Any]) -> _Rows:
-    """Return how many points of ground that was held out were right, by the class they were given."""
+    """Return the share of right points on ground that was held out, by the class given."""
     if not info.get("sureness"):
         return []
-    known = Calibration.from_dict(info["sureness"])
-    shares = {code: known.accuracy([code]) for code in sorted(known.right)}
-    each = ", ".join(f"{code}: {_percent(share)}" for code, share in shares.items())
+    counts = Calibration.from_dict(info["sureness"])
+    shares = {code: counts.accuracy([code]) for code in sorted(counts.right)}
+    by_class = ", ".join(f"{code}: {_percent(share)}" for code, share in shares.items())
     return [
-        ("points right", f"{_percent(known.accuracy(known.right))}; of those given {each}"),
-        ("", f"measured on {known.about}"),
+        ("points right", f"{_percent(counts.accuracy(counts.right))}; of those given {by_class}"),
+        ("", f"measured on {counts.about}"),
     ]
 
 
 def _inputs(info: Mapping[str, Any], passes: Sequence[tuple[int, Mapping[str, Any]]]) -> _Rows:
-    """Return what the points must have, the stages that make it, and the features computed of it."""
+    """Return dimensions, preprocessing, features by neighborhood, and context."""
     versions = info.get("algorithms", {})
     rows = [("reads", ", ".join(["X, Y, Z", *info["required_dimensions"]]))]
     if info["optional_dimensions"]:
@@ -129,35 +142,53 @@ def _inputs(info: Mapping[str, Any], passes: Sequence[tuple[int, Mapping[str, An
     if info.get("by_hand"):
         rows.append(("preprocessing", f"{', '.join(info['by_hand'])}, which the file cannot carry"))
     tokens: dict[str, list[str]] = {}  # list of features -> neighborhoods that have it
-    for _, one in passes:
-        for token, names in one["features"].items():
+    for _, entry in passes:
+        for token, names in entry["features"].items():
             listed = ", ".join(names)
             if token in tokens.setdefault(listed, []):
                 continue
-            said = f"those of {tokens[listed][0]}" if tokens[listed] else listed
+            text = f"those of {tokens[listed][0]}" if tokens[listed] else listed
             tokens[listed].append(token)
-            rows.append(("features", f"{_describe(token)}: {len(names)} features, {said}"))
+            rows.append(("features", f"{_describe(token)}: {len(names)} features, {text}"))
     if tokens and "filters.multiscalefeatures" in versions:
         rows.append(("", f"version {versions['filters.multiscalefeatures']} of their algorithm"))
-    return rows
+    read = dict.fromkeys(token for _, entry in passes for token in entry["context"])
+    return rows + [("context", f"{token}, {_describe_context(token)}") for token in read]
+
+
+def _describe_context(token: str) -> str:
+    """Return a token of the context of a pass in words."""
+    if token == OWN:
+        return "probabilities of the pass before at the point itself"
+    if token.startswith(SEGMENTS):
+        return (
+            f"what the object of class {token.removeprefix(SEGMENTS)} in the point's cell is like"
+        )
+    word = max((word for word in CELLS if token.startswith(word)), key=len)
+    axes, votes = CELLS[word]
+    where = (
+        f"{'cells' if axes == 3 else 'columns'} of {token.removeprefix(word)} m around the point"
+    )
+    what = "share of points by class" if votes else "mean probabilities"
+    return f"{what} of the pass before in the {3**axes} {where}"
 
 
 def _describe(token: str) -> str:
-    (one,) = parse_neighborhoods(token)
-    return f"{token}, {_KINDS[one.kind].format(*one.parameters)}"
+    (neighborhood,) = parse_neighborhoods(token)
+    return f"{token}, {_KINDS[neighborhood.kind].format(*neighborhood.parameters)}"
 
 
 def _passes(passes: Sequence[tuple[int, Mapping[str, Any]]], several: bool) -> _Rows:
     """Return the size of each classifier and how many columns of which kind it reads."""
     rows = []
-    for number, one in passes:
-        sizes = [f"{v:,} {k}" for k, v in one["parameters"].items() if isinstance(v, int)]
-        said = f"{one['algorithm'].replace('_', ' ')}, {', '.join(sizes)}"
-        features = sum(map(len, one["features"].values()))
-        said += f"; reads {features} features, {len(one['dimensions'])} dimensions"
-        if one["context"]:
-            said += f" and, of the pass before, {' '.join(one['context'])}"
-        rows.append((f"pass {number}" if several else "classifier", said))
+    for number, entry in passes:
+        sizes = [f"{v:,} {k}" for k, v in entry["parameters"].items() if isinstance(v, int)]
+        text = f"{entry['algorithm'].replace('_', ' ')}, {', '.join(sizes)}"
+        features = sum(map(len, entry["features"].values()))
+        text += f"; reads {features} features, {len(entry['dimensions'])} dimensions"
+        if entry["context"]:
+            text += f" and, of the pass before, {' '.join(entry['context'])}"
+        rows.append((f"pass {number}" if several else "classifier", text))
     return rows
 
 
@@ -190,7 +221,7 @@ def _training(info: Mapping[str, Any]) -> _Rows:
         ("strategy", info["strategy"] == "binary", binary),
         ("written by", info["created_by"].get("pdal_stages"), "pdal_stages {0}"),
     ]
-    return [(name, said.format(value)) for name, value, said in rows if value]
+    return [(name, text.format(value)) for name, value, text in rows if value]
 
 
 def _classes(info: Mapping[str, Any]) -> list[str]:
@@ -208,14 +239,13 @@ def _classes(info: Mapping[str, Any]) -> list[str]:
 
 
 def range_text(densities: Mapping[str, float]) -> str:
-    """``0.3 to 46``, or one number where both are alike."""
-    return " to ".join(
-        dict.fromkeys(f"{densities[one]:.3g}" for one in ("low", "high") if densities)
-    )
+    """Return ``0.3 to 46``, or one number where both are alike; empty for an empty mapping."""
+    ends = (f"{densities[end]:.3g}" for end in ("low", "high") if densities)
+    return " to ".join(dict.fromkeys(ends))
 
 
 def _in_one_line(value: Any) -> Any:
-    """Names come from files and people: none of them may look like lines of ours."""
+    """Escape line breaks in all texts: names come from files, and must not look like rows."""
     if isinstance(value, str):
         return one_line(value)
     if isinstance(value, Mapping):
@@ -224,22 +254,28 @@ def _in_one_line(value: Any) -> Any:
 
 
 def held_out(info: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The figures on ground that was held out: a network's own, or those of the cross-validation; empty without."""
+    """Return the scores on ground that was held out; empty where there are none.
+
+    A network has its own; a forest has those of the cross-validation.
+    """
     if info.get("teacher"):
         return {}
-    own = info["training"].get("held_out")
+    of_network = info["training"].get("held_out")
     crossed = info["accuracy"]["cross_validation"]
-    return own if isinstance(own, dict) else crossed["chosen"] if crossed else {}
+    return of_network if isinstance(of_network, dict) else crossed["chosen"] if crossed else {}
 
 
 def score(info: Mapping[str, Any]) -> str:
-    """The score in a line, or why there is none."""
+    """Return the score in a line, or why there is none."""
     if teacher := info.get("teacher"):
-        return f"not scored     its labels are answers of {teacher['name']}; only labels of your own tell how right it is"
+        return (
+            f"not scored     its labels are answers of {teacher['name']}; only labels of your own "
+            "tell how right it is"
+        )
     row = held_out(info)
     if not row and info.get("sureness"):
-        known = Calibration.from_dict(info["sureness"])
-        share = _percent(known.accuracy(known.right))
+        counts = Calibration.from_dict(info["sureness"])
+        share = _percent(counts.accuracy(counts.right))
         return f"measured       {share} of points right, on ground it had not seen"
     if not row:
         why = "no score in the file (the shipped model: docs/models.md)"
@@ -253,7 +289,7 @@ def score(info: Mapping[str, Any]) -> str:
 
 
 def groups_word(dimension: str) -> str:
-    """What the values of a dimension of groups stand for."""
+    """Return the word for the groups that a dimension numbers."""
     return "files" if dimension == FILE_NUMBER else dimension
 
 

@@ -1,7 +1,9 @@
-"""The model file: one zip of a manifest and arrays, written whole or not at all, read with distrust.
+"""The model file: one zip of a manifest and arrays, written whole or not at all, read with
+distrust.
 
-Nothing from a file is ever executed. What a file declares is held against the size of the file itself
-before anything is allocated, so a hostile one costs bounded time and memory. See docs/model-file.md.
+Nothing from a file is ever executed. What a file declares is held against the size of the file
+itself before anything is allocated, so a hostile one costs bounded time and memory. See
+docs/model-file.md.
 """
 
 from __future__ import annotations
@@ -59,7 +61,8 @@ def shipped() -> dict[str, Path]:
 
 
 def find(name: str) -> str:
-    """The file of a model: of a shipped one by its name; a file in the current folder that is called so is ``./name``.
+    """The file of a model: of a shipped one by its name; a file in the current folder that is
+    called so is ``./name``.
 
     So what is run does not depend on what lies in the folder, which others may write to.
     """
@@ -79,8 +82,8 @@ def write(
 ) -> None:
     """Write a model file; an existing one stays as it was until the new one is complete.
 
-    The same model always gives the same bytes: no date, no path and no host is stored. The manifest is whole but for
-    ``arrays``; `passes` has the arrays of each pass by their names.
+    The same model always gives the same bytes: no date, no path and no host is stored. The manifest
+    is whole but for ``arrays``; `passes` has the arrays of each pass by their names.
     """
     members: dict[str, bytes] = {}
     table = {}
@@ -229,8 +232,8 @@ def to_bytes(array: npt.NDArray[Any]) -> bytes:
 def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
     """The array in ``.npy`` bytes, if it is what `rule` says; a view of `data`, read-only.
 
-    NumPy's reader is not used for the values because it allocates what a header says: here an array's size must be
-    that of the bytes.
+    NumPy's reader is not used for the values because it allocates what a header says: here an
+    array's size must be that of the bytes.
     """
     stream = io.BytesIO(data)
     try:
@@ -241,7 +244,8 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
             raise ValueError(f"shape {shape}")
         if fortran or dtype.str not in rule.dtypes or len(shape) != rule.ndim:
             raise ValueError(
-                f"{dtype.str} {shape}, not {' or '.join(rule.dtypes)} with {rule.ndim} axes in C order"
+                f"{dtype.str} {shape}, not {' or '.join(rule.dtypes)} with {rule.ndim} axes in C "
+                "order"
             )
         rest = len(data) - stream.tell()
         if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != rest:
@@ -255,7 +259,8 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
 
 
 def parse(data: bytes, own: bool = False) -> dict[str, Any]:
-    """The manifest in `data`, valid by its schema; `own` ones, which came with the package, are known to be."""
+    """The manifest in `data`, valid by its schema; `own` ones, which came with the package, are
+    known to be."""
     try:
         manifest = strict_json(data.decode("utf-8"))
     except RecursionError:

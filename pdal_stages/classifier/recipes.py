@@ -1,7 +1,9 @@
-"""Recipes of training: what a paper says of its experiment, or what a kind of scan needs, as options, by one word.
+"""Recipes of training: what a paper says of its experiment, or what a kind of scan needs, as
+options, by one word.
 
-Each option has the value that the paper gives and where it says so. ``not stated`` marks what the paper leaves open and what
-this package takes instead; an option that is not listed has its default. Options given beside a recipe replace its values.
+Each option has the value that the paper gives and where it says so. ``not stated`` marks what the
+paper leaves open and what this package takes instead; an option that is not listed has its default.
+Options given beside a recipe replace its values.
 """
 
 from __future__ import annotations
@@ -128,7 +130,8 @@ RECIPES: dict[str, Recipe] = {
     ),
 }
 
-#: Recipes that no paper gives. Chosen on the validation cloud of Oakland 3-D, where the defaults leave poles and wires out.
+#: Recipes that no paper gives. Chosen on the validation cloud of Oakland 3-D, where the defaults
+#: leave poles and wires out.
 RECIPES["mobile"] = Recipe(
     "scans from vehicles",
     {
@@ -143,7 +146,8 @@ RECIPES["mobile"] = Recipe(
 
 
 def with_recipe(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options with those of the recipe that they name filled in; OptionError for a word that is none.
+    """Return options with those of the recipe that they name filled in; OptionError for a word that
+    is none.
 
     Options of the network are merged one by one.
     """

@@ -1,6 +1,6 @@
-"""A forest on top of a trained model: classes that only the base knows keep its probability.
+"""A forest that refines a trained model, its base: classes that only the base knows stay.
 
-Of the other classes the forest is believed the more, the more labels it was trained on.
+Of the other classes the forest counts the more, the more labels it was trained on.
 """
 
 from __future__ import annotations
@@ -15,108 +15,132 @@ import numpy.typing as npt
 from ..base.errors import ModelError
 from .interface import weigh
 
-#: As many labeled points of its rarest class count as much as the base.
+#: Labeled points of the rarest class with which a forest counts as much as its base.
 EVEN = 30
-#: Probabilities that cannot be divided by.
-NOTHING = 1e-300
+#: Least sum of probabilities that is divided by.
+_SMALLEST = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """What is said before and what a forest on top says, as one."""
+    """How the probabilities of the pass before and those of a forest become one."""
 
     before: tuple[int, ...]  #: classes of the pass before
-    labeled: tuple[int, ...]  #: those the forest was trained on, in the order of its columns
-    #: 0: the forest counts for nothing where the base knows the class; 1: the base for nothing among the labeled
+    labeled: tuple[int, ...]  #: classes of the forest, in the order of its columns
+    #: weight of the forest, 0 to 1, where both know a class; the base has the rest
     trusted: float = 1.0
-    #: with the binary strategy, the class that alone is changed; the other of `labeled` is everything else
+    #: with the binary strategy the one class that is changed; the other one of `labeled` is all else
     target: int | None = None
-    #: what the forest's classes are multiplied by for being frequent
+    #: factors of the forest's probabilities by the classes' frequency
     factors: tuple[float, ...] | None = None
 
     @classmethod
-    def from_dict(cls, said: Mapping[str, Any], codes: Sequence[int]) -> Blend:
-        """From what a manifest says of a pass whose classes are `codes`; ModelError where it contradicts itself."""
-        factors = said.get("factors")
-        made = cls(
-            tuple(said["before"]),
-            tuple(said["labeled"]),
-            float(said["trusted"]),
-            said.get("target"),
+    def from_dict(cls, entry: Mapping[str, Any], codes: Sequence[int]) -> Blend:
+        """Return the blend that a manifest describes for a pass whose classes are `codes`.
+
+        ModelError where its classes contradict each other.
+        """
+        factors = entry.get("factors")
+        blend = cls(
+            tuple(entry["before"]),
+            tuple(entry["labeled"]),
+            float(entry["trusted"]),
+            entry.get("target"),
             None if factors is None else tuple(map(float, factors)),
         )
-        labeled, target = made.labeled, made.target
-        good = made.codes == list(codes) and len(made.factors or labeled) == len(labeled)
-        good &= all(sorted(set(one)) == list(one) for one in (made.before, labeled))
+        labeled, target = blend.labeled, blend.target
+        good = blend.codes == list(codes) and len(blend.factors or labeled) == len(labeled)
+        good &= all(sorted(set(each)) == list(each) for each in (blend.before, labeled))
         if not good or (target is not None and (target not in labeled or len(labeled) != 2)):
             raise ModelError(
-                "a refined forest's classes do not fit each other", found=str(said)[:100]
+                "a refined forest's classes do not fit each other", found=str(entry)[:100]
             )
-        return made
+        return blend
 
     def to_dict(self) -> dict[str, Any]:
-        """As a manifest has it."""
-        said = {"before": list(self.before), "labeled": list(self.labeled), "trusted": self.trusted}
-        return (
-            said
-            | ({"factors": list(self.factors)} if self.factors else {})
-            | {"target": self.target}
-        )
+        """Return the entry of a manifest."""
+        classes = {"before": list(self.before), "labeled": list(self.labeled)}
+        factors = {"factors": list(self.factors)} if self.factors else {}
+        return {**classes, "trusted": self.trusted, **factors, "target": self.target}
 
     @property
     def codes(self) -> list[int]:
-        """The classes that come out."""
+        """Classes of the result."""
         return sorted({*self.before, *(self.labeled if self.target is None else (self.target,))})
 
     def __call__(
-        self, said: npt.NDArray[np.float64], grown: npt.NDArray[np.float64]
+        self, base: npt.NDArray[np.float64], forest: npt.NDArray[np.float64]
     ) -> npt.NDArray[np.float64]:
-        """Probabilities (n, classes) of ``codes`` from those of `before` and those the forest gives to `labeled`.
+        """Return probabilities (n, classes) in the order of :attr:`codes`.
 
-        Classes that only the base knows keep its probability. The rest is shared among the labeled ones.
+        Parameters
+        ----------
+        base : (n, before) float64
+            Probabilities of the pass before. Classes that only it knows keep theirs, and the
+            labeled ones share the rest.
+        forest : (n, labeled) float64
+            Probabilities of the forest.
         """
-        grown = weigh(grown, None if self.factors is None else np.array(self.factors))
-        target, trusted, codes = self.target, self.trusted, self.codes
-        counted = list(self.labeled) if target is None else [target]
-        out = np.zeros((len(said), len(codes)))
-        out[:, np.searchsorted(codes, self.before)] = said
-        at = np.searchsorted(codes, counted)
-        if target is not None:
-            mine = grown[:, list(self.labeled).index(target)]
-            if target in self.before:
-                mine = trusted * mine + (1.0 - trusted) * out[:, at[0]]
-            out[:, at] = 0.0
-            rest = out.sum(axis=1)  # where the base knows of nothing else it stays the target
-            mine = np.where(rest > NOTHING, mine, 1.0)
-            out *= ((1.0 - mine) / np.maximum(rest, NOTHING))[:, None]
-            out[:, at[0]] = mine
-            return out
-        theirs = out[:, at]
-        share = theirs.sum(axis=1, keepdims=True)
-        known = np.where(share > 0, theirs / np.maximum(share, NOTHING), grown)
-        kept = np.delete(out, at, axis=1).sum(axis=1, keepdims=True)
-        out[:, at] = np.maximum(1.0 - kept, 0.0) * (trusted * grown + (1.0 - trusted) * known)
+        forest = weigh(forest, None if self.factors is None else np.array(self.factors))
+        out = np.zeros((len(base), len(self.codes)))
+        out[:, np.searchsorted(self.codes, self.before)] = base
+        if self.target is not None:
+            by_forest = forest[:, self.labeled.index(self.target)]
+            return self._change_target(out, self.codes.index(self.target), by_forest)
+        columns = np.searchsorted(self.codes, self.labeled)
+        by_base = out[:, columns]
+        share = by_base.sum(axis=1, keepdims=True)
+        by_base = np.where(share > 0, by_base / np.maximum(share, _SMALLEST), forest)
+        kept = np.delete(out, columns, axis=1).sum(axis=1, keepdims=True)
+        mixed = self.trusted * forest + (1.0 - self.trusted) * by_base
+        out[:, columns] = np.maximum(1.0 - kept, 0.0) * mixed
+        return out
+
+    def _change_target(
+        self, out: npt.NDArray[np.float64], column: int, target: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
+        """Give a column of `out` the forest's probabilities (n,), and the others the rest."""
+        if self.target in self.before:
+            target = self.trusted * target + (1.0 - self.trusted) * out[:, column]
+        out[:, column] = 0.0
+        rest = out.sum(axis=1)
+        target = np.where(rest > _SMALLEST, target, 1.0)  # the base knows of nothing else there
+        out *= ((1.0 - target) / np.maximum(rest, _SMALLEST))[:, None]
+        out[:, column] = target
         return out
 
 
 def trust(labels: int) -> float:
-    """How far the forest is believed beside the base, 0 to 1, by the labeled points of its rarest class."""
+    """Return the weight of a forest beside its base, by the labeled points of its rarest class."""
     return labels / (labels + EVEN)
 
 
-def on_top(
+def describe_refinement(
     base: Any, info: Mapping[str, Any], names: Mapping[int, str], codes: Sequence[int]
 ) -> dict[str, Any]:
-    """What a model of a base's passes and others on top says of itself.
+    """Return the manifest's entries for a model that is a base's passes and others on top.
 
-    `info` is what training on top would say alone; `names` are those of the classes `codes`, which come out of the last.
+    Parameters
+    ----------
+    base : Model
+    info : mapping
+        The entries that training of the passes on top gives alone.
+    names : mapping of int to str
+        Name of each class.
+    codes : sequence of int
+        Classes of the last pass.
     """
-    entries = {one["code"]: one for one in info["classes"]}
-    unseen = {"available": 0, "samples": 0, "duplicates": 0}
-    inherited = {one["code"]: {"labels": one["labels"]} for one in base.info["classes"]}
+    counts = {"available": 0, "samples": 0, "duplicates": 0}
+    inherited = {entry["code"]: {"labels": entry["labels"]} for entry in base.info["classes"]}
+    trained = {entry["code"]: entry for entry in info["classes"]}
+    classes = [
+        {**counts, **inherited.get(code, {}), **trained.get(code, {})}
+        | {"code": code, "name": names[code]}
+        for code in codes
+    ]
     scores = [
-        {**one, "codes": codes}
-        for codes, one in zip(base.codes_of, base.info["passes"], strict=True)
+        {**entry, "codes": own_codes}
+        for own_codes, entry in zip(base.codes_of, base.info["passes"], strict=True)
     ]
     if base.factors is not None:
         scores[-1]["factors"] = base.factors.tolist()
@@ -129,19 +153,10 @@ def on_top(
         "strategy": "multiclass",
         "target": None,
         "background": None,
-        "classes": [
-            {
-                **unseen,
-                **inherited.get(code, {}),
-                **entries.get(code, {}),
-                "code": code,
-                "name": names[code],
-            }
-            for code in codes
-        ],
+        "classes": classes,
         "priors": None,
         "densities": densities,
-        "preparation": base.info.get("preparation") or [],
+        "preparation": base.preparation,
         "algorithms": base.info.get("algorithms", {}),
         "passes": [*scores, *info["passes"]],
     }

@@ -1,8 +1,9 @@
 """Registry of what the rooms above offer to models: kinds of classifiers, and preprocessing.
 
-Imports only go downward, so this room cannot import the network or the stages of pipelines. Such a room registers itself
-in its ``__init__``, which the package's own ``__init__`` imports. What it registers are functions that import the
-implementation when it is first needed, so that a forest is applied without the network's modules.
+Imports only go downward, so this room cannot import the network or the stages of pipelines. Such a
+room registers itself in its ``__init__``, which the package's own ``__init__`` imports. What it
+registers are functions that import the implementation when it is first needed, so that a forest is
+applied without the network's modules.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ FOREST, REFINED_FOREST = "random_forest", "refined_forest"
 class Trainer(Protocol):
     """Module that trains one kind of classifier."""
 
-    #: dimensions that training uses where the points have them -> the dimensions that each is computed from
+    #: dimensions that training uses where the points have them -> the dimensions that each is
+    #: computed from
     optional_inputs: Mapping[str, tuple[str, ...]]
 
     def own_options(self, given: Any) -> Any:
@@ -48,7 +50,8 @@ class Trainer(Protocol):
 
 
 class Preprocessing(Protocol):
-    """Module that knows the stages that compute what a model reads, such as heights above ground."""
+    """Module that knows the stages that compute what a model reads, such as heights above
+    ground."""
 
     def check(self, preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Return the stages in one spelling; ModelError for one that no model may carry."""
@@ -87,7 +90,8 @@ def register_kind(
 
 
 def register_preprocessing(load: Callable[[], Preprocessing]) -> None:
-    """Register the module that knows the stages which compute a model's dimensions; the last one counts."""
+    """Register the module that knows the stages which compute a model's dimensions; the last one
+    counts."""
     _preprocessing.append(load)
 
 

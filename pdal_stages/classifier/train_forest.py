@@ -28,7 +28,7 @@ from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dim
 from .interface import PredictRequest, weigh
 from .model import Model
 from .random_forest import Forest, grow_forest
-from .refinement import Blend, on_top, trust
+from .refinement import Blend, describe_refinement, trust
 from .sampling import BLOCK, Folds, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
@@ -227,7 +227,9 @@ class _ForestTraining:
         codes = self._codes_after(o.passes - 1)
         names |= dict(base.classes)
         classes = [(code, names[code]) for code in codes]
-        return Model((*base.passes, *forests), classes, on_top(base, info, names, codes))
+        return Model(
+            (*base.passes, *forests), classes, describe_refinement(base, info, names, codes)
+        )
 
     def _codes_after(self, number: int) -> Sequence[int]:
         """The classes of a pass."""

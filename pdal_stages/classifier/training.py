@@ -35,17 +35,19 @@ def train(
     Parameters
     ----------
     clouds : (n, 3) array, TrainingCloud, or iterable of TrainingCloud
-        Coordinates in meters of points that have `labels`; or one cloud per file or view. Features see only their own
-        cloud. Of anything but a list or tuple one cloud at a time is in memory; all are kept in `folder` while training
-        lasts. With tiles (:meth:`TiledCloud.clouds`, as far around as :func:`reach` says) the model is that of the whole
-        cloud, but for points whose nearest neighbors lie farther away, and for thinned copies, which follow the density of
-        each tile.
+        Coordinates in meters of points that have `labels`; or one cloud per file or view. Features
+        see only their own cloud. Of anything but a list or tuple one cloud at a time is in memory;
+        all are kept in `folder` while training lasts. With tiles (:meth:`TiledCloud.clouds`, as far
+        around as :func:`reach` says) the model is that of the whole cloud, but for points whose
+        nearest neighbors lie farther away, and for thinned copies, which follow the density of each
+        tile.
     labels : (n,) int, optional
         Class codes, with coordinates; the options may stand here otherwise.
     options : TrainingOptions
     dimensions : mapping, optional
-        With coordinates: name to (n,) values, as the options' `dimensions` need. Without, heights are made of the
-        coordinates as ``filters.hag_morphological`` makes them, and the model knows how.
+        With coordinates: name to (n,) values, as the options' `dimensions` need. Without, heights
+        are made of the coordinates as ``filters.hag_morphological`` makes them, and the model knows
+        how.
     folder : Path, optional
         Instead of a temporary one.
     progress : bool
@@ -68,51 +70,51 @@ def train(
                 found=f"shape {np.shape(labels)}",
             )
         if dimensions is None:
-            dimensions, options, preparation = _prepared(xyz, labels, options)
-        sources = [TrainingCloud(xyz, labels, dimensions)]
-    with tempfile.TemporaryDirectory(prefix="pdal-stages-") as temporary:
-        each = prepared(sources, options)
-        made = (
-            list(each)
-            if isinstance(sources, list | tuple)
-            else spooled(each, folder or Path(temporary))
-        )
-        made = [one for one in made if one.points]
-        if not made:
-            left_out = ", ".join(map(str, options.ignore))
-            raise OptionError(
-                "there are no points to train on",
-                cure=f"Give some; those of labels {left_out} are left out ('ignore') unless 'classes' names them",
+            options = _use_default_dimensions(options)
+            preparation = preprocessing().preparation_of(required_dimensions(options.inputs))
+            usable = ~np.isin(np.asarray(labels), options.ignore)
+            dimensions = preprocessing().made_of_coordinates(
+                preparation, xyz, usable, options.threads
             )
-        model = trainer_of(options.algorithm).train(made, options, progress)
+        sources = [TrainingCloud(xyz, labels, dimensions)]
+    model = _train_prepared(sources, options, folder, progress)
     if options.base is None:
         model.record_preprocessing(preparation)
     return model
 
 
+def _use_default_dimensions(options: TrainingOptions) -> TrainingOptions:
+    """Return options with the optional dimensions of the kind, where the defaults are asked for."""
+    if tuple(options.dimensions) != DEFAULT_DIMENSIONS:
+        return options
+    supported = trainer_of(options.algorithm).optional_inputs
+    more = (name for name in OPTIONAL_DIMENSIONS if name in supported)
+    return replace(options, dimensions=(*DEFAULT_DIMENSIONS, *more))
+
+
+def _train_prepared(
+    sources: Iterable[TrainingCloud], options: TrainingOptions, folder: Path | None, progress: bool
+) -> Model:
+    """Train on the clouds without ignored points; those of an iterator are kept in files."""
+    with tempfile.TemporaryDirectory(prefix="pdal-stages-") as temporary:
+        clouds: Iterable[TrainingCloud] = prepared(sources, options)
+        if not isinstance(sources, list | tuple):
+            clouds = spooled(clouds, folder or Path(temporary))
+        usable = [cloud for cloud in clouds if cloud.points]
+        if not usable:
+            left_out = ", ".join(map(str, options.ignore))
+            raise OptionError(
+                "there are no points to train on",
+                cure=f"Give some; those of labels {left_out} are left out ('ignore') unless "
+                "'classes' names them",
+            )
+        return trainer_of(options.algorithm).train(usable, options, progress)
+
+
 def reach(options: TrainingOptions) -> float:
-    """Meters around a tile whose points training on it depends on."""
+    """Return the meters around a tile whose points training on the tile depends on."""
     halo, context = feature_plan(options).halo_m, Context(tuple(options.context)).reach
     passes = options.passes - 1
     if options.base is not None:
         halo, passes = max(halo, options.base.plan.halo_m), options.passes
     return halo + passes * context + 2.0 * options.voxel
-
-
-def _prepared(
-    xyz: npt.NDArray[np.float64], labels: npt.ArrayLike, options: TrainingOptions
-) -> tuple[dict[str, npt.NDArray[Any]], TrainingOptions, list[dict[str, Any]]]:
-    """Heights of bare points, the options that use them, and the stage that makes them."""
-    if tuple(options.dimensions) == DEFAULT_DIMENSIONS:
-        more = trainer_of(options.algorithm).optional_inputs
-        options = replace(
-            options,
-            dimensions=(
-                *DEFAULT_DIMENSIONS,
-                *(name for name in OPTIONAL_DIMENSIONS if name in more),
-            ),
-        )
-    preparation = preprocessing().preparation_of(required_dimensions(options.inputs))
-    usable = ~np.isin(np.asarray(labels), options.ignore)
-    made = preprocessing().made_of_coordinates(preparation, xyz, usable, options.threads)
-    return made, options, preparation

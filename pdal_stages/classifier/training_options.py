@@ -20,18 +20,78 @@ from ..features.voxels import LARGEST, check_side
 from .class_map import MAX_LABEL
 from .context_features import OWN, Context
 from .recipes import with_recipe
-from .registry import kinds, trainer_of
+from .registry import FOREST, kinds, trainer_of
 
 #: Most passes a model can have.
 MOST_PASSES = 3
-#: Where `max_samples` is not given a tree draws a third of the samples, on average at least and at most so many of a class.
-LEAST_PER_TREE, PER_TREE = 1_000, 10_000
-#: How many it has by default, and on top of a base, where labels are few.
-DEFAULT_PASSES, PASSES_ON_BASE = 2, 1
-#: What passes after the first read of the surroundings.
+#: Without `max_samples` a tree draws a third of the samples of a class, on average at least so many
+LEAST_PER_TREE = 1_000
+#: and at most so many.
+PER_TREE = 10_000
+#: Passes by default.
+DEFAULT_PASSES = 2
+#: Passes by default on top of a base, where labels are few.
+PASSES_ON_BASE = 1
+#: Context of passes after the first by default.
 DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8")
-#: The same of a forest on top of a base.
+#: Context of a single pass on top of a base by default.
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
+
+
+def _listed(value: Any) -> list[Any]:
+    """Return a list; a number is a list of one."""
+    return [value] if isinstance(value, int | float) else list(value)
+
+
+def _check_densities(what: str, value: Any) -> tuple[float, ...]:
+    return tuple(checks.number(what, each, 0, 10**6, above=True) for each in _listed(value))
+
+
+def _check_labels(what: str, value: Any) -> tuple[int, ...]:
+    return tuple(checks.whole(what, each, 0, MAX_LABEL) for each in _listed(value))
+
+
+def _check_tree_numbers(what: str, value: Any) -> tuple[int, ...]:
+    return tuple(sorted({checks.whole(what, each, 1, 10_000) for each in _listed(value)}))
+
+
+def _check_name(what: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise OptionError(f"{what} must be the name of a dimension", found=repr(value)[:60])
+    return value
+
+
+def _check_folds(what: str, value: Any) -> int:
+    if (folds := checks.whole(what, value, 0, 1000)) == 1:
+        raise OptionError(f"{what} must be 0 or at least 2", found=1)
+    return folds
+
+
+def _check_voxel(what: str, value: Any) -> float:
+    return check_side(checks.number(what, value, 0, LARGEST, unit="m"))
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 1)
+
+
+def _check_max_features(what: str, value: Any) -> Any:
+    is_share = isinstance(value, float | np.floating) and 0.0 < value <= 1.0
+    is_word = isinstance(value, str) and value in ("auto", "sqrt", "log2")
+    if not (is_share or is_word or _is_count(value)):
+        raise OptionError(
+            f"{what} must be auto, sqrt, log2, a number of features, or a share up to 1.0",
+            found=repr(value),
+        )
+    return value
+
+
+def _check_max_depth(what: str, value: Any) -> Any:
+    if not (_is_count(value) or (isinstance(value, str) and value == "sqrt")):
+        raise OptionError(
+            f"{what} must be a whole number of at least 1, or sqrt", found=repr(value)
+        )
+    return value
 
 
 @dataclass(frozen=True)
@@ -41,24 +101,28 @@ class TrainingOptions(Settings):
     neighborhoods: Any = setting(
         ("s5", "k10", "k20", "k50"),
         "list",
-        "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, weinmann2018, he2017)",
+        "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, "
+        "weinmann2018, he2017)",
     )
     feature_set: Any = setting(
         ("covariance", "Verticality", "HeightRange", "HeightStd", "HeightAboveLowest"),
         "list",
-        "Groups (covariance, geometric, shapes, surfaces, all) or single features. 'all' is the papers' set",
+        "Groups (covariance, geometric, shapes, surfaces, all) or single features. 'all' is the "
+        "papers' set",
     )
     dimensions: Sequence[str] = setting(
         ("HeightAboveGround",),
         "list",
-        "Dimensions of the points to use as features as well, e.g. HeightAboveGround, Intensity, or returns (all return "
-        "features)",
+        "Dimensions of the points to use as features as well, e.g. HeightAboveGround, Intensity, "
+        "or returns (all return features)",
+        check=checks.names,
     )
     classes: Any = setting(
         None,
         "mapping",
-        'Class codes, e.g. 2,5,6, or labels and their classes: {"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: '
-        "every label but 0, 1, 7, 12 and 18, and these where the base has them",
+        "Class codes, e.g. 2,5,6, or labels and their classes: "
+        '{"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: every label but 0, 1, 7, 12 '
+        "and 18, and these where the base has them",
     )
     strategy: str = setting(
         "multiclass",
@@ -80,7 +144,8 @@ class TrainingOptions(Settings):
     sampling: str = setting(
         "spread",
         "string",
-        "How samples are drawn: spread evenly over the ground, or at random from all points of a class",
+        "How samples are drawn: spread evenly over the ground, or at random from all points of a "
+        "class",
         choices=("spread", "random"),
     )
     seed: int = setting(
@@ -91,11 +156,14 @@ class TrainingOptions(Settings):
         (),
         "numbers",
         "Numbers of trees to choose from by out-of-bag accuracy on the samples, instead of 'trees'",
+        check=_check_tree_numbers,
     )
     max_depth: str | int | None = setting(
         None,
         "string",
-        "Maximum depth of a tree: a number, or sqrt for the root of the number of features; default: no limit",
+        "Maximum depth of a tree: a number, or sqrt for the root of the number of features; "
+        "default: no limit",
+        check=_check_max_depth,
     )
     vote: str = setting(
         "mean",
@@ -106,21 +174,24 @@ class TrainingOptions(Settings):
     scaling: str = setting(
         "none",
         "string",
-        "percentiles: limit shape measures and heights to their 1st and 99th percentile among the samples, which is "
+        "percentiles: limit shape measures and heights to their 1st and 99th percentile among the "
+        "samples, which is "
         "what scaling to [0, 1] changes for trees",
         choices=("none", "percentiles"),
     )
     copt_threshold: float | None = setting(
         None,
         "number",
-        "Curvature from which on copt treats a point as scattered; default: by 2-means over the training clouds",
+        "Curvature from which on copt treats a point as scattered; default: by 2-means over the "
+        "training clouds",
         *(0, 1),
     )
     min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", 1, 10**6)
     max_samples: float | None = setting(
         None,
         "number",
-        f"Share of the samples drawn for each tree; default: a third, on average {LEAST_PER_TREE:,} to {PER_TREE:,} of each "
+        "Share of the samples drawn for each tree; default: a third, on average "
+        f"{LEAST_PER_TREE:,} to {PER_TREE:,} of each "
         "class",
         *(0, 1),
         exclusive=True,
@@ -128,59 +199,76 @@ class TrainingOptions(Settings):
     max_features: str | int | float = setting(
         "auto",
         "string",
-        "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a number or a share",
+        "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a "
+        "number or a share",
+        check=_check_max_features,
     )
     prior_weight: float = setting(
         0.2,
         "number",
-        "Weight of class frequency, from 0 (all equally frequent, as sampled) to 1 (as in the training points)",
+        "Weight of class frequency, from 0 (all equally frequent, as sampled) to 1 (as in the "
+        "training points)",
         *(0, 1),
     )
     thin: Sequence[float] = setting(
         (),
         "numbers",
-        "Densities of thinned copies to train on as well, points/m2, so that the model also works on sparse clouds",
+        "Densities of thinned copies to train on as well, points/m2, so that the model also works "
+        "on sparse clouds",
+        check=_check_densities,
     )
     voxel: float = setting(
         0.125,
         "number",
-        "Voxel size: in training and classifying one point represents each voxel, the others get its class; 0 for none",
+        "Voxel size: in training and classifying one point represents each voxel, the others get "
+        "its class; 0 for none",
         *(0, LARGEST),
         unit="m",
+        check=_check_voxel,
     )
     ignore: Sequence[int] = setting(
         NOISE,
         "list",
-        "Labels of points to leave out, even as neighbors, unless 'classes' names them; default: noise",
+        "Labels of points to leave out, even as neighbors, unless 'classes' names them; default: "
+        "noise",
+        check=_check_labels,
     )
     folds: int | None = setting(
         None,
         "integer",
-        "Folds of cross-validation by group, survey or block of ground; 0 for none; default: 5, with a quarter of the trees",
+        "Folds of cross-validation by group, survey or block of ground; 0 for none; default: 5, "
+        "with a quarter of the trees",
         *(0, 1000),
+        check=_check_folds,
     )
     groups: str = setting(
         "",
         "string",
-        "Dimension, such as the number of a tile or flight, whose points of the same value are held out together, so that "
+        "Dimension, such as the number of a tile or flight, whose points of the same value are "
+        "held out together, so that "
         "the score is for tiles or flights that the model has not seen",
+        check=_check_name,
     )
     passes: Any = setting(
         None,
         "integer",
-        "Number of forests in succession, each using what the previous one found around a point; default 2, or 1 on a base",
+        "Number of forests in succession, each using what the previous one found around a point; "
+        "default 2, or 1 on a base",
         *(1, MOST_PASSES),
     )
     context: Any = setting(
         None,
         "list",
-        "What passes after the first use: own, or box, boxvotes, column, columnvotes and a cell size (box0.5); default: "
-        f"{','.join(DEFAULT_CONTEXT)}; with a base {','.join(CONTEXT_OF_BASE)}, or for several passes own and the former",
+        "What passes after the first use: own, or box, boxvotes, column, columnvotes and a cell "
+        "size (box0.5); default: "
+        f"{','.join(DEFAULT_CONTEXT)}; with a base {','.join(CONTEXT_OF_BASE)}, or for several "
+        "passes own and the former",
     )
     base: Any = setting(
         None,
         "model",
-        "A model to build on, so that a few labels suffice; it still decides on classes without labels",
+        "A model to build on, so that a few labels suffice; it still decides on classes without "
+        "labels",
     )
     algorithm: str = setting(
         "random_forest",
@@ -190,7 +278,8 @@ class TrainingOptions(Settings):
     alsnet: Any = setting(
         None,
         "mapping",
-        'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on alsNet',
+        'Options of the network: {"configuration": "small", "epochs": 60, ...}; see the page on '
+        "alsNet",
     )
     threads: int | None = setting(
         None, "integer", "Threads to use; by default every available core"
@@ -205,86 +294,21 @@ class TrainingOptions(Settings):
     )
 
     def __post_init__(self) -> None:
-        def put(name: str, check: Any) -> None:
-            object.__setattr__(self, name, check(f"'{name}'", getattr(self, name)))
-
+        """Check all options, and fill in those that follow from others."""
         super().__post_init__()
-        if not isinstance(self.groups, str):
-            raise OptionError(
-                "'groups' must be the name of a dimension", found=repr(self.groups)[:60]
-            )
-        check_side(self.voxel)
-        if self.folds == 1:
-            raise OptionError("'folds' must be 0 or at least 2", found=1)
         self._check_algorithm()
-        base = self.base
-        if self.passes is None:
-            object.__setattr__(self, "passes", DEFAULT_PASSES if base is None else PASSES_ON_BASE)
-        if self.context is None:
-            several = DEFAULT_CONTEXT if base is None else (OWN, *DEFAULT_CONTEXT)
-            put("context", lambda *_: CONTEXT_OF_BASE if base and self.passes == 1 else several)
-        if base is not None:
-            if (passes := getattr(base, "passes", None)) is None:
-                raise OptionError(
-                    "'base' must be a model",
-                    found=type(base).__name__,
-                    cure="Load it with load_model",
-                )
-            if len(passes) > MOST_PASSES:
-                raise OptionError(
-                    f"a base may have {MOST_PASSES} passes",
-                    found=len(passes),
-                    cure="Start from the model that it was built on, with all labels together",
-                )
-            if self.algorithm != "random_forest":
-                raise OptionError(
-                    "only a forest is built on a 'base'",
-                    found=self.algorithm,
-                    cure="Leave 'algorithm' out",
-                )
-            if self.passes == 1:
-                object.__setattr__(self, "voxel", base.voxel)
-        put("context", lambda _, tokens: Context.parse(tokens).tokens)
-        if self.passes > 1 and not self.context:
-            raise OptionError(
-                "several passes need a context", found="an empty list", cure="Leave 'context' out"
-            )
-        if base is not None and OWN not in self.context:
-            raise OptionError(
-                f"with a 'base', 'context' must have '{OWN}'", found=", ".join(self.context)
-            )
+        if self.base is not None:
+            self._check_base()
+        self._resolve_passes()
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
             raise OptionError("'target' applies only to strategy 'binary'", found=self.target)
-        m = self.max_features
-        share = isinstance(m, float | np.floating) and 0.0 < m <= 1.0
-        whole = isinstance(m, int | np.integer) and not isinstance(m, bool) and m >= 1
-        if not (share or whole or (isinstance(m, str) and m in ("auto", "sqrt", "log2"))):
-            raise OptionError(
-                "'max_features' must be auto, sqrt, log2, a number of features, or a share up to 1.0",
-                found=repr(m),
-            )
-        depth = self.max_depth
-        if not (
-            depth in (None, "sqrt")
-            or (isinstance(depth, int | np.integer) and not isinstance(depth, bool) and depth >= 1)
-        ):
-            raise OptionError(
-                "'max_depth' must be a whole number of at least 1, or sqrt", found=repr(depth)
-            )
-        put("trees_grid", lambda what, _: _tree_numbers(what, self.trees_grid))
-        put("dimensions", checks.names)
-        thin = [self.thin] if isinstance(self.thin, int | float) else self.thin
-        put(
-            "thin",
-            lambda what, _: tuple(checks.number(what, one, 0, 10**6, above=True) for one in thin),
-        )
-        ignore = [self.ignore] if isinstance(self.ignore, int) else self.ignore
-        put(
-            "ignore", lambda what, _: tuple(checks.whole(what, one, 0, MAX_LABEL) for one in ignore)
-        )
         resolve_threads(self.threads)
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     def _check_algorithm(self) -> None:
         checks.one_of("'algorithm'", self.algorithm, kinds())
@@ -293,13 +317,55 @@ class TrainingOptions(Settings):
                 raise OptionError(
                     f"'{name}' applies only to algorithm '{name}'", found=self.algorithm
                 )
-        own = trainer_of(self.algorithm).own_options(getattr(self, self.algorithm, None))
-        if own is not None:
-            object.__setattr__(self, self.algorithm, own)
+        options = trainer_of(self.algorithm).own_options(getattr(self, self.algorithm, None))
+        if options is not None:
+            self._set(**{self.algorithm: options})
+
+    def _check_base(self) -> None:
+        passes = getattr(self.base, "passes", None)
+        if passes is None:
+            raise OptionError(
+                "'base' must be a model",
+                found=type(self.base).__name__,
+                cure="Load it with load_model",
+            )
+        if len(passes) > MOST_PASSES:
+            raise OptionError(
+                f"a base may have {MOST_PASSES} passes",
+                found=len(passes),
+                cure="Start from the model that it was built on, with all labels together",
+            )
+        if self.algorithm != FOREST:
+            raise OptionError(
+                "only a forest is built on a 'base'",
+                found=self.algorithm,
+                cure="Leave 'algorithm' out",
+            )
+
+    def _resolve_passes(self) -> None:
+        """Fill in the number of passes and their context, and check that they fit."""
+        base, passes, context = self.base, self.passes, self.context
+        if passes is None:
+            passes = DEFAULT_PASSES if base is None else PASSES_ON_BASE
+        if context is None and base is None:
+            context = DEFAULT_CONTEXT
+        elif context is None:
+            context = CONTEXT_OF_BASE if passes == 1 else (OWN, *DEFAULT_CONTEXT)
+        self._set(passes=passes, context=Context.parse(context).tokens)
+        if base is not None and passes == 1:
+            self._set(voxel=base.voxel)
+        if passes > 1 and not self.context:
+            raise OptionError(
+                "several passes need a context", found="an empty list", cure="Leave 'context' out"
+            )
+        if base is not None and OWN not in self.context:
+            raise OptionError(
+                f"with a 'base', 'context' must have '{OWN}'", found=", ".join(self.context)
+            )
 
     @classmethod
     def from_recipe(cls, recipe: str, **options: Any) -> TrainingOptions:
-        """Return the options of a paper's experiment, a key of ``recipes.RECIPES``; `options` replace some."""
+        """Return the options of a recipe, a key of ``recipes.RECIPES``; `options` replace some."""
         values = with_recipe({"recipe": recipe, **options})
         del values["recipe"]
         return cls(**values)
@@ -310,25 +376,20 @@ class TrainingOptions(Settings):
         return trainer_of(self.algorithm).inputs(self)
 
 
-def _tree_numbers(what: str, numbers: Any) -> tuple[int, ...]:
-    """Return the candidates of a grid of numbers of trees, ascending; OptionError for other values."""
-    numbers = [numbers] if isinstance(numbers, int | float) else numbers
-    return tuple(sorted({checks.whole(what, number, 1, 10_000) for number in numbers}))
-
-
 def feature_plan(options: TrainingOptions) -> FeaturePlan:
-    """The features that options ask for."""
+    """Return the features that options ask for."""
     return FeaturePlan.parse(
         options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
     )
 
 
 def _documented() -> str:
+    """Return the docstring of the options, from their declarations."""
     lines = ["How a model is trained.", "", "Attributes", "----------"]
-    for one in fields(TrainingOptions):
-        unit = f", {one.metadata['unit']}" if one.metadata.get("unit") else ""
-        what = textwrap.fill(f"{one.metadata['help']}.", 110)
-        lines += [f"{one.name} : {one.type}{unit}", textwrap.indent(what, "    ")]
+    for option in fields(TrainingOptions):
+        unit = f", {option.metadata['unit']}" if option.metadata.get("unit") else ""
+        text = textwrap.fill(f"{option.metadata['help']}.", 96)
+        lines += [f"{option.name} : {option.type}{unit}", textwrap.indent(text, "    ")]
     return "\n".join([*lines, ""])
 
 

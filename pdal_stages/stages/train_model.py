@@ -54,7 +54,8 @@ AUTO = "auto"
 def trained(name: str, /, **other: Any) -> Any:
     """An option of training, as it is declared there; `other` is what is different here, as for :class:`Option`."""
     field = _TRAINING[name]
-    return option(**{"default": field.default, **field.metadata, **other})
+    declared = {key: value for key, value in field.metadata.items() if key != "check"}
+    return option(**{"default": field.default, **declared, **other})
 
 
 class TrainModel(Stage):
