@@ -49,9 +49,11 @@ def outputs(options: TrainingOptions) -> list[Output]:
     return [Output(path, "checkpoint", CHECKPOINT)] if path else []
 
 
-def own_options(given: Any) -> NetworkOptions:
+def own_options(options: Any) -> NetworkOptions:
     """The options of the network."""
-    return given if isinstance(given, NetworkOptions) else NetworkOptions.from_dict(given or {})
+    if isinstance(options, NetworkOptions):
+        return options
+    return NetworkOptions.from_dict(options or {})
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:

@@ -43,24 +43,21 @@ class ClassLimit(NamedTuple):
 
 @dataclass(frozen=True)
 class ReliabilityLimits:
-    """Limits by class that keep a wanted share of points right, as the option `keep_sure` asks
-    for."""
+    """Limits by class that keep a wanted share of points right, for `keep_sure`."""
 
     accuracy: float  #: share of points of each class that should be right
     classes: Mapping[int, ClassLimit]  #: by code
     kept: float  #: share of all points that keep their class
 
     def least_reliability(self) -> npt.NDArray[np.float32]:
-        """Return the least reliability (256,) with which a point keeps a class, by its code; 0 for
-        other classes."""
+        """Return by code the least reliability (256,) with which a point keeps its class."""
         least = np.zeros(256, np.float32)
         for code, limit in self.classes.items():
             least[code] = limit.reliability
         return least
 
     def describe_cost(self, names: Mapping[int, str]) -> list[str]:
-        """Return lines of text: the share of points that is expected to lose its class, by
-        class."""
+        """Return lines of text: the expected share of points that lose their class."""
         lines = [
             f"to be right in {100 * self.accuracy:g} % of the points of each class, about "
             f"{100 * (1 - self.kept):.1f} % of all points are expected to become class 1 "
@@ -77,8 +74,7 @@ class ReliabilityLimits:
                 accuracy, share = limit.instead
                 lines.append(
                     f"  {name}: no point keeps it, as at most {100 * limit.accuracy:.1f} % of the "
-                    "most reliable were "
-                    f"right; with {accuracy:g}, {100 * share:.1f} % would"
+                    f"most reliable were right; with {accuracy:g}, {100 * share:.1f} % would"
                 )
         return lines
 
@@ -98,8 +94,7 @@ class Calibration:
         reliability: npt.NDArray[np.floating],
         weight: npt.NDArray[np.floating] | None = None,
     ) -> None:
-        """Count points: (n,) codes predicted, true codes, reliabilities, and weights (default
-        1)."""
+        """Count points: (n,) codes predicted, true codes, reliabilities, and weights."""
         place = np.floor(np.asarray(reliability, np.float64) * BINS)
         place = np.clip(place, 0, BINS - 1).astype(np.int64)
         for code in np.unique(predicted).tolist():
@@ -109,13 +104,13 @@ class Calibration:
                 table[code] = table.get(code, np.zeros(BINS)) + counts
 
     def limits(self, accuracy: float) -> ReliabilityLimits:
-        """Return the lowest limits from which on at least `accuracy` of the points of each class
-        are right."""
+        """Return the lowest limits that keep the share `accuracy` of each class right."""
         classes = {code: self._limit(code, accuracy) for code in sorted(self.right)}
         kept = sum(limit.kept * self.points([code]) for code, limit in classes.items())
         return ReliabilityLimits(accuracy, classes, kept / max(self.points(self.right), 1e-9))
 
     def _limit(self, code: int, accuracy: float) -> ClassLimit:
+        """Return the lowest limit of a class that keeps the share `accuracy` right."""
         right, wrong = (table[code][::-1].cumsum()[::-1] for table in (self.right, self.wrong))
         points = right + wrong
         good = (points > 0) & (right >= accuracy * points)
@@ -134,8 +129,7 @@ class Calibration:
         return sum(float((self.right[code] + self.wrong[code]).sum()) for code in known)
 
     def accuracy(self, codes: Iterable[int]) -> float | None:
-        """Return the share of points given these classes that are right; None where there is no
-        such point."""
+        """Return the share of points given these classes that are right; None without points."""
         known = [code for code in codes if code in self.right]
         points = self.points(known)
         return sum(float(self.right[code].sum()) for code in known) / points if points else None
@@ -172,8 +166,9 @@ class Calibration:
 
 
 def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
-    """Return the calibration of a model: from its manifest `info`, or the file beside the model's
-    `path`.
+    """Return the calibration of a model.
+
+    It is in the manifest `info`, or in the file beside the model's `path`.
 
     Raises
     ------
@@ -194,7 +189,9 @@ def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
             ) from None
     cure = "Train it with folds (the default), on labels that lie in more than one place"
     if info.get("teacher"):
-        cure = "Its labels are another model's answers; take a model that was scored on a person's labels"
+        cure = (
+            "Its labels are another model's answers; take one that was scored on a person's labels"
+        )
     raise OptionError(
         "how often this model is right at which Reliability is not known: it was never scored on "
         "ground held out",

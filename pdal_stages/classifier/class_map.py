@@ -1,5 +1,4 @@
-"""Which labels become which classes: renaming, merging and dropping, and the two classes of a
-binary task."""
+"""Class map: which labels become which class; both classes of a binary task."""
 
 from __future__ import annotations
 
@@ -49,18 +48,18 @@ class ClassMap:
 
     @classmethod
     def parse(
-        cls, spec: Any, found: Iterable[int] = (), left_out: Collection[int] = UNINFORMATIVE
+        cls, spec: Any, labels_found: Iterable[int] = (), left_out: Collection[int] = UNINFORMATIVE
     ) -> ClassMap:
         """Read the option `classes`.
 
         Parameters
         ----------
         spec : None, str, list of codes or mapping
-            None: every label found as it is, except those `left_out`. A list: those labels as they
+            None: every label as it is, except those `left_out`. A list: those labels as they
             are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
             name (``"5 Trees"``), ``{"code": 5, "name": "Trees"}``, or ``"drop"``. Labels not
             mentioned are dropped. Text is a comma-separated list, or JSON.
-        found : iterable of int
+        labels_found : iterable of int
             Labels in the training clouds, for None.
         left_out : collection of int
             Labels that are no classes of themselves.
@@ -73,7 +72,7 @@ class ClassMap:
                     "'classes' is not valid JSON", found=str(error), cure=_CURE
                 ) from None
         if spec is None:
-            spec = [label for label in sorted(set(map(int, found))) if label not in left_out]
+            spec = [label for label in sorted(set(map(int, labels_found))) if label not in left_out]
             if any(label > MAX_CODE for label in spec):
                 raise OptionError(
                     f"labels above {MAX_CODE} cannot be class codes",
@@ -102,7 +101,7 @@ class ClassMap:
         return cls(codes, named, tuple(tuple(sorted(members[code])) for code in codes))
 
     def binary(self, target: int, background: int) -> ClassMap:
-        """One class against all the others, which become `background`."""
+        """Return one class against all the others, which become `background`."""
         if target not in self.codes:
             raise OptionError(
                 "'target' is not one of the classes",
@@ -123,7 +122,7 @@ class ClassMap:
         return ClassMap(*zip(*both, strict=True))
 
     def index(self, labels: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
-        """Position of each label's class in `codes`, -1 where it is dropped."""
+        """Return (n,) int16: the position of each label's class, -1 where it is dropped."""
         labels = np.asarray(labels)
         highest = max((label for part in self.labels for label in part), default=0)
         table = np.full(highest + 2, -1, np.int16)
@@ -133,7 +132,7 @@ class ClassMap:
 
 
 def _labels(text: Any) -> tuple[int, ...]:
-    """``"3,4,5"``, ``"3-5"`` or 3 as labels."""
+    """Return the labels that ``"3,4,5"``, ``"3-5"`` or 3 stands for."""
     if not isinstance(text, str):
         return (_code(text, "label"),)
     labels: list[int] = []
@@ -161,7 +160,7 @@ def _code(value: Any, what: str) -> int:
 
 
 def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | None:
-    """(code, name) that a mapping's value means; None for dropped."""
+    """Return the code and name that a mapping's value stands for; None for dropped."""
     if isinstance(value, Mapping):
         if "code" not in value or set(value) - {"code", "name"}:
             raise OptionError(

@@ -1,4 +1,4 @@
-"""A random forest that classifies points by features, context, and where it refines a base by what the base gives."""
+"""A random forest that classifies points by features and context, alone or on top of a base."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Features with what training fitted to compute them, and their values at the points of one
-cloud."""
+"""Features with what training fitted, and their values at the points of a cloud."""
 
 from __future__ import annotations
 
@@ -19,8 +18,7 @@ from .interface import PredictRequest
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features and what training fitted to compute them; ModelError where something is missing that
-    they need."""
+    """Features and what training fitted to compute them."""
 
     plan: FeaturePlan
     bins: ShapeBins | None = None  #: thresholds of the shape distributions' histograms
@@ -28,10 +26,11 @@ class Features:
     seed: int = 0  #: of the shape distributions' random pulls
 
     def __post_init__(self) -> None:
-        there = {} if self.bins is None else self.bins.to_dict()
+        """Raise a ModelError where something is missing that the features need."""
+        stored = {} if self.bins is None else self.bins.to_dict()
         for part in self.plan.layout:
             token = part.neighborhood.token
-            if part.shapes and token not in there:
+            if part.shapes and token not in stored:
                 raise ModelError(
                     "the model lacks the thresholds of shape distributions", found=token
                 )
@@ -51,8 +50,7 @@ class Features:
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any], names: Sequence[str]) -> Features:
-        """Return the features of a pass of a manifest, whose full `names` are in the order of its
-        columns."""
+        """Return the features of a manifest's pass; `names` are those of the columns, in order."""
         bins = entry["shape_bins"]
         return cls(
             FeaturePlan.from_dict({**entry, "features": list(names)}),
@@ -63,8 +61,10 @@ class Features:
 
 
 class CloudFeatures:
-    """Features of the points of a request, computed in blocks; counts go into the request's
-    report."""
+    """Features of the points of a request, computed in blocks.
+
+    Counts go into the request's report.
+    """
 
     def __init__(self, features: Features, request: PredictRequest) -> None:
         self.features, self._request = features, request
@@ -77,8 +77,10 @@ class CloudFeatures:
         take_dimensions(names, self._dimensions, len(request.xyz), request.rows)
 
     def run(self, rows: npt.NDArray[np.int64] | None, memory_share: float = 1.0) -> Run:
-        """Return the blocks of some rows (None: all) to compute, in `memory_share` of the request's
-        memory."""
+        """Return the blocks of some rows (None: all) to compute.
+
+        They take `memory_share` of the request's memory.
+        """
         request, features = self._request, self.features
         if self._engine is None:
             grid = request.grid
@@ -113,12 +115,12 @@ class CloudFeatures:
         self._report(run)
 
     def _report(self, run: Run) -> None:
-        report, found = self._request.report, run.engine.report
-        few = {token: k for token, k in found.figures["fewer_than_three"].items() if k}
+        report, computed = self._request.report, run.engine.report
+        few = {token: k for token, k in computed.figures["fewer_than_three"].items() if k}
         if few:
             report.figures.setdefault("fewer_than_three", {}).update(few)
-        report.beyond_halo.update(found.beyond_halo)
-        report.reach = max(report.reach, found.reach)
+        report.beyond_halo.update(computed.beyond_halo)
+        report.reach = max(report.reach, computed.reach)
 
     def _take(self, rows: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[Any]]:
         names = self.features.plan.dimensions

@@ -1,5 +1,4 @@
-"""Dimensions of points that classifiers read: which a cloud must have, their values, and errors
-that name the cure."""
+"""Dimensions that classifiers read: which a cloud must have, and their values."""
 
 from __future__ import annotations
 
@@ -34,8 +33,10 @@ _CURES = {
 
 
 def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the dimensions among feature names that a cloud must have: neither coordinates nor
-    return features."""
+    """Return the dimensions among feature names that a cloud must have.
+
+    These are neither coordinates nor return features.
+    """
     return tuple(
         dict.fromkeys(
             name
@@ -46,8 +47,7 @@ def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def optional_dimensions(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the dimensions that features are computed from where a cloud has them: return
-    numbers."""
+    """Return dimensions that features use where a cloud has them: return numbers."""
     if any(return_features.parse(name) is not None for name in names):
         return return_features.SOURCES
     return ()
@@ -60,19 +60,19 @@ def list_values(
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
 ) -> list[npt.NDArray[Any]]:
-    """Return the values (n,) of the dimensions that features require, and of the optional ones that
-    are there.
+    """Return the values (n,) of the dimensions that features use.
 
-    All are checked at `rows`, as by :func:`take_dimensions`.
+    All required ones, and the optional ones that are there; checked at `rows`, as by
+    :func:`take_dimensions`.
     """
     names = tuple(names)
     optional = (name for name in optional_dimensions(names) if name in dimensions)
-    found = [*required_dimensions(names), *optional]
-    for name in found:
+    read = [*required_dimensions(names), *optional]
+    for name in read:
         take_dimensions(
             (name,), dimensions, n, rows, where
         )  # one after the other: it may be a copy
-    return [np.asarray(dimensions[name]) for name in found]
+    return [np.asarray(dimensions[name]) for name in read]
 
 
 def add_return_features(
@@ -81,8 +81,10 @@ def add_return_features(
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
 ) -> Mapping[str, npt.ArrayLike]:
-    """Return the dimensions (n,), and those of `names` that are computed from return numbers and
-    points (n, 3)."""
+    """Return the dimensions (n,) with the return features among `names`.
+
+    These are computed from return numbers and the points (n, 3) around.
+    """
     computed = return_features.return_features(names, xyz, dimensions, threads)
     return {**dimensions, **computed} if computed else dimensions
 
@@ -94,8 +96,9 @@ def take_dimensions(
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the values of dimensions at some rows of a cloud of n points, by name; coordinates are
-    passed over.
+    """Return the values of dimensions at some rows of a cloud of n points, by name.
+
+    Coordinates are passed over.
 
     Parameters
     ----------

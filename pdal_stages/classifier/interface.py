@@ -1,5 +1,4 @@
-"""Interface of all kinds of classifiers: what they are asked, what they return, and how a model
-file describes them."""
+"""Interface of all kinds of classifiers: their request, results, and entries in model files."""
 
 from __future__ import annotations
 
@@ -32,8 +31,7 @@ class InputPlan:
 
 
 class Column(NamedTuple):
-    """An input for people: its name, the feature it belongs to, that feature's group, and its
-    neighborhood."""
+    """An input of a classifier, with the feature, the group and the neighborhood it belongs to."""
 
     name: str
     feature: str
@@ -67,8 +65,7 @@ class PredictRequest:
 
 
 class PassClassifier(Protocol):
-    """Classifier that is one pass of a model; each kind is a class of its own, and either of the
-    two below."""
+    """Classifier that is one pass of a model: each kind is one of the two below."""
 
     #: arrays that the kind stores in a model file; a name that ends in ``*`` stands for many
     rules: ClassVar[Mapping[str, ArrayRule]]
@@ -93,8 +90,10 @@ class PassClassifier(Protocol):
     def from_file(
         cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
     ) -> PassClassifier:
-        """Return the classifier that a pass of a manifest describes; ModelError where it
-        contradicts itself."""
+        """Return the classifier that a pass of a manifest describes.
+
+        ModelError where the entry contradicts itself.
+        """
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """Return what a manifest says of it beside its arrays."""
@@ -112,8 +111,7 @@ class FeatureClassifier(PassClassifier, Protocol):
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float64]:
-        """Return probabilities (b, classes) from features and context (b, inputs) of the points at
-        `rows`."""
+        """Return probabilities (b, classes) from features and context (b, inputs) at `rows`."""
 
 
 class CloudClassifier(PassClassifier, Protocol):
@@ -135,8 +133,10 @@ class Block(NamedTuple):
 def weigh(
     p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None
 ) -> npt.NDArray[np.float64]:
-    """Multiply the probabilities (b, classes) of each class by its factor; None leaves them as they
-    are."""
+    """Multiply the probabilities (b, classes) of each class by its factor.
+
+    None leaves them as they are.
+    """
     if factors is None:
         return p
     p = p * factors

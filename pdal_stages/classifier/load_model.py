@@ -47,7 +47,7 @@ def load_model(path: str | os.PathLike) -> Model:
 
 
 def loaded_model(path: str) -> Model:
-    """Return a model that this process has loaded before, or load it; a changed file is read anew."""
+    """Return a model that this process has loaded before, or load it; also a changed file."""
     path = model_file.find(path)
     try:
         stat = os.stat(path)

@@ -116,7 +116,7 @@ class Model:
 
     @property
     def algorithm_versions(self) -> dict[str, int]:
-        """This release's version of each algorithm that computes what the model reads, by stage."""
+        """Versions in the present release of the algorithms that compute what the model reads."""
         reads_features = any(each.features is not None for each in self.passes)
         features = {"filters.multiscalefeatures": ALGORITHM_VERSION} if reads_features else {}
         return preprocessing().algorithm_versions(self.preparation) | features
@@ -270,7 +270,7 @@ class Model:
         roles: PointRoles,
         threads: int | None,
     ) -> dict[str, npt.ArrayLike]:
-        """Return the dimensions (n,), with heights computed as in training where they are missing.
+        """Return the dimensions (n,), and heights as computed in training where they miss.
 
         DimensionError where only a part of what the stages compute is there: heights of two kinds
         would be mixed.
@@ -297,7 +297,7 @@ class Model:
         dimensions: Mapping[str, npt.ArrayLike],
         roles: PointRoles,
     ) -> Representatives | None:
-        """Return the points that stand for the others of their voxel, after a check of all values."""
+        """Check all values, and return the points that stand for the others of their voxel."""
         values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.present)
         return represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
 
@@ -362,6 +362,6 @@ class Model:
         lonely = f"; {100 * few / request.count:.3g} % have fewer than three neighbors"
         request.report.warnings.append(
             f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
-            f"{model_description.range_text(trained)}{lonely if few else ''}. Expect lower accuracy, "
-            "or train with 'thin'"
+            f"{model_description.range_text(trained)}{lonely if few else ''}. Expect lower "
+            "accuracy, or train with 'thin'"
         )

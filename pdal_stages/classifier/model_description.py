@@ -1,5 +1,4 @@
-"""A model in words: classes, accuracy, what it reads and where that comes from, training,
-importances."""
+"""Description of a model in words: accuracy, classes, inputs, training, importances."""
 
 from __future__ import annotations
 

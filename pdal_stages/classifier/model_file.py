@@ -1,5 +1,4 @@
-"""The model file: one zip of a manifest and arrays, written whole or not at all, read with
-distrust.
+"""The model file: a zip of a manifest and arrays, written whole or not at all.
 
 Nothing from a file is ever executed. What a file declares is held against the size of the file
 itself before anything is allocated, so a hostile one costs bounded time and memory. See
@@ -34,35 +33,43 @@ from .interface import ArrayRule
 #: Arrays of each pass by their names.
 Arrays = list[dict[str, npt.NDArray[Any]]]
 
-#: What is used where no model is named.
+#: Name of the shipped model that is used where none is named.
 STANDARD = "standard"
+#: Value of the manifest's key ``format``.
 FORMAT = "pdal-stages model"
-#: Of the format that is written, and of those that are read; a file of another is refused.
-VERSION, READABLE = 3, (2, 3)
+#: Version of the format that is written.
+VERSION = 3
+#: Versions that are read; a file of another one is refused.
+READABLE = (2, 3)
+#: Member of the zip that says what is in the others.
 MANIFEST = "manifest.json"
 
 #: A manifest's largest size in bytes, unpacked.
 MANIFEST_LIMIT = 2 << 20
-#: Unpacked bytes allowed per byte of the file (ours have 2 to 15), beside a fixed allowance.
-RATIO_LIMIT, ALLOWANCE = 60, 4 << 20
+#: Unpacked bytes allowed per byte of the file; real models have 2 to 15.
+RATIO_LIMIT = 60
+#: Unpacked bytes allowed beside that, for small files.
+ALLOWANCE = 4 << 20
 
-#: What helps against most of what can be wrong with a file.
+#: Cure of most errors in a file.
 CURE = "Train the model again, or copy the file again if it was damaged on its way"
+#: Errors that zipfile, zlib and NumPy raise for damaged files.
 _BAD = (
-    zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error, KeyError, OverflowError,
-    OSError, MemoryError,
-)  # fmt: skip
+    *(zlib.error, struct.error, EOFError, OSError, MemoryError, NotImplementedError, RuntimeError),
+    *(ValueError, KeyError, OverflowError),
+)
 
 
 def shipped() -> dict[str, Path]:
-    """Name -> file of every model that comes with the package, in alphabetical order."""
+    """Return the file of every model that comes with the package, by name, in their order."""
     folder = Path(__file__).parent.parent / "models"
     return {path.stem: path for path in sorted(folder.glob("*.model"))}
 
 
 def find(name: str) -> str:
-    """The file of a model: of a shipped one by its name; a file in the current folder that is
-    called so is ``./name``.
+    """Return the file of a model: a shipped one by its name, or a path.
+
+    A file in the current folder that has a shipped model's name is ``./name``.
 
     So what is run does not depend on what lies in the folder, which others may write to.
     """
@@ -71,7 +78,7 @@ def find(name: str) -> str:
 
 
 def digest_of(name: str) -> str:
-    """SHA-256 of a model file, or of a shipped model by its name."""
+    """Return the SHA-256 of a model file, or of a shipped model by its name."""
     return hashlib.sha256(Path(find(name)).read_bytes()).hexdigest()
 
 
@@ -114,18 +121,18 @@ def write(
 
 
 def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
-    """(manifest, arrays of each pass) of a model file.
+    """Return the manifest of a model file, and the arrays of each pass.
 
     Parameters
     ----------
     path : path
     rules_of : function
-        From a pass's ``algorithm`` to its arrays' rules; raises for an algorithm it does not know.
+        Returns the rules of the arrays of an algorithm; raises for one that it does not know.
 
     Raises
     ------
     ModelError
-        Whatever is wrong with the file; the message names it.
+        For anything that is wrong with the file.
     """
     path = Path(path)
     try:
@@ -152,7 +159,7 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
 
 
 def _read(
-    archive: zipfile.ZipFile, size: int, rules_of, own: bool
+    archive: zipfile.ZipFile, size: int, rules_of, is_shipped: bool
 ) -> tuple[dict[str, Any], Arrays]:
     members = {info.filename: info for info in archive.infolist()}
     if len(members) != len(archive.infolist()):
@@ -169,8 +176,8 @@ def _read(
         raise ModelError(
             "the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes"
         )
-    manifest = parse(_unpack(archive, members[MANIFEST]), own)
-    rules = [rules_of(one["algorithm"]) for one in manifest["passes"]]
+    manifest = parse(_unpack(archive, members[MANIFEST]), is_shipped)
+    rules = [rules_of(entry["algorithm"]) for entry in manifest["passes"]]
     table = manifest["arrays"]
     expected = {MANIFEST, *(entry["file"] for entry in table.values())}
     if len(expected) != 1 + len(table) or expected != set(members):
@@ -182,7 +189,7 @@ def _read(
     for label, entry in table.items():
         number, name = int(label[0]) - 1, label[2:]
         known = rules[number].items() if number < len(rules) else ()
-        rule = next((one for pattern, one in known if fnmatchcase(name, pattern)), None)
+        rule = next((rule for pattern, rule in known if fnmatchcase(name, pattern)), None)
         if rule is None:
             raise ModelError(
                 "the model file has an array its passes do not know", found=repr(label)
@@ -201,8 +208,8 @@ def _read(
                 f"the array '{name}' is not what the manifest says", found=f"shape {array.shape}"
             )
         arrays[number][name] = array
-    for there, needed in zip(arrays, rules, strict=True):
-        missing = [name for name in needed if not name.endswith("*") and name not in there]
+    for stored, needed in zip(arrays, rules, strict=True):
+        missing = [name for name in needed if not name.endswith("*") and name not in stored]
         if missing:
             raise ModelError("the model file lacks an array", found=missing[0])
     return manifest, arrays
@@ -221,7 +228,7 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 
 def to_bytes(array: npt.NDArray[Any]) -> bytes:
-    """The array as ``.npy`` bytes (version 1.0, little-endian, C order)."""
+    """Return the array as ``.npy`` bytes (version 1.0, little-endian, C order)."""
     out = io.BytesIO()
     np.save(
         out, array.astype(array.dtype.newbyteorder("<"), order="C", copy=False), allow_pickle=False
@@ -230,7 +237,7 @@ def to_bytes(array: npt.NDArray[Any]) -> bytes:
 
 
 def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
-    """The array in ``.npy`` bytes, if it is what `rule` says; a view of `data`, read-only.
+    """Return the array in ``.npy`` bytes, a view of `data`; ModelError where it breaks `rule`.
 
     NumPy's reader is not used for the values because it allocates what a header says: here an
     array's size must be that of the bytes.
@@ -258,9 +265,8 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
     return values.astype(dtype.newbyteorder("="), copy=False)
 
 
-def parse(data: bytes, own: bool = False) -> dict[str, Any]:
-    """The manifest in `data`, valid by its schema; `own` ones, which came with the package, are
-    known to be."""
+def parse(data: bytes, is_shipped: bool = False) -> dict[str, Any]:
+    """Return the manifest in `data`, valid by its schema; a shipped one is not validated again."""
     try:
         manifest = strict_json(data.decode("utf-8"))
     except RecursionError:
@@ -276,7 +282,7 @@ def parse(data: bytes, own: bool = False) -> dict[str, Any]:
             found=f"version {str(version)[:20]}",
             cure="Update pdal-stages",
         )
-    if not own:  # the validator takes 0.07 s and 10 MB to import
+    if not is_shipped:  # the validator takes 0.07 s and 10 MB to import
         validate(manifest)
     return _upgraded(manifest)
 
@@ -295,7 +301,7 @@ def _upgraded(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def validate(manifest: Mapping[str, Any]) -> None:
-    """Hold a manifest against its JSON Schema."""
+    """Raise a ModelError where a manifest does not follow its JSON Schema."""
     try:
         error = next(_validator().iter_errors(manifest), None)
     except RecursionError:

@@ -55,8 +55,10 @@ class PredictionOptions(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Classes given to a cloud's points, in its order; numbers are 0 for points that were not
-    classified."""
+    """Classes of a cloud's points, in its order.
+
+    Numbers are 0 for points that were not classified.
+    """
 
     classification: npt.NDArray[np.uint8]  #: (n,) ASPRS codes
     reliability: npt.NDArray[np.float32]  #: (n,) probability of the winning class
@@ -89,8 +91,10 @@ class PointRoles:
         current: npt.ArrayLike | None,
         may_be_ground: npt.ArrayLike | None,
     ) -> PointRoles:
-        """Check the arguments of ``Model.predict`` about n points; OptionError for other shapes or
-        types."""
+        """Return the roles of n points from arguments of ``Model.predict``.
+
+        OptionError for other shapes or types.
+        """
         wanted = np.ones(n, np.bool_) if where is None else _mask("where", where, n)
         present = None
         if ignore is not None and (ignored := _mask("ignore", ignore, n)).any():
@@ -146,8 +150,10 @@ def _codes(name: str, values: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class WorkingCloud:
-    """Points of a cloud that are computed: one for each voxel, none that is ignored, in the order
-    of the features' grid."""
+    """Points of a cloud that are computed: one for each voxel, none that is ignored.
+
+    They are in the order of the features' grid.
+    """
 
     xyz: npt.NDArray[np.float64]  #: (k, 3) meters
     wanted: (
@@ -217,8 +223,10 @@ class WorkingCloud:
     def members(
         self, rows_in_work: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64] | slice]:
-        """Return the rows in the cloud that a block stands for, and for each the row in the block
-        that stands for it."""
+        """Return the rows in the cloud that a block stands for.
+
+        And for each of them the row in the block that stands for it.
+        """
         rows = rows_in_work if self._order is None else self._order[rows_in_work]
         if self._representatives is None:
             return rows, slice(None)
@@ -228,8 +236,7 @@ class WorkingCloud:
 def empty_columns(
     roles: PointRoles, classes: int, options: PredictionOptions
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the columns (n,) or (n, classes) of results that options ask for, before any point is
-    classified."""
+    """Return the columns (n, ...) of results before any point is classified."""
     n, current = len(roles.wanted), roles.current
     columns: dict[str, npt.NDArray[Any]] = {
         "classification": np.zeros(n, np.uint8) if current is None else current.copy(),
@@ -272,8 +279,7 @@ def decide(
 
 
 def move_from_ground(columns: dict[str, npt.NDArray[Any]], roles: PointRoles) -> int:
-    """Give points that must not be ground, but are, their second class; return how many there
-    were."""
+    """Give ground points that must not be ground their second class; return their number."""
     second, share = columns.pop("second"), columns.pop("second_share")
     rows = np.flatnonzero(roles.not_ground & (columns["classification"] == GROUND))
     columns["classification"][rows], columns["reliability"][rows] = second[rows], share[rows]

@@ -1,5 +1,4 @@
-"""Recipes of training: what a paper says of its experiment, or what a kind of scan needs, as
-options, by one word.
+"""Recipes of training: the options of a paper, or for a kind of scan, under one word.
 
 Each option has the value that the paper gives and where it says so. ``not stated`` marks what the
 paper leaves open and what this package takes instead; an option that is not listed has its default.
@@ -22,7 +21,7 @@ NOT_STATED = "not stated"
 
 @dataclass(frozen=True)
 class Recipe:
-    """The options of one paper's experiment, or for one kind of scan."""
+    """Options of one paper's experiment, or for one kind of scan."""
 
     source: str  #: the paper, as docs/papers.md cites it, or the kind of scan
     #: option of ``writers.classifiermodel`` -> (value, section of the paper)
@@ -145,26 +144,27 @@ RECIPES["mobile"] = Recipe(
 )
 
 
-def with_recipe(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options with those of the recipe that they name filled in; OptionError for a word that
-    is none.
+def with_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options with those of the recipe that they name filled in.
+
+    OptionError for an unknown recipe.
 
     Options of the network are merged one by one.
     """
-    name = given.get("recipe")
+    name = options.get("recipe")
     if not name:
-        return dict(given)
+        return dict(options)
     checks.one_of("option 'recipe'", name, tuple(RECIPES))
     recipe = RECIPES[name]
     for option in recipe.needs:
-        if given.get(option) is None:
+        if options.get(option) is None:
             raise OptionError(
                 f"the recipe '{name}' needs the option '{option}'",
                 cure=f"Give {option}, the code of the class to find; with the command train as "
                 f"--writers.classifiermodel.{option}=6",
             )
-    values = recipe.values() | dict(given)
-    if isinstance(network := given.get("alsnet"), Mapping) and "alsnet" in recipe.options:
+    values = recipe.values() | dict(options)
+    if isinstance(network := options.get("alsnet"), Mapping) and "alsnet" in recipe.options:
         values["alsnet"] = {**recipe.options["alsnet"][0], **network}
     return values
 

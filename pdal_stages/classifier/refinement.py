@@ -29,7 +29,7 @@ class Blend:
     labeled: tuple[int, ...]  #: classes of the forest, in the order of its columns
     #: weight of the forest, 0 to 1, where both know a class; the base has the rest
     trusted: float = 1.0
-    #: with the binary strategy the one class that is changed; the other one of `labeled` is all else
+    #: with the binary strategy the one class that is changed; the other of `labeled` is all else
     target: int | None = None
     #: factors of the forest's probabilities by the classes' frequency
     factors: tuple[float, ...] | None = None

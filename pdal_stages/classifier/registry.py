@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from .training_clouds import TrainingCloud
     from .training_options import TrainingOptions
 
-#: The kind of a forest on features, and of one that refines the passes of another model.
-FOREST, REFINED_FOREST = "random_forest", "refined_forest"
+#: The kind of a forest on features.
+FOREST = "random_forest"
+#: The kind of a forest on features that refines the passes of another model.
+REFINED_FOREST = "refined_forest"
 
 
 class Trainer(Protocol):
@@ -34,7 +36,7 @@ class Trainer(Protocol):
     #: computed from
     optional_inputs: Mapping[str, tuple[str, ...]]
 
-    def own_options(self, given: Any) -> Any:
+    def own_options(self, options: Any) -> Any:
         """Return the checked options that only this kind has; None where it has none."""
 
     def inputs(self, options: TrainingOptions) -> tuple[str, ...]:
@@ -50,8 +52,7 @@ class Trainer(Protocol):
 
 
 class Preprocessing(Protocol):
-    """Module that knows the stages that compute what a model reads, such as heights above
-    ground."""
+    """Module that knows the stages that compute what a model reads, such as heights."""
 
     def check(self, preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Return the stages in one spelling; ModelError for one that no model may carry."""
@@ -90,8 +91,7 @@ def register_kind(
 
 
 def register_preprocessing(load: Callable[[], Preprocessing]) -> None:
-    """Register the module that knows the stages which compute a model's dimensions; the last one
-    counts."""
+    """Register the module that knows the stages which compute a model's dimensions."""
     _preprocessing.append(load)
 
 
