@@ -11,19 +11,32 @@ from .eigen import bits_of, cbrt_fast, eigen3, entropy_term, from_bits
 from .neighborhoods import LEAST_RADIUS
 from .registry import MOMENT_FEATURES, rows_of
 
-#: Rows of a table of moments about the queries: count, sums, products, lowest and highest height;
-#: and, where it is chosen query by query, the radius (meters) and how far away points matter to
-#: the choice.
-N, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ, LOW, HIGH, RADIUS, REACH = range(14)
-MOMENTS, ROWS = 12, 14
+# Rows of a table of moments about the queries.
+N = 0  #: number of points
+SX = 1  #: sum of x, and so on
+SY = 2
+SZ = 3
+SXX = 4  #: sum of the products x x, and so on
+SXY = 5
+SXZ = 6
+SYY = 7
+SYZ = 8
+SZZ = 9
+LOW = 10  #: lowest z
+HIGH = 11  #: highest z
+RADIUS = 12  #: radius that was chosen for the query, meters
+REACH = 13  #: meters to the farthest point that matters to the choice
+#: Rows that are sums and extremes of points.
+MOMENTS = RADIUS
+ROWS = 14
 
 #: Rows of the features that :func:`finish` computes, and of the unit normal.
 ROW = rows_of(*MOMENT_FEATURES, "NormalX", "NormalY", "NormalZ")
 FEATURES = len(ROW)
 
-#: Queries finished at a time: small enough for the second-level cache. And columns of their
-#: scratch: not a power of two, whose rows would compete for the same cache lines.
+#: Queries finished at a time: small enough for the second-level cache.
 BATCH = 256
+#: Columns of their scratch: not a power of two, whose rows would compete for the same cache lines.
 WIDTH = BATCH + 8
 
 #: A variance below this part of the mean squared distance to the query is rounding: the points
@@ -35,27 +48,28 @@ _MOST = np.int64(2**63 - 1)
 
 @device(forceinline=True)
 def height_key(z):
-    """An int64 that orders like the float64 (minima of integers are vectorized, of floats they are not)."""
+    """Return an int64 that orders like the float64: minima of integers are vectorized."""
     bits = bits_of(z)
     return bits ^ ((bits >> 63) & _MOST)
 
 
 @device(forceinline=True)
 def height_of(key):
+    """Return the float64 that :func:`height_key` made the key of."""
     return from_bits(key ^ ((key >> 63) & _MOST))
 
 
 @device(forceinline=True)
 def distance2(dx, dy, dz, spherical):
-    """Squared distance, in the plane where `spherical` is 0, rounded as NumPy rounds it: nothing here is contracted."""
+    """Return the squared distance, in the plane where `spherical` is 0, rounded as by NumPy."""
     return dx * dx + dy * dy + spherical * (dz * dz)
 
 
 @device(fastmath=set(FAST))
 def sums_within(px, py, pz, keys, count, qx, qy, qz, spherical, r2, out, j):
-    """Moments about (qx, qy, qz) of the first `count` candidates within sqrt(r2) of it, into ``out[:, j]``.
+    """Write moments about (qx, qy, qz) of the first `count` candidates within sqrt(r2) of it.
 
-    `spherical` is 1 for a sphere and 0 for a cylinder. The order of the sums follows from `count`
+    They go to ``out[:, j]``. `spherical` is 1 for a sphere and 0 for a cylinder. The order of the sums follows from `count`
     alone.
     """
     n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -84,9 +98,10 @@ def sums_within(px, py, pz, keys, count, qx, qy, qz, spherical, r2, out, j):
 
 
 @device(forceinline=True)
-def write_eigen_features(made, j, n, l1, l2, l3, nz):
-    """Write the features of eigenvalues l1 >= l2 >= l3 of `n` points to column `j` of `made`, rows as of :data:`ROW`.
+def write_eigen_features(values, j, n, l1, l2, l3, nz):
+    """Write the features of eigenvalues l1 >= l2 >= l3 of `n` points to column `j` of `values`.
 
+    A new eigen-feature is one line here, ``values[ROW.Name, j] = ...``, and its entry in the registry.
     `nz` is the height of the unit eigenvector of l3. With fewer than three points, or points that
     all coincide, features are 0 and the surface variation is 1/3 [H17].
     """
@@ -97,15 +112,15 @@ def write_eigen_features(made, j, n, l1, l2, l3, nz):
     inverse = 1.0 / (l1 if real else 1.0)
     omnivariance = cbrt_fast(e1 * e2 * e3)
     entropy = entropy_term(e1) + entropy_term(e2) + entropy_term(e3)
-    made[ROW.Linearity, j] = (l1 - l2) * inverse if real else 0.0
-    made[ROW.Planarity, j] = (l2 - l3) * inverse if real else 0.0
-    made[ROW.Scattering, j] = l3 * inverse if real else 0.0
-    made[ROW.Omnivariance, j] = omnivariance if real else 0.0
-    made[ROW.Anisotropy, j] = (l1 - l3) * inverse if real else 0.0
-    made[ROW.Eigenentropy, j] = entropy if real else 0.0
-    made[ROW.EigenvalueSum, j] = total if real else 0.0
-    made[ROW.SurfaceVariation, j] = e3 if real else 1.0 / 3.0
-    made[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= 3.0 else 0.0
+    values[ROW.Linearity, j] = (l1 - l2) * inverse if real else 0.0
+    values[ROW.Planarity, j] = (l2 - l3) * inverse if real else 0.0
+    values[ROW.Scattering, j] = l3 * inverse if real else 0.0
+    values[ROW.Omnivariance, j] = omnivariance if real else 0.0
+    values[ROW.Anisotropy, j] = (l1 - l3) * inverse if real else 0.0
+    values[ROW.Eigenentropy, j] = entropy if real else 0.0
+    values[ROW.EigenvalueSum, j] = total if real else 0.0
+    values[ROW.SurfaceVariation, j] = e3 if real else 1.0 / 3.0
+    values[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= 3.0 else 0.0
 
 
 @njit
@@ -133,23 +148,17 @@ def finish(table, volume, heights, few, copies, columns, out):
         (0, 0, 0) where there is none.
     """
     # Of constant shapes: rows known not to overlap let the loops be vectorized.
-    made, m = np.empty((FEATURES, WIDTH)), np.empty((7, WIDTH))
+    values, m = np.empty((FEATURES, WIDTH)), np.empty((7, WIDTH))
     for start in range(0, len(heights), BATCH):
         count = min(BATCH, len(heights) - start)
         moments = table[:, start : start + count]
         for j in range(count):
             n = moments[N, j]
             inverse = 1.0 / (n if n > 0.0 else 1.0)
-            mx, my, mz = (
-                moments[SX, j] * inverse,
-                moments[SY, j] * inverse,
-                moments[SZ, j] * inverse,
-            )
-            ax, ay, az = (
-                moments[SXX, j] * inverse,
-                moments[SYY, j] * inverse,
-                moments[SZZ, j] * inverse,
-            )
+            mx, my, mz = moments[SX, j], moments[SY, j], moments[SZ, j]
+            mx, my, mz = mx * inverse, my * inverse, mz * inverse
+            ax, ay, az = moments[SXX, j], moments[SYY, j], moments[SZZ, j]
+            ax, ay, az = ax * inverse, ay * inverse, az * inverse
             xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
             apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
             m[0, j], m[1, j], m[2, j] = xx, yy, zz
@@ -158,31 +167,29 @@ def finish(table, volume, heights, few, copies, columns, out):
             m[5, j] = moments[SYZ, j] * inverse - my * mz
             # Not read from the moments again, which LLVM must fear to overlap with what is written.
             m[6, j] = n if apart else 0.0
-            made[ROW.HeightRange, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
-            made[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
-            made[ROW.HeightAboveLowest, j] = (
+            values[ROW.HeightRange, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
+            values[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
+            values[ROW.HeightAboveLowest, j] = (
                 heights[start + j] - moments[LOW, j] if n > 0.0 else 0.0
             )
         for j in range(count):
             r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
-            made[ROW.Radius, j] = moments[RADIUS, j]
-            made[ROW.Density, j] = moments[N, j] / (
+            values[ROW.Radius, j] = moments[RADIUS, j]
+            values[ROW.Density, j] = moments[N, j] / (
                 4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume
             )
         for j in range(count):
             n = m[6, j]
             l1, l2, l3, nx, ny, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
-            some = 1.0 if n >= 3.0 else 0.0
-            made[ROW.NormalX, j], made[ROW.NormalY, j], made[ROW.NormalZ, j] = (
-                some * nx,
-                some * ny,
-                some * nz,
-            )
-            write_eigen_features(made, j, n, l1, l2, l3, nz)
+            real = 1.0 if n >= 3.0 else 0.0
+            values[ROW.NormalX, j] = real * nx
+            values[ROW.NormalY, j] = real * ny
+            values[ROW.NormalZ, j] = real * nz
+            write_eigen_features(values, j, n, l1, l2, l3, nz)
         for j in range(count):
             if moments[N, j] < 3.0:
                 few[0] += copies[start + j]
         for f in range(len(columns)):
             if columns[f] >= 0:
                 for j in range(count):
-                    out[start + j, columns[f]] = made[f, j]
+                    out[start + j, columns[f]] = values[f, j]
