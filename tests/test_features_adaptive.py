@@ -89,7 +89,7 @@ def choose(xyz, queries, token, least=10, cap=math.inf):
     adaptive = FeatureEngine(xyz, plan).neighborhoods()[1]
     (search,) = adaptive.searches
     if cap < math.inf:
-        search = replace(search, cap2=cap * cap)
+        search = search._replace(cap2=cap * cap)
     return adaptive.choose(search, columns(queries))[0]
 
 

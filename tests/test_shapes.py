@@ -47,7 +47,7 @@ def pulls(members, repeats=400, seed=0):
     out, work = np.zeros((5, PULLS), f32), make_work()
     rows = []
     for s in seeds_of(repeats, seed):
-        shape_values(record, len(members), *center, s, work, out)
+        shape_values(record, len(members), center, s, work, out)
         rows.append(out.astype(float))
     a3, d1, d2, d3, d4 = np.concatenate(rows, axis=1)
     angle = np.arccos(np.clip(-np.sign(a3) * np.sqrt(abs(a3)), -1, 1))
@@ -178,8 +178,8 @@ def counts_and_values(members, bins, seed=0):
     record, center = as_record(members)
     work, counts, values = make_work(), np.zeros(50, f32), np.zeros((5, PULLS), f32)
     s = seeds_of(1, seed)[0]
-    shape_counts(record, len(members), *center, s, bins.comparable(["c1"])[0], work, counts)
-    shape_values(record, len(members), *center, s, work, values)
+    shape_counts(record, len(members), center, s, bins.comparable(["c1"])[0], work, counts)
+    shape_values(record, len(members), center, s, work, values)
     draw(s, len(members), work.draws)
     return counts.reshape(5, 10), values, work.draws.reshape(4, ROOM)[:, :PULLS].copy()
 

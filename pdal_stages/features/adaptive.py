@@ -1,4 +1,4 @@
-"""Neighborhoods whose size adapts to the points: the k nearest, ``kopt``, ``ropt``, ``rdim`` and ``copt``.
+"""Neighborhoods whose size adapts to the points: k nearest, ``kopt``, ``ropt``, ``rdim``, ``copt``.
 
 All are chosen among nested ones, made of a query's neighbors in the order of distance, whose
 moments are summed up once. The k nearest are the point and its k nearest: n = k + 1 members, as in
@@ -17,20 +17,21 @@ is 1/3.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ..base.jit import device, njit
 from ..base.threads import map_blocks
 from .kdtree import build_tree
-from .moments import COINCIDENT, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
+from .moments import COINCIDENT, LEAST_MEMBERS, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
 from .nearest_neighbors import (
     CROWD,
     FIRST2,
     LEAST2,
     MORE,
     ROOM,
+    Wanted,
     gather_near,
     make_groups,
     make_near,
@@ -40,7 +41,7 @@ from .neighbor_surfaces import COLUMNS, FAR, SURFACE, UP, agreement
 from .neighborhoods import AROUND, COPT_REACH
 from .plan import Columns, FeaturePlan, columns_of
 from .point_grid import CellGrid
-from .registry import MOMENT_FEATURES, SURFACE_FEATURES
+from .registry import SURFACE_FEATURES
 from .scale_selection import (
     add_up,
     eigenvalues_of,
@@ -48,23 +49,31 @@ from .scale_selection import (
     lowest_entropy,
     write_moments,
 )
-from .shape_bins import ShapeBins
-from .shape_distributions import Axes, shapes_of, write_shapes
+from .shape_distributions import Axes, Fitted, NeighborhoodGroup, Shapes, write_shapes
 
-#: Members of a candidate among numbers of neighbors.
-LEAST = 3
+#: Radius of the sphere whose curvature is looked at, meters [H17].
+CURVATURE_RADIUS = 1.0
+#: Curvature where too few neighbors tell [H17].
+SCATTERED = 1.0 / 3.0
 
-#: Radius of the sphere whose curvature is looked at, meters, and curvature where too few neighbors
-#: tell [H17].
-CURVATURE_RADIUS, SCATTERED = 1.0, 1.0 / 3.0
-
-#: ``copt``: first and last radius and step of regular points, meters; fewest and most neighbors of
-#: scattered ones [H17].
+#: ``copt``: first and last radius and step of regular points, meters [H17].
 COPT_RADII = (0.5, 2.0, 0.05)
+#: ``copt``: fewest and most neighbors of scattered points [H17].
 COPT_K = (10, 50)
+
+#: For searches that need neither bins nor a threshold.
+NOTHING_FITTED = Fitted()
 
 #: Queries computed at a time for a whole cloud.
 CHUNK = 4096
+
+# Columns of :attr:`Search.choices`.
+FIRST = 0  #: first candidate among radii and ks
+END = 1  #: behind the last one
+MEMBERS = 2  #: members that a candidate needs
+BY_DIMENSIONALITY = (
+    3  #: 1 where the entropy of dimensionality chooses, 0 where the eigenentropy does
+)
 
 
 def radii_of(first: float, last: float, step: float) -> np.ndarray:
@@ -101,61 +110,66 @@ def curvature_threshold(curvatures: np.ndarray) -> float:
     return float(low + (high - low) * (n - split) / n) if low < high else float(low)
 
 
-@dataclass(frozen=True)
-class Search:
-    """Neighborhoods that one search serves."""
+class Search(NamedTuple):
+    """Neighborhoods that one search serves, as kernels take them."""
 
-    numbers: tuple[int, ...]  # which of a plan's
-    radii: np.ndarray  # ascending, meters
-    ks: np.ndarray  # neighbors besides the point itself, ascending
+    numbers: np.ndarray  # (n,) int64: which of a plan's
+    radii: np.ndarray  # (r,) float64, ascending, meters
+    ks: np.ndarray  # (k,) int64: neighbors besides the point itself, ascending
     within2: float  # all points within this squared distance are wanted
     cap2: float  # and of those within this one as many as the last of `ks` says
-    # (numbers, 4) int64: first and end of the candidates among radii and ks, members they need, and
-    # 1 where the entropy of dimensionality chooses, 0 where the eigenentropy does
-    choices: np.ndarray
-    curved: bool = False  # copt: radii where it is regular
+    choices: np.ndarray  # (n, 4) int64: see FIRST, END, MEMBERS, BY_DIMENSIONALITY
+    curved: bool = False  # copt: radii where the point is regular, ks where it is scattered
+    least: int = LEAST_MEMBERS  # members that a sphere needs to have a curvature
+    threshold: float = math.nan  # curvature from which on a point is scattered
 
 
-class AdaptiveNeighborhoods:
+class Results(NamedTuple):
+    """Arrays that a search fills."""
+
+    table: np.ndarray  # (numbers, ROWS, m) float64: moments of what is chosen
+    curvature: np.ndarray  # (m,) float64: curvature of the points where the search is curved
+    out: np.ndarray  # (m, F) float32: shapes and features of surfaces
+
+
+class Surfaces(NamedTuple):
+    """Surfaces of the cloud's points, and where features of them go."""
+
+    values: np.ndarray  # (n, SURFACE) float32; n = 0 where none are wanted
+    columns: np.ndarray  # (neighborhoods, features) int64: columns of the output; -1: not wanted
+
+
+class AdaptiveNeighborhoods(NeighborhoodGroup):
     """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan.
 
     Prepared once for a grid; the engine calls :meth:`fill` for every block.
     """
 
     def __init__(self, grid: CellGrid, plan: FeaturePlan, threads: int | None = None) -> None:
-        self.grid, self.halo_m = grid, plan.halo_m
         fixed = ("cylinder", "sphere")
-        self.chosen = [c for c in plan.layout if c.at and c.neighborhood.kind not in fixed]
-        self.shaped = any(c.shapes for c in self.chosen)
-        #: In the plan's order: what `few` and `far` of :meth:`fill` count for.
-        self.tokens = [c.neighborhood.token for c in self.chosen]
-        self.columns = columns_of(self.chosen, MOMENT_FEATURES)
+        super().__init__([c for c in plan.layout if c.at and c.neighborhood.kind not in fixed])
+        self.grid, self.halo_m = grid, plan.halo_m
         self.surface_columns = columns_of(self.chosen, SURFACE_FEATURES)
         self.searches = _searches(self.chosen, plan.least_members)
         self.tree = build_tree(grid.x, grid.y, grid.z, threads)
         self._surfaces = np.zeros((0, SURFACE), np.float32)
         if (self.surface_columns >= 0).any():
-            self._surfaces = np.empty((len(grid), SURFACE), np.float32)
-            around = _by_number({0: (AROUND, AROUND)}, False)
+            self._surfaces = self._make_surfaces(threads)
 
-            def surfaces(part: slice) -> None:
-                points, made = self._part(part), self._surfaces[part]
-                (table,) = self.choose(around, points)
-                finish(
-                    table,
-                    0.0,
-                    points[2],
-                    np.zeros(1, np.int64),
-                    np.ones(len(made), np.int64),
-                    COLUMNS,
-                    made,
-                )
-                made[:, FAR] = table[REACH] * UP
+    def _make_surfaces(self, threads: int | None) -> np.ndarray:
+        """Return the surface of every point of the cloud, (n, SURFACE) float32."""
+        surfaces = np.empty((len(self.grid), SURFACE), np.float32)
+        nearest = _by_number({0: (AROUND, AROUND)}, False)
 
-            self._for_all(surfaces, threads)
+        def fill_part(part: slice) -> None:
+            points, out = self._part(part), surfaces[part]
+            (table,) = self.choose(nearest, points)
+            few, copies = np.zeros(1, np.int64), np.ones(len(out), np.int64)
+            finish(table, 0.0, points[2], few, copies, COLUMNS, out)
+            out[:, FAR] = table[REACH] * UP
 
-    def __len__(self) -> int:
-        return len(self.chosen)
+        self._for_all(fill_part, threads)
+        return surfaces
 
     def _part(self, part: slice) -> Axes:
         return self.grid.x[part], self.grid.y[part], self.grid.z[part]
@@ -166,281 +180,318 @@ class AdaptiveNeighborhoods:
             pass
 
     def curvatures(self, least: int, threads: int | None = None) -> np.ndarray:
-        """The curvature of every point of the cloud, in the order of the grid, (n,) float64 [H17]."""
+        """Return the curvature of the cloud's points, in the order of the grid, (n,) [H17]."""
         curvatures = np.empty(len(self.grid))
-        radius = np.array([CURVATURE_RADIUS])
-        search = Search(
-            (), radius, np.zeros(0, np.int64), 1.0, 1.0, np.zeros((0, 4), np.int64), True
-        )
+        none, radius = np.zeros(0, np.int64), np.array([CURVATURE_RADIUS])
+        choices = np.zeros((0, 4), np.int64)
+        search = Search(none, radius, none, 1.0, 1.0, choices, True, least)
         self._for_all(
-            lambda part: self.choose(
-                search, self._part(part), least=least, curvature=curvatures[part]
-            ),
-            threads,
+            lambda part: self.choose(search, self._part(part), curvature=curvatures[part]), threads
         )
         return curvatures
 
-    def shape_values(
-        self, points: Axes, seed: int, copt_threshold: float | None
-    ) -> dict[str, np.ndarray]:
-        """By neighborhood the metrics of all pulls round a few points, (m, 5, 255) float32, comparable."""
-        if not self.shaped:
-            return {}
-        shapes = shapes_of(self.chosen, points, seed, None)
+    def measure_shapes(self, points: Axes, shapes: Shapes, fitted: Fitted) -> None:
+        """Write the metrics of all pulls into `shapes`."""
         for search in self.searches:
-            self.choose(search, points, copt_threshold, shapes)
-        return {
-            c.neighborhood.token: shapes.values[k] for k, c in enumerate(self.chosen) if c.shapes
-        }
+            self.choose(search, points, fitted, shapes)
 
     def fill(
-        self,
-        points: Axes,
-        copies: np.ndarray,
-        bins: ShapeBins | None,
-        seed: int,
-        copt_threshold: float | None,
-        few: np.ndarray,
-        far: np.ndarray,
-        out: np.ndarray,
-    ) -> float:
-        """Compute the columns of these neighborhoods in `out` (m, F) for a block of queries, neighbors at best.
+        self, points: Axes, copies: np.ndarray, fitted: Fitted, out: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Compute the columns of these neighborhoods for a block of queries, neighbors at best.
 
-        Each query stands for so many `copies` of the user's. `bins` are needed where shapes are
-        wanted, the threshold for copt. For each neighborhood, `few` is raised by the number of
-        queries with fewer than three points, and `far` by that of queries whose result depends on
-        points farther than the plan's halo. How far the farthest of all lie is returned, meters.
+        Parameters
+        ----------
+        points : (x, y, z), (m,) float64 each
+        copies : (m,) int64
+            How many of the user's queries each one stands for.
+        fitted : Fitted
+        out : (m, F) float32
+
+        Returns
+        -------
+        few : (neighborhoods,) int64
+            Numbers of queries with fewer than three points.
+        far : (neighborhoods,) int64
+            Numbers of queries whose result depends on points farther than the plan's halo.
+        reach : float
+            Meters to the farthest of all these points.
         """
-        reach = 0.0
-        shapes = shapes_of(self.chosen, points, seed, bins) if self.shaped else None
+        few, far = np.zeros((2, len(self)), np.int64)
+        reach, shapes = 0.0, self.shapes(points, fitted)
         for search in self.searches:
-            table = self.choose(search, points, copt_threshold, shapes, out)
-            for number, rows in zip(search.numbers, table, strict=True):
-                finish(
-                    rows,
-                    0.0,
-                    points[2],
-                    few[number : number + 1],
-                    copies,
-                    self.columns[number],
-                    out,
-                )
-                far[number] += int(copies[rows[REACH] > self.halo_m].sum())
+            table = self.choose(search, points, fitted, shapes, out)
+            for k, rows in zip(search.numbers.tolist(), table, strict=True):
+                finish(rows, 0.0, points[2], few[k : k + 1], copies, self.columns[k], out)
+                far[k] += int(copies[rows[REACH] > self.halo_m].sum())
                 reach = max(reach, float(rows[REACH].max(initial=0.0)))
-        return reach
+        return few, far, reach
 
     def choose(
         self,
         search: Search,
         points: Axes,
-        threshold=None,
-        shapes=None,
-        out=None,
+        fitted: Fitted = NOTHING_FITTED,
+        shapes: Shapes | None = None,
+        out: np.ndarray | None = None,
         *,
-        least=0,
-        curvature=None,
+        curvature: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Moments (numbers, ROWS, m) of what is chosen; shapes, surfaces and curvatures go where arguments say."""
+        """Return moments (numbers, ROWS, m) of what is chosen for points.
+
+        Features of shapes and surfaces go to `out`, curvatures to `curvature`, where given.
+        """
         m = len(points[0])
-        numbers = np.array(search.numbers, np.int64)
-        table = np.empty((len(numbers), ROWS, m))
-        curvature = np.empty(m if search.curved else 0) if curvature is None else curvature
-        least = int(search.choices[0, 2]) if len(numbers) else least
+        if fitted.copt_threshold is not None:
+            search = search._replace(threshold=float(fitted.copt_threshold))
+        if curvature is None:
+            curvature = np.empty(m if search.curved else 0)
         # Surfaces of neighbors are looked at only where features are written, by a search that
         # finds AROUND of them.
-        looked = out is not None and len(numbers) > 0 and search.cap2 == math.inf
+        looked = out is not None and len(search.numbers) > 0 and search.cap2 == math.inf
         surfaces = self._surfaces if looked else self._surfaces[:0]
         out = np.empty((m, 0), np.float32) if out is None else out
+        results = Results(np.empty((len(search.numbers), ROWS, m)), curvature, out)
         adaptive_block(
-            self.tree, *points, numbers, search.radii, search.ks, search.within2, search.cap2, search.choices,
-            search.curved, least, math.nan if threshold is None else threshold, surfaces,
-            self.surface_columns, shapes, table, curvature, out,
-        )  # fmt: skip
-        return table
+            self.tree, points, search, Surfaces(surfaces, self.surface_columns), shapes, results
+        )
+        return results.table
 
 
-def _by_number(ranges: dict[int, tuple[int, int]], around: bool) -> Search:
-    """One search for several ranges of numbers of neighbors, by the neighborhood's number, and `around` a point."""
+def _by_number(ranges: dict[int, tuple[int, int]], with_around: bool) -> Search:
+    """Return one search for ranges of numbers of neighbors, by the neighborhood's number.
+
+    With `with_around` it also finds the AROUND nearest points.
+    """
     all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
-    ks = np.array(sorted(all_ks | ({AROUND} if around else set())), np.int64)
+    ks = np.array(sorted(all_ks | ({AROUND} if with_around else set())), np.int64)
     choices = [
-        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST, 0]
+        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST_MEMBERS, 0]
         for first, last in ranges.values()
     ]
+    numbers = np.array(list(ranges), np.int64)
     return Search(
-        tuple(ranges), np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 4)
+        numbers, np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 4)
     )
 
 
 def _searches(chosen: list[Columns], least: int) -> list[Search]:
-    ranges, found = {}, []
+    """Return the searches for adaptive neighborhoods: one for all numbers of neighbors first."""
+    ranges, searches = {}, []
     for number, columns in enumerate(chosen):
-        one = columns.neighborhood
-        if one.reach is None:
-            ranges[number] = int(one.parameters[0]), int(one.parameters[-1])
+        neighborhood = columns.neighborhood
+        if neighborhood.reach is None:
+            ranges[number] = int(neighborhood.parameters[0]), int(neighborhood.parameters[-1])
             continue
-        radii = radii_of(*(one.parameters or COPT_RADII))
+        radii = radii_of(*(neighborhood.parameters or COPT_RADII))
         within2 = float(radii[-1] * radii[-1])
-        choices = np.array([[0, len(radii), least, one.kind == "rdim"]], np.int64)
-        search = Search((number,), radii, np.zeros(0, np.int64), within2, within2, choices)
-        if one.kind == "copt":
+        choices = np.array([[0, len(radii), least, neighborhood.kind == "rdim"]], np.int64)
+        ks, numbers = np.zeros(0, np.int64), np.array([number], np.int64)
+        search = Search(numbers, radii, ks, within2, within2, choices, False, least)
+        if neighborhood.kind == "copt":
             ks = np.arange(COPT_K[0], COPT_K[1] + 1)
-            search = replace(search, ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
-        found.append(search)
-    around = any(name in columns.at for columns in chosen for name in SURFACE_FEATURES)
-    return ([_by_number(ranges, around)] if ranges else []) + found
+            search = search._replace(ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
+        searches.append(search)
+    with_around = any(name in columns.at for columns in chosen for name in SURFACE_FEATURES)
+    return ([_by_number(ranges, with_around)] if ranges else []) + searches
 
 
-@njit
-def adaptive_block(
-    tree, qx, qy, qz, numbers, radii, ks, within2, cap2, choices, curved, least, threshold, surfaces,
-    surface_columns, shapes, table, curvature, out,
-):  # fmt: skip
-    """Moments, shapes and surfaces of the best nested neighborhoods of a block of queries.
+# ---- kernels ---------------------------------------------------------------------------------
 
-    Parameters
-    ----------
-    tree : KdTree
-    qx, qy, qz : (m,) float64 arrays
-    numbers, radii, ks, within2, cap2, choices, curved
-        See :class:`Search`.
-    least, threshold : int, float
-        Members a sphere needs to have a curvature, and the curvature from which on a point is
-        scattered.
-    surfaces : (n, SURFACE) float32 array
-        Of the cloud's points, n = 0 where none are wanted.
-    surface_columns : (k, 4) int64 array
-        Where in `out` (m, F) what surfaces make goes; -1: nowhere.
-    shapes : Shapes or None
-        None compiles to a kernel without them.
-    table : (numbers, ROWS, m) float64 array
-        Out: moments about the query, radius, and how far away points matter, infinite where there
-        are too few.
-    curvature : (m,) float64 array
-        Out: the curvature where `curved`.
-    """
-    order, starts = make_groups(qx, qy, qz)
-    need = min(ks[-1] + 1 if len(ks) else 0, len(tree.perm))
-    near, s = make_near(CROWD * need + ROOM), np.empty((MOMENTS + 1, len(radii) + len(ks)))
-    ends, record = np.zeros(len(radii) + len(ks), np.int64), np.empty((0, 4), np.float32)
-    # What finish takes for one query (a constant's type would have it compiled once more).
-    alone = (
+
+class Scratch(NamedTuple):
+    """Arrays that are used again for every query."""
+
+    sums: np.ndarray  # (MOMENTS + 1, candidates) float64
+    ends: np.ndarray  # (candidates,) int64: members of each candidate
+    surface: np.ndarray  # (1, SURFACE) float32: the query's own
+    # What ``finish`` takes for one query (a constant's type would have it compiled once more).
+    moments: np.ndarray  # (ROWS, 1) float64
+    ignored: np.ndarray  # (1,) int64
+    columns: np.ndarray
+
+
+@device(_nrt=True)
+def make_scratch(candidates):
+    """Return scratch for so many candidates."""
+    return Scratch(
+        np.empty((MOMENTS + 1, candidates)),
+        np.zeros(candidates, np.int64),
         np.empty((1, SURFACE), np.float32),
         np.empty((ROWS, 1)),
         np.zeros(1, np.int64),
         COLUMNS.copy(),
     )
+
+
+@njit
+def adaptive_block(tree, points, search, surfaces, shapes, results):
+    """Compute moments, shapes and surfaces of the best nested neighborhoods of queries.
+
+    Parameters
+    ----------
+    tree : KdTree
+    points : (x, y, z), (m,) float64 each
+    search : Search
+    surfaces : Surfaces
+    shapes : Shapes or None
+        None compiles to a kernel without them.
+    results : Results
+        Moments about the query, radius, and how far away points matter (infinite where there are
+        too few); curvatures; shapes and features of surfaces.
+    """
+    qx, qy, qz = points
+    queries = make_groups(qx, qy, qz)
+    ks = search.ks
+    need = min(ks[-1] + 1 if len(ks) else 0, len(tree.perm))
+    wanted = Wanted(need, search.within2, search.cap2)
+    near, scratch = make_near(CROWD * need + ROOM), make_scratch(len(search.radii) + len(ks))
+    record = np.empty((0, 4), np.float32)
     done = 0
     while True:
         if shapes is not None:
             record = np.empty((len(near.x), 4), np.float32)
-        done = _adaptive(
-            tree, qx, qy, qz, numbers, radii, ks, within2, cap2, choices, curved, least, threshold, surfaces,
-            surface_columns, shapes, table, curvature, out,
-            order, starts, done, need, near, s, ends, record, alone,
-        )  # fmt: skip
+        done = _serve_groups(
+            tree, queries, wanted, search, surfaces, shapes, results, (near, record, scratch), done
+        )
         if done == len(qx):
             return
         near = make_near(4 * len(near.x))
 
 
 @device
-def _adaptive(
-    tree, qx, qy, qz, numbers, radii, ks, within2, cap2, choices, curved, least, threshold, surfaces,
-    surface_columns, shapes, table, curvature, out,
-    order, starts, done, need, near, s, ends, record, alone,
-):  # fmt: skip
-    """:func:`adaptive_block` from the query order[done] on, and up to where `near` has no room for the candidates."""
-    shells, count, around = len(radii), len(ends), 0
-    own, single, none, columns = alone
-    for e in range(len(ks)):
-        around = e if ks[e] == AROUND else around
-    guess = FIRST2
+def _serve_groups(tree, queries, wanted, search, surfaces, shapes, results, buffers, done):
+    """Serve the queries from order[done] on; return up to where there is room for candidates."""
+    near, record, scratch = buffers
+    need, within2, cap2 = wanted.need, wanted.within2, wanted.cap2
+    starts, guess = queries.starts, FIRST2
     for group in range(np.searchsorted(starts, done, "right") - 1, len(starts) - 1):
         lo, end = max(starts[group], done), starts[group + 1]
         reach2, farthest2 = min(max(guess, within2), cap2), 0.0
         while lo < end:
-            hi, there, reach2 = gather_near(
-                tree, qx, qy, qz, order, lo, end, need, within2, cap2, reach2, near
-            )
+            hi, there, reach2 = gather_near(tree, queries, lo, end, wanted, reach2, near)
             if there < 0:
                 return lo
             while lo < hi:
-                q = order[lo]
-                x, y, z = qx[q], qy[q], qz[q]
-                found = sort_near(near, there, x, y, z, need, within2, cap2, reach2)
-                if found < 0:
+                q = queries.order[lo]
+                point = queries.x[q], queries.y[q], queries.z[q]
+                count = sort_near(near, there, point, wanted, reach2)
+                if count < 0:
                     reach2 = min(2.0 * reach2, cap2)
                     break
                 lo += 1
-                i = 0
-                for e in range(shells):
-                    while i < found and near.sorted[i] <= radii[e] * radii[e]:
-                        i += 1
-                    ends[e] = i
-                for e in range(len(ks)):
-                    ends[shells + e] = min(ks[e] + 1, found)
-                add_up(near, x, y, z, ends, 0, shells, s)
-                add_up(near, x, y, z, ends, shells, count, s)
-                farthest2 = max(
-                    farthest2, near.sorted[min(found, need) - 1] if need and found else 0.0
-                )
-                if curved:
-                    at = 0
-                    while radii[at] < CURVATURE_RADIUS:
-                        at += 1
-                    curvature[q] = curvature_of(s, at, least)
-                if len(surfaces):
-                    if near.sorted[0] == 0.0:
-                        for f in range(SURFACE):
-                            own[0, f] = surfaces[near.at[near.pos[0]], f]
-                    else:  # no point of the cloud
-                        write_moments(s, shells + around, single, 0)
-                        finish(single, 1.0, qz[q : q + 1], none, none, columns, own)
-                        own[0, FAR] = (
-                            math.sqrt(near.sorted[AROUND]) * UP if found > AROUND else math.inf
-                        )
-                for j in range(len(numbers)):
-                    first, last, members = choices[j, 0], choices[j, 1], choices[j, 2]
-                    if curved and curvature[q] >= threshold:
-                        first, last, members = shells, count, LEAST
-                    if choices[j, 3]:
-                        best = lowest_dimensionality(s, first, last, members)
-                    else:
-                        best = lowest_entropy(s, first, last, members)
-                    n = ends[best]
-                    write_moments(s, best, table[j], q)
-                    reach = 0.0
-                    if best < shells:
-                        table[j, RADIUS, q] = radii[best]
-                    else:
-                        table[j, RADIUS, q] = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
-                        k = ks[last - 1 - shells]
-                        reach = math.sqrt(near.sorted[k]) if k < found else math.inf
-                    if len(surfaces):
+                sum_candidates(near, count, point, search, scratch)
+                if need and count:
+                    farthest2 = max(farthest2, near.sorted[min(count, need) - 1])
+                if search.curved:
+                    results.curvature[q] = _curvature(scratch.sums, search)
+                if len(surfaces.values):
+                    _find_surface(near, count, queries, q, search, surfaces, scratch)
+                for j in range(len(search.numbers)):
+                    best = _choose(
+                        search, j, results.curvature[q] if search.curved else 0.0, scratch
+                    )
+                    _write_reach(near, count, search, (j, best), scratch, results.table[j], q)
+                    number, members = search.numbers[j], scratch.ends[best]
+                    if len(surfaces.values):
+                        columns = surfaces.columns[number]
                         beyond = agreement(
-                            surfaces, near, n, own[0], surface_columns[numbers[j]], out[q]
+                            surfaces.values,
+                            near,
+                            members,
+                            scratch.surface[0],
+                            columns,
+                            results.out[q],
                         )
-                        reach = max(reach, beyond)
-                    table[j, REACH, q] = 0.0 if curved else reach
-                    if shapes is not None and shapes.shaped[numbers[j]]:
-                        for i in range(n):
-                            p = near.pos[i]
-                            record[i, 0], record[i, 1] = near.x[p] - x, near.y[p] - y
-                            record[i, 2], record[i, 3] = near.z[p] - z, 0.0
-                        w = 1.0 / s[N, best]
-                        gx, gy, gz = s[SX, best] * w, s[SY, best] * w, s[SZ, best] * w
-                        center = np.float32(gx), np.float32(gy), np.float32(gz)
-                        write_shapes(shapes, numbers[j], q, record, n, *center, out)
+                        results.table[j, REACH, q] = max(results.table[j, REACH, q], beyond)
+                    if shapes is not None and shapes.shaped[number]:
+                        centroid = _record_members(near, members, point, scratch.sums, best, record)
+                        write_shapes(shapes, number, q, record, members, centroid, results.out)
         guess = max(MORE * farthest2, LEAST2)
-    return len(qx)
+    return len(queries.x)
+
+
+@device(forceinline=True)
+def sum_candidates(near, count, point, search, scratch):
+    """Find the members of each candidate among the first `count` neighbors, and their moments."""
+    radii, ks, ends = search.radii, search.ks, scratch.ends
+    shells, i = len(radii), 0
+    for e in range(shells):
+        while i < count and near.sorted[i] <= radii[e] * radii[e]:
+            i += 1
+        ends[e] = i
+    for e in range(len(ks)):
+        ends[shells + e] = min(ks[e] + 1, count)
+    add_up(near, point, ends, 0, shells, scratch.sums)
+    add_up(near, point, ends, shells, len(ends), scratch.sums)
 
 
 @device
-def curvature_of(s, j, least):
-    """Surface variation of the sums `j`; 1/3 for fewer than `least` or coinciding points."""
-    if s[N, j] < least:
+def _curvature(sums, search):
+    """Return the surface variation of the sphere of CURVATURE_RADIUS; 1/3 of too few points."""
+    j = 0
+    while search.radii[j] < CURVATURE_RADIUS:
+        j += 1
+    if sums[N, j] < search.least:
         return SCATTERED
-    l1, l2, l3, spread = eigenvalues_of(s, j)
+    l1, l2, l3, spread = eigenvalues_of(sums, j)
     total = l1 + l2 + l3
     return l3 / total if total > COINCIDENT * spread else SCATTERED
+
+
+@device
+def _find_surface(near, count, queries, q, search, surfaces, scratch):
+    """Write the surface of a query to the scratch: that of its point, or of its neighbors."""
+    surface = scratch.surface
+    if near.sorted[0] == 0.0:
+        for f in range(SURFACE):
+            surface[0, f] = surfaces.values[near.at[near.pos[0]], f]
+        return
+    nearest = len(search.radii)  # the candidate of AROUND neighbors
+    while search.ks[nearest - len(search.radii)] != AROUND:
+        nearest += 1
+    write_moments(scratch.sums, nearest, scratch.moments, 0)
+    heights, ignored = queries.z[q : q + 1], scratch.ignored
+    finish(scratch.moments, 1.0, heights, ignored, ignored, scratch.columns, surface)
+    surface[0, FAR] = math.sqrt(near.sorted[AROUND]) * UP if count > AROUND else math.inf
+
+
+@device
+def _choose(search, j, curvature, scratch):
+    """Return the best candidate for the neighborhood number `j` of a search."""
+    first, end = search.choices[j, FIRST], search.choices[j, END]
+    members = search.choices[j, MEMBERS]
+    if search.curved and curvature >= search.threshold:
+        first, end, members = len(search.radii), len(scratch.ends), LEAST_MEMBERS
+    if search.choices[j, BY_DIMENSIONALITY]:
+        return lowest_dimensionality(scratch.sums, first, end, members)
+    return lowest_entropy(scratch.sums, first, end, members)
+
+
+@device(forceinline=True)
+def _write_reach(near, count, search, choice, scratch, table, q):
+    """Write moments and radius of the chosen candidate, and how far away points matter to it."""
+    j, best = choice
+    shells, n = len(search.radii), scratch.ends[best]
+    write_moments(scratch.sums, best, table, q)
+    table[REACH, q] = 0.0
+    if best < shells:
+        table[RADIUS, q] = search.radii[best]
+        return
+    table[RADIUS, q] = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
+    if not search.curved:
+        k = search.ks[search.choices[j, END] - 1 - shells]
+        table[REACH, q] = math.sqrt(near.sorted[k]) if k < count else math.inf
+
+
+@device
+def _record_members(near, count, point, sums, best, record):
+    """List the offsets of the members from the query for pulls; return their centroid."""
+    x, y, z = point
+    for i in range(count):
+        p = near.pos[i]
+        record[i, 0], record[i, 1] = near.x[p] - x, near.y[p] - y
+        record[i, 2], record[i, 3] = near.z[p] - z, 0.0
+    w = 1.0 / sums[N, best]
+    gx, gy, gz = sums[SX, best] * w, sums[SY, best] * w, sums[SZ, best] * w
+    return np.float32(gx), np.float32(gy), np.float32(gz)

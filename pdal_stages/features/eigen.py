@@ -1,4 +1,4 @@
-"""Eigenvalues of 3x3 covariance matrices and the features made of them, for scalar and vectorized use.
+"""Eigenvalues of 3x3 covariance matrices, for scalar and vectorized use.
 
 Every function here is branch-free apart from selections, and is inlined where it is called, so a
 loop over arrays of moments is vectorized by LLVM; no fast-math flag is set, so a value does not
@@ -18,6 +18,7 @@ import numpy as np
 
 from ..base.jit import device
 
+#: The logarithm of 2 in two parts, as fdlibm has it.
 LN2_HI = 6.93147180369123816490e-01
 LN2_LO = 1.90821492927058770002e-10
 
@@ -27,19 +28,19 @@ LINE = 1e-12
 
 @device(forceinline=True)
 def bits_of(value):
-    """The 64 bits of a float64 as int64."""
+    """Return the 64 bits of a float64 as int64."""
     return np.float64(value).view(np.int64)
 
 
 @device(forceinline=True)
 def from_bits(bits):
-    """The float64 of 64 bits."""
+    """Return the float64 of 64 bits."""
     return np.int64(bits).view(np.float64)
 
 
 @device(forceinline=True)
 def log_fast(x):
-    """Natural logarithm of a positive normal float64 to 1e-15 relative (fdlibm's scheme, no branches)."""
+    """Return the logarithm of a positive normal float64 to 1e-15 relative (fdlibm's scheme)."""
     bits = bits_of(x)
     # Mantissa into [sqrt(1/2), sqrt(2)).
     shifted = bits - 0x3FE6A09E667F3BCD
@@ -65,7 +66,7 @@ def log_fast(x):
 
 @device(forceinline=True)
 def cbrt_fast(x):
-    """Cube root of a float64 >= 0 to 1e-15 relative; 0 for anything below 1e-290."""
+    """Return the cube root of a float64 >= 0 to 1e-15 relative; 0 for anything below 1e-290."""
     big = x > 1e-290
     y = x if big else 1.0
     # Exponent divided by three (as a float: integer division is no vector instruction).
@@ -79,7 +80,7 @@ def cbrt_fast(x):
 
 @device(forceinline=True)
 def _rotation(app, aqq, apq):
-    """Cosine, sine and tangent of the rotation that makes `apq` zero."""
+    """Return cosine, sine and tangent of the rotation that makes `apq` zero."""
     d = 0.5 * (aqq - app)
     h = math.sqrt(d * d + apq * apq)
     denominator = abs(d) + h
@@ -92,39 +93,44 @@ def _rotation(app, aqq, apq):
 
 @device(forceinline=True)
 def _turn(c, s, a, b):
+    """Return two values turned into each other."""
     return c * a - s * b, s * a + c * b
 
 
 @device(forceinline=True)
-def _sweep(xx, xy, xz, yy, yz, zz, ax, ay, az, bx, by, bz, cx, cy, cz):
-    """A cyclic sweep of Jacobi's rotations of a matrix and of the vectors a, b and c along with it."""
-    c, s, t = _rotation(xx, yy, xy)
+def _sweep(matrix, a, b, c):
+    """Return a matrix after a cyclic sweep of Jacobi's rotations, and three vectors turned along."""
+    xx, xy, xz, yy, yz, zz = matrix
+    ax, ay, az = a
+    bx, by, bz = b
+    cx, cy, cz = c
+    cos, sin, t = _rotation(xx, yy, xy)
     xx, yy = xx - t * xy, yy + t * xy
     xy = 0.0
-    xz, yz = c * xz - s * yz, s * xz + c * yz
-    ax, bx = _turn(c, s, ax, bx)
-    ay, by = _turn(c, s, ay, by)
-    az, bz = _turn(c, s, az, bz)
-    c, s, t = _rotation(xx, zz, xz)
+    xz, yz = _turn(cos, sin, xz, yz)
+    ax, bx = _turn(cos, sin, ax, bx)
+    ay, by = _turn(cos, sin, ay, by)
+    az, bz = _turn(cos, sin, az, bz)
+    cos, sin, t = _rotation(xx, zz, xz)
     xx, zz = xx - t * xz, zz + t * xz
     xz = 0.0
-    xy, yz = c * xy - s * yz, s * xy + c * yz
-    ax, cx = _turn(c, s, ax, cx)
-    ay, cy = _turn(c, s, ay, cy)
-    az, cz = _turn(c, s, az, cz)
-    c, s, t = _rotation(yy, zz, yz)
+    xy, yz = _turn(cos, sin, xy, yz)
+    ax, cx = _turn(cos, sin, ax, cx)
+    ay, cy = _turn(cos, sin, ay, cy)
+    az, cz = _turn(cos, sin, az, cz)
+    cos, sin, t = _rotation(yy, zz, yz)
     yy, zz = yy - t * yz, zz + t * yz
     yz = 0.0
-    xy, xz = c * xy - s * xz, s * xy + c * xz
-    bx, cx = _turn(c, s, bx, cx)
-    by, cy = _turn(c, s, by, cy)
-    bz, cz = _turn(c, s, bz, cz)
-    return xx, xy, xz, yy, yz, zz, ax, ay, az, bx, by, bz, cx, cy, cz
+    xy, xz = _turn(cos, sin, xy, xz)
+    bx, cx = _turn(cos, sin, bx, cx)
+    by, cy = _turn(cos, sin, by, cy)
+    bz, cz = _turn(cos, sin, bz, cz)
+    return (xx, xy, xz, yy, yz, zz), (ax, ay, az), (bx, by, bz), (cx, cy, cz)
 
 
 @device(forceinline=True)
 def eigen3(xx, xy, xz, yy, yz, zz):
-    """Eigenvalues l1 >= l2 >= l3 >= 0 of a symmetric positive semidefinite matrix and the unit eigenvector of l3.
+    """Return the eigenvalues l1 >= l2 >= l3 >= 0 of a covariance matrix and the unit vector of l3.
 
     Four cyclic Jacobi sweeps; absolute error about 1e-15 of l1, negative rounding leftovers become
     0. The eigenvector is of either sign; of points on a line (l2 below 1e-12 of l1) it is the
@@ -133,9 +139,12 @@ def eigen3(xx, xy, xz, yy, yz, zz):
     """
     # No loop: LLVM leaves one of this length rolled up, and then does not vectorize the loop
     # around it.
-    m = _sweep(xx, xy, xz, yy, yz, zz, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    m = _sweep(*_sweep(*_sweep(*m)))
-    xx, _, _, yy, _, zz, ax, ay, az, bx, by, bz, cx, cy, cz = m
+    swept = _sweep((xx, xy, xz, yy, yz, zz), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    matrix, a, b, c = _sweep(*_sweep(*_sweep(*swept)))
+    xx, _, _, yy, _, zz = matrix
+    ax, ay, az = a
+    bx, by, bz = b
+    cx, cy, cz = c
     xx, yy, zz = max(xx, 0.0), max(yy, 0.0), max(zz, 0.0)
     # Sort downwards, the vectors with their values.
     swap = xx < yy
@@ -163,15 +172,14 @@ def eigen3(xx, xy, xz, yy, yz, zz):
 
 @device(forceinline=True)
 def entropy_term(e):
-    """-e ln e, 0 for e = 0 (and below 1e-290)."""
-    some = e > 1e-290
-    safe = e if some else 1.0
-    return -e * log_fast(safe) if some else 0.0
+    """Return -e ln e, 0 for e = 0 (and below 1e-290)."""
+    positive = e > 1e-290
+    return -e * log_fast(e if positive else 1.0) if positive else 0.0
 
 
 @device(forceinline=True)
 def eigenentropy(l1, l2, l3):
-    """Eigenentropy -sum e ln e of e_i = l_i / (l1 + l2 + l3); 0 where all are 0."""
+    """Return the eigenentropy -sum e ln e of e_i = l_i / (l1 + l2 + l3); 0 where all are 0."""
     total = l1 + l2 + l3
     scale = 1.0 / (total if total > 0.0 else 1.0)
     return entropy_term(l1 * scale) + entropy_term(l2 * scale) + entropy_term(l3 * scale)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from .feature_table import FeatureTable
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .point_grid import CellGrid, build_grid, check_xyz
 from .shape_bins import ShapeBins
-from .shape_distributions import SAMPLES, smallest_hashes
+from .shape_distributions import SAMPLES, Fitted, smallest_hashes
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
@@ -28,14 +28,18 @@ if TYPE_CHECKING:
 
 #: Rows of a block, whatever the memory allows: Ctrl-C waits for the blocks in work.
 MOST_ROWS = 4096
-#: Bytes of a row besides its features, and for each neighborhood.
-ROW_BYTES, NEIGHBORHOOD_BYTES = 200, 130
+#: Fewest distinct queries of a block.
+LEAST_ROWS = 64
+#: Bytes of a row besides its features.
+ROW_BYTES = 200
+#: Bytes of a row for each neighborhood.
+NEIGHBORHOOD_BYTES = 130
 
 #: The queries' own dimensions: (m,) values each, or what gives those of a block's queries, named
 #: by their indices.
 Given = Mapping[str, npt.ArrayLike] | Callable[[np.ndarray], Mapping[str, np.ndarray]] | None
 
-#: What a block counted: by kind, then by neighborhood.
+#: Counts of a block: by kind, then by neighborhood.
 Tally = dict[str, dict[str, int]]
 
 
@@ -114,7 +118,13 @@ class FeatureEngine:
         self.report = Report({"points": len(self.grid), "queries": 0, "fewer_than_three": {}})
 
     def __len__(self) -> int:
+        """Return the number of points of the cloud."""
         return len(self.grid)
+
+    @property
+    def fitted(self) -> Fitted:
+        """What was given or fitted, as the kernels take it."""
+        return Fitted(self.bins, self.copt_threshold, self.seed)
 
     # ---- fitting
     # -------------------------------------------------------------------------------------------
@@ -147,7 +157,10 @@ class FeatureEngine:
         return self
 
     def curvatures(self) -> np.ndarray:
-        """The curvature of every point, in the order of the cloud, (n,) float64 [H17 eq. 1]; for adaptive plans."""
+        """Return the curvature of the points, in the order of the cloud, (n,) float64 [H17 eq. 1].
+
+        The plan must have an adaptive neighborhood.
+        """
         adaptive = self.neighborhoods()[1]
         assert adaptive is not None
         out = np.empty(len(self))
@@ -155,27 +168,26 @@ class FeatureEngine:
         return out
 
     def shape_values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Neighborhood token -> metrics of all pulls round some points of the cloud, (m, 5, 255) float32, comparable."""
-        fixed, adaptive = self.neighborhoods()
+        """Return by token the metrics of all pulls round points of the cloud, comparable.
+
+        (m, METRICS, PULLS) float32 for m `rows`.
+        """
         x, y, z = np.ascontiguousarray(self.cloud[rows].T)
-        found = fixed.shape_values((x, y, z), self.seed)
-        if adaptive is not None:
-            found |= adaptive.shape_values((x, y, z), self.seed, self.copt_threshold)
-        return {
-            c.neighborhood.token: found[c.neighborhood.token] for c in self.plan.layout if c.shapes
-        }
+        values: dict[str, np.ndarray] = {}
+        for group in filter(None, self.neighborhoods()):
+            values |= group.shape_values((x, y, z), self.fitted)
+        shaped = (c.neighborhood.token for c in self.plan.layout if c.shapes)
+        return {token: values[token] for token in shaped}
 
     def neighborhoods(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
-        """The plan's neighborhoods, made for the cloud once."""
+        """Return the plan's neighborhoods, prepared for the cloud once."""
         with self._lock:
             if self._parts is None:
                 from .fixed_radius import FixedRadius
 
                 adaptive = None
-                if any(
-                    c.at and c.neighborhood.kind not in ("cylinder", "sphere")
-                    for c in self.plan.layout
-                ):
+                fixed = ("cylinder", "sphere")
+                if any(c.at and c.neighborhood.kind not in fixed for c in self.plan.layout):
                     from .adaptive import AdaptiveNeighborhoods
 
                     adaptive = AdaptiveNeighborhoods(self.grid, self.plan, self.threads)
@@ -239,9 +251,10 @@ class FeatureEngine:
     ) -> Run:
         """Return the blocks of queries to compute; parameters as for :meth:`blocks`.
 
-        A classifier computes a block's features and classifies it in one thread, so that the whole matrix is never held::
+        A classifier computes a block's features and classifies it in one thread, so that the whole
+        matrix is never held. Its function `classify` calls ``run.compute``::
 
-            for block, classes in map_blocks(classify, run.ranges, run.threads):  # classify calls run.compute
+            for block, classes in map_blocks(classify, run.ranges, run.threads):
                 run.count(block)
         """
         return Run(self, queries, dimensions, threads, memory_mb)
@@ -255,7 +268,10 @@ class FeatureEngine:
         memory_mb: float = 512,
         progress: Progress | bool | None = None,
     ) -> FeatureTable:
-        """The features of all queries as one table, row i for query i; parameters as for :meth:`blocks`."""
+        """Return the features of all queries as one table, row i for query i.
+
+        Parameters as for :meth:`blocks`.
+        """
         run = self.run(queries, dimensions=dimensions, threads=threads, memory_mb=memory_mb)
         values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
         for block in run.computed(progress):
@@ -267,15 +283,16 @@ class FeatureBlock(NamedTuple):
     """Features of some queries."""
 
     positions: np.ndarray  #: (b,) int64: which of the queries, in the user's order
-    rows: (
-        np.ndarray
-    )  #: (b,) int64: which points of the cloud they are; of coordinates the positions
+    rows: np.ndarray  #: (b,) int64: which points of the cloud; positions where they are coordinates
     values: np.ndarray  #: (b, features) float32
     tally: Tally
 
 
 class Run:
-    """One run over queries, sorted like the cloud and cut into blocks; arguments as of ``FeatureEngine.blocks``."""
+    """A run over queries, sorted like the cloud and cut into blocks.
+
+    Arguments as of :meth:`FeatureEngine.blocks`.
+    """
 
     def __init__(
         self,
@@ -294,8 +311,9 @@ class Run:
         self.grid = engine.grid if coordinates is None else build_grid(coordinates, self.plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
         self.threads = resolve_threads(engine.threads if threads is None else threads)
-        #: Sorted queries that are no copies of the one before; first and last (exclusive) of each block among these.
+        #: Sorted queries that are no copies of the one before.
         self.distinct = np.zeros(0, np.int64)
+        #: First distinct query of each block, and the first behind it.
         self.ranges: list[tuple[int, int]] = []
         if not count:
             return
@@ -308,17 +326,16 @@ class Run:
         new = np.ones(count, np.bool_)
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
         self.distinct = np.append(np.flatnonzero(new), count)
-        # Two results per thread may wait (map_blocks) and one is being made; copies of points
+        # Two results per thread may wait (map_blocks) and one is being computed; copies of points
         # double a block.
-        row = (
-            8 * len(self.plan.names) + ROW_BYTES + NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods)
-        )
+        row = NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods) + ROW_BYTES
+        row += 8 * len(self.plan.names)
         rows = min(
             memory_mb * 2**20 / ((2 * self.threads + 1) * row),
             MOST_ROWS,
             count / (4 * self.threads),
         )
-        starts = np.arange(0, len(self.distinct) - 1, max(int(rows), 64))
+        starts = np.arange(0, len(self.distinct) - 1, max(int(rows), LEAST_ROWS))
         self.ranges = list(pairwise([*starts.tolist(), len(self.distinct) - 1]))
 
     def compute(self, block: tuple[int, int]) -> FeatureBlock:
@@ -331,15 +348,11 @@ class Run:
         points = grid.x[at], grid.y[at], grid.z[at]
         width = len(plan.names)
         values = np.empty((len(at), width), np.float32)
-        few = np.zeros(len(self.fixed), np.int64)
-        self.fixed.fill(points, copies, engine.bins, engine.seed, few, values)
+        few = self.fixed.fill(points, copies, engine.fitted, values)
         tally: Tally = {"fewer_than_three": dict(zip(self.fixed.tokens, few.tolist(), strict=True))}
         if self.adaptive is not None:
             tokens = self.adaptive.tokens
-            few, far = np.zeros(len(tokens), np.int64), np.zeros(len(tokens), np.int64)
-            reach = self.adaptive.fill(
-                points, copies, engine.bins, engine.seed, engine.copt_threshold, few, far, values
-            )
+            few, far, reach = self.adaptive.fill(points, copies, engine.fitted, values)
             tally["fewer_than_three"].update(zip(tokens, few.tolist(), strict=True))
             self.reaches.append(reach)
             tally["beyond_halo"] = {
@@ -350,16 +363,15 @@ class Run:
         positions = grid.order[first:last].astype(np.int64)
         rows = positions if self.indices is None else self.indices[positions]
         if callable(self.dimensions):
-            found = self.dimensions(rows)
+            dimensions = self.dimensions(rows)
         else:
-            found = {name: given[positions] for name, given in self.dimensions.items()}
+            dimensions = {name: column[positions] for name, column in self.dimensions.items()}
+        axes = {"X": grid.x, "Y": grid.y, "Z": grid.z}
         for column, name in enumerate(plan.dimensions, width - len(plan.dimensions)):
-            given = found.get(name)
-            values[:, column] = (
-                {"X": grid.x, "Y": grid.y, "Z": grid.z}[name][first:last]
-                if given is None
-                else given
-            )
+            given_values = dimensions.get(name)
+            if given_values is None:
+                given_values = axes[name][first:last]
+            values[:, column] = given_values
         return FeatureBlock(positions, rows, values, tally)
 
     def computed(self, progress: Progress | bool | None = None) -> Iterator[FeatureBlock]:
@@ -387,7 +399,7 @@ class Run:
 
 
 def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Indices into the cloud (where the queries are such) and coordinates (None: those of the cloud)."""
+    """Return indices into the cloud, or None, and coordinates of queries, None for the whole cloud."""
     if queries is None:
         return None, None
     array = np.asarray(queries)
@@ -408,27 +420,28 @@ def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
 
 
 def _dimensions(
-    plan: FeaturePlan, given: Mapping[str, npt.ArrayLike] | None, count: int
+    plan: FeaturePlan, dimensions: Mapping[str, npt.ArrayLike] | None, count: int
 ) -> dict[str, np.ndarray]:
-    given = given or {}
-    found = {}
+    """Return the plan's dimensions of `count` queries; DimensionError for a missing or wrong one."""
+    dimensions = dimensions or {}
+    columns = {}
     for name in plan.dimensions:
-        if name not in given:
+        if name not in dimensions:
             if name in ("X", "Y", "Z"):
                 continue
             raise DimensionError(
                 f"the dimension '{name}' is needed as a feature but missing",
-                found=", ".join(map(str, given)) or "none",
+                found=", ".join(map(str, dimensions)) or "none",
                 cure=f"Give dimensions={{'{name}': values}}, or leave it out of the plan",
             )
-        values = np.asarray(given[name])
+        values = np.asarray(dimensions[name])
         if values.shape != (count,) or values.dtype.kind not in "fiub":
             raise DimensionError(
                 f"the dimension '{name}' must have one number per query",
                 found=f"shape {values.shape}, dtype {values.dtype}, for {count} queries",
             )
-        found[name] = values
-    return found
+        columns[name] = values
+    return columns
 
 
 def compute_features(
@@ -438,14 +451,11 @@ def compute_features(
     feature_set=DEFAULT_FEATURES,
     *,
     dimensions: Mapping[str, npt.ArrayLike] | None = None,
-    bins: ShapeBins | None = None,
-    copt_threshold: float | None = None,
-    seed: int = 0,
-    threads: int | None = None,
     memory_mb: float = 512,
     progress: Progress | bool | None = None,
+    **settings: Any,
 ) -> FeatureTable:
-    """Multi-scale features of a point cloud.
+    """Compute multi-scale features of a point cloud.
 
     Parameters
     ----------
@@ -463,11 +473,11 @@ def compute_features(
     dimensions : mapping of str to (m,) array
         The queries' own dimensions that the plan uses as features (HeightAboveGround for
         weinmann2018).
-    bins, copt_threshold, seed, threads
-        See :class:`FeatureEngine`.
     memory_mb : float
         Memory that blocks may take, over the cloud, its index and the table.
     progress : Progress or bool, optional
+    **settings
+        ``bins``, ``copt_threshold``, ``seed`` and ``threads`` of :class:`FeatureEngine`.
 
     Returns
     -------
@@ -483,9 +493,7 @@ def compute_features(
     """
     names = tuple(dimensions) if dimensions else ()
     plan = FeaturePlan.parse(neighborhoods, feature_set, names)
-    engine = FeatureEngine(
-        xyz, plan, bins=bins, copt_threshold=copt_threshold, seed=seed, threads=threads
-    )
+    engine = FeatureEngine(xyz, plan, **settings)
     return engine.table(queries, dimensions=dimensions, memory_mb=memory_mb, progress=progress)
 
 

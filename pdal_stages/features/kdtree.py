@@ -1,4 +1,10 @@
-"""A balanced k-d tree."""
+"""A balanced k-d tree, for searches whose cost does not depend on how points lie.
+
+Such as facades, strays and copies. Every node halves its points along the longest side of their
+bounding box. Only a permutation (4 bytes a point) and the nodes' boxes (about 6 bytes a point) are
+stored. A box is skipped only if the distance computed to it is larger than the reach, and computed
+distances are monotone in the coordinates: which points are gathered never depends on rounding.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +35,7 @@ class KdTree(NamedTuple):
 
 
 def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray, threads: int | None = None) -> KdTree:
-    """The tree over a cloud of 1 to 2**32 - 1 points, finite coordinates (n,) each; ValueError for other numbers."""
+    """Return the tree over a cloud of 1 to 2**32 - 1 points with finite coordinates (n,) each."""
     x, y, z = (np.ascontiguousarray(v, dtype=np.float64) for v in (x, y, z))
     n = len(x)
     if not 1 <= n < 2**32:
@@ -57,7 +63,7 @@ def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray, threads: int | None 
 
 @njit
 def build_nodes(tree, keys, node, lo, hi, depth, whole):
-    """Make a node, its points perm[lo:hi], and, of the `whole` subtree, the `depth` levels below it."""
+    """Make a node of the points perm[lo:hi] and, if `whole`, the `depth` levels below it."""
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     stack = np.empty((STACK, 4), np.int64)
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = node, lo, hi, depth
@@ -91,7 +97,7 @@ def build_nodes(tree, keys, node, lo, hi, depth, whole):
 
 @device
 def bounding_box(x, y, z, perm, lo, hi):
-    """Bounding box xmin, ymin, zmin, xmax, ymax, zmax of the points perm[lo:hi]."""
+    """Return the box xmin, ymin, zmin, xmax, ymax, zmax of the points perm[lo:hi]."""
     x0 = y0 = z0 = np.inf
     x1 = y1 = z1 = -np.inf
     for i in range(lo, hi):
@@ -104,7 +110,7 @@ def bounding_box(x, y, z, perm, lo, hi):
 
 @device
 def halve(x, y, z, perm, keys, lo, hi, box):
-    """Reorder perm[lo:hi] so that its halves lie on either side along the longest side of `box`."""
+    """Reorder perm[lo:hi] so that its halves lie on either side of the box; return the middle."""
     dx, dy, dz = box[3] - box[0], box[4] - box[1], box[5] - box[2]
     along = x if dx >= dy and dx >= dz else (y if dy >= dz else z)
     for i in range(lo, hi):
@@ -145,7 +151,7 @@ def select_nth(keys, perm, lo, hi, nth):
 
 @device(forceinline=True)
 def _gap(lo, hi, low, high):
-    """Distance along one axis between the intervals lo..hi and low..high."""
+    """Return the distance along one axis between the intervals lo..hi and low..high."""
     a, b = lo - high, low - hi
     gap = a if a > b else b
     return gap if gap > 0.0 else 0.0
@@ -153,7 +159,7 @@ def _gap(lo, hi, low, high):
 
 @device(forceinline=True)
 def gap2(box, boxes, n):
-    """Squared distance between a box and that of node n."""
+    """Return the squared distance between a box and that of node n."""
     dx = _gap(box[0], box[3], boxes[n, 0], boxes[n, 3])
     dy = _gap(box[1], box[4], boxes[n, 1], boxes[n, 4])
     dz = _gap(box[2], box[5], boxes[n, 2], boxes[n, 5])
@@ -162,7 +168,7 @@ def gap2(box, boxes, n):
 
 @device
 def enough2(tree, box, need):
-    """A squared distance from the point `box` within which `need` points of the tree lie; of all points, if more."""
+    """Return a squared distance from the point `box` within which `need` points lie, or all."""
     boxes = tree.boxes
     node, count = 0, len(tree.perm)
     for _ in range(tree.depth):
@@ -177,14 +183,23 @@ def enough2(tree, box, need):
 
 
 @device
-def gather(tree, box, reach2, copies, limit, stack, cx, cy, cz, ci):
-    """Collect the points within sqrt(`reach2`) of `box` into cx, cy, cz, ci; how many, or -1 for more than `limit`.
+def gather(tree, box, reach2, copies, limit, candidates):
+    """Collect the points within sqrt(`reach2`) of `box`; return how many, or -1 for more than `limit`.
+
+    `candidates` has room for them: arrays x, y, z, at (positions in the cloud) and a stack.
 
     Of points that all coincide at most about `copies` are taken, a leaf's worth more where they
     share leaves with others.
     """
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     x0, y0, z0, x1, y1, z1 = box
+    cx, cy, cz, ci, stack = (
+        candidates.x,
+        candidates.y,
+        candidates.z,
+        candidates.at,
+        candidates.stack,
+    )
     # Unsigned: what may be negative is looked up with a detour.
     count, one = np.uint64(0), np.uint64(1)
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, len(perm), tree.depth

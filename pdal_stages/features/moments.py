@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,7 +31,7 @@ REACH = 13  #: meters to the farthest point that matters to the choice
 MOMENTS = RADIUS
 ROWS = 14
 
-#: Rows of the features that :func:`finish` computes, and of the unit normal.
+#: Rows of the features that :func:`finish` computes, and of the unit normal, by name.
 ROW = rows_of(*MOMENT_FEATURES, "NormalX", "NormalY", "NormalZ")
 FEATURES = len(ROW)
 
@@ -39,11 +40,33 @@ BATCH = 256
 #: Columns of their scratch: not a power of two, whose rows would compete for the same cache lines.
 WIDTH = BATCH + 8
 
+#: Members that a neighborhood needs to have a structure.
+LEAST_MEMBERS = 3
+
 #: A variance below this part of the mean squared distance to the query is rounding: the points
 #: coincide.
 COINCIDENT = 1e-13
 
 _MOST = np.int64(2**63 - 1)
+
+# Rows of the scratch of :func:`finish`: a covariance matrix, and the number of its points, 0 where
+# they all coincide.
+XX = 0
+YY = 1
+ZZ = 2
+XY = 3
+XZ = 4
+YZ = 5
+COUNT = 6
+
+
+class Candidates(NamedTuple):
+    """Points that may be members of a neighborhood."""
+
+    x: np.ndarray  # float64, meters
+    y: np.ndarray
+    z: np.ndarray
+    keys: np.ndarray  # int64: :func:`height_key` of z
 
 
 @device(forceinline=True)
@@ -66,12 +89,14 @@ def distance2(dx, dy, dz, spherical):
 
 
 @device(fastmath=set(FAST))
-def sums_within(px, py, pz, keys, count, qx, qy, qz, spherical, r2, out, j):
-    """Write moments about (qx, qy, qz) of the first `count` candidates within sqrt(r2) of it.
+def sums_within(candidates, count, point, spherical, r2, out, j):
+    """Write moments about a point of the first `count` candidates within sqrt(r2) of it.
 
     They go to ``out[:, j]``. `spherical` is 1 for a sphere and 0 for a cylinder. The order of the sums follows from `count`
     alone.
     """
+    px, py, pz, keys = candidates
+    qx, qy, qz = point
     n = sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
     low, high = _MOST, -_MOST
     for i in range(count):
@@ -106,7 +131,7 @@ def write_eigen_features(values, j, n, l1, l2, l3, nz):
     all coincide, features are 0 and the surface variation is 1/3 [H17].
     """
     total = l1 + l2 + l3
-    real = (n >= 3) & (total > 0.0)
+    real = (n >= LEAST_MEMBERS) & (total > 0.0)
     scale = 1.0 / (total if real else 1.0)
     e1, e2, e3 = l1 * scale, l2 * scale, l3 * scale
     inverse = 1.0 / (l1 if real else 1.0)
@@ -120,7 +145,7 @@ def write_eigen_features(values, j, n, l1, l2, l3, nz):
     values[ROW.Eigenentropy, j] = entropy if real else 0.0
     values[ROW.EigenvalueSum, j] = total if real else 0.0
     values[ROW.SurfaceVariation, j] = e3 if real else 1.0 / 3.0
-    values[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= 3.0 else 0.0
+    values[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= LEAST_MEMBERS else 0.0
 
 
 @njit
@@ -128,8 +153,8 @@ def finish(table, volume, heights, few, copies, columns, out):
     """Write the features made of moments.
 
     With fewer than three points, or points that all coincide, eigen-features and Verticality are 0
-    and SurfaceVariation is 1/3 [H17]; heights are those of the points there are; with none
-    (queries that are not points of the cloud) 0.
+    and SurfaceVariation is 1/3 [H17]; heights are those of the points there are; without any
+    point (of queries that are not in the cloud) they are 0.
 
     Parameters
     ----------
@@ -148,7 +173,7 @@ def finish(table, volume, heights, few, copies, columns, out):
         (0, 0, 0) where there is none.
     """
     # Of constant shapes: rows known not to overlap let the loops be vectorized.
-    values, m = np.empty((FEATURES, WIDTH)), np.empty((7, WIDTH))
+    values, m = np.empty((FEATURES, WIDTH)), np.empty((COUNT + 1, WIDTH))
     for start in range(0, len(heights), BATCH):
         count = min(BATCH, len(heights) - start)
         moments = table[:, start : start + count]
@@ -161,12 +186,12 @@ def finish(table, volume, heights, few, copies, columns, out):
             ax, ay, az = ax * inverse, ay * inverse, az * inverse
             xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
             apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
-            m[0, j], m[1, j], m[2, j] = xx, yy, zz
-            m[3, j] = moments[SXY, j] * inverse - mx * my
-            m[4, j] = moments[SXZ, j] * inverse - mx * mz
-            m[5, j] = moments[SYZ, j] * inverse - my * mz
+            m[XX, j], m[YY, j], m[ZZ, j] = xx, yy, zz
+            m[XY, j] = moments[SXY, j] * inverse - mx * my
+            m[XZ, j] = moments[SXZ, j] * inverse - mx * mz
+            m[YZ, j] = moments[SYZ, j] * inverse - my * mz
             # Not read from the moments again, which LLVM must fear to overlap with what is written.
-            m[6, j] = n if apart else 0.0
+            m[COUNT, j] = n if apart else 0.0
             values[ROW.HeightRange, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
             values[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
             values[ROW.HeightAboveLowest, j] = (
@@ -179,15 +204,17 @@ def finish(table, volume, heights, few, copies, columns, out):
                 4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume
             )
         for j in range(count):
-            n = m[6, j]
-            l1, l2, l3, nx, ny, nz = eigen3(m[0, j], m[3, j], m[4, j], m[1, j], m[5, j], m[2, j])
-            real = 1.0 if n >= 3.0 else 0.0
+            n = m[COUNT, j]
+            l1, l2, l3, nx, ny, nz = eigen3(
+                m[XX, j], m[XY, j], m[XZ, j], m[YY, j], m[YZ, j], m[ZZ, j]
+            )
+            real = 1.0 if n >= LEAST_MEMBERS else 0.0
             values[ROW.NormalX, j] = real * nx
             values[ROW.NormalY, j] = real * ny
             values[ROW.NormalZ, j] = real * nz
             write_eigen_features(values, j, n, l1, l2, l3, nz)
         for j in range(count):
-            if moments[N, j] < 3.0:
+            if moments[N, j] < LEAST_MEMBERS:
                 few[0] += copies[start + j]
         for f in range(len(columns)):
             if columns[f] >= 0:

@@ -24,9 +24,12 @@ GROUP = 8
 #: Bins of squared distance; behind them what lies beyond the reach.
 BINS = 64
 
-#: First guess of the squared reach, the least, and by how much the next is larger than what the
-#: last needed.
-FIRST2, LEAST2, MORE = 1.0, 1e-6, 1.2
+#: First guess of the squared reach, square meters.
+FIRST2 = 1.0
+#: Least squared reach, square meters.
+LEAST2 = 1e-6
+#: The next guess is larger by this factor than what the last queries needed.
+MORE = 1.2
 
 #: A search for `need` neighbors that meets more than CROWD * need + ROOM candidates looks closer.
 CROWD = 4
@@ -34,6 +37,24 @@ ROOM = 256
 
 #: Squared meters too small to divide by.
 TINY = 1e-200
+
+
+class Queries(NamedTuple):
+    """Places of a block whose neighbors are searched, in groups that lie together."""
+
+    x: np.ndarray  # (m,) float64
+    y: np.ndarray
+    z: np.ndarray
+    order: np.ndarray  # (m,) uint32: queries, group by group
+    starts: np.ndarray  # (groups + 1,) int64: where groups begin in the order
+
+
+class Wanted(NamedTuple):
+    """The neighbors that a search must not miss."""
+
+    need: int  # at least so many of those within `cap2`
+    within2: float  # all within this squared distance, square meters
+    cap2: float
 
 
 class Near(NamedTuple):
@@ -53,6 +74,7 @@ class Near(NamedTuple):
 
 @device(_nrt=True)
 def make_near(room):
+    """Return room for `room` candidates."""
     f, u = np.float64, np.uint32
     return Near(
         np.empty(room, f), np.empty(room, f), np.empty(room, f), np.empty(room, u), np.empty(room, f),
@@ -63,7 +85,7 @@ def make_near(room):
 
 @device(_nrt=True)
 def make_groups(qx, qy, qz):
-    """Order of queries, (m,) uint32, and where groups of at most GROUP that lie together start, (groups + 1,)."""
+    """Return queries in groups of at most GROUP that lie together."""
     m = len(qx)
     order, keys = np.arange(m).astype(np.uint32), np.empty(m)
     starts, count = np.empty(m + 1, np.int64), 0
@@ -83,37 +105,35 @@ def make_groups(qx, qy, qz):
         stack[top, 0], stack[top, 1] = lo, middle
         top += 1
     starts[count] = m
-    return order, starts[: count + 1]
+    return Queries(qx, qy, qz, order, starts[: count + 1])
 
 
 @device
-def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, near):
-    """Candidates of the queries order[lo:hi], or of the first alone where they are too many or lie too far apart.
+def gather_near(tree, queries, lo, hi, wanted, reach2, near):
+    """Find candidates for the queries order[lo:hi], or for the first alone.
 
-    At least the points within `within2` (squared meters) are wanted, at least `need` of those
-    within `cap2`.
+    That happens where candidates are too many or the queries lie too far apart.
 
     Returns
     -------
     hi : int
         Up to where queries are served.
     count : int
-        Of the candidates in `near`; -1 where these are too many for it.
+        Number of the candidates in `near`; -1 where these are too many for it.
     reach2 : float
         Squared distance within which no point of the cloud is missing.
     """
+    need, within2, cap2 = wanted.need, wanted.within2, wanted.cap2
     room = len(near.x)
     limit = room if within2 > 0.0 else min(room, CROWD * need + ROOM)
     copies = need if within2 == 0.0 else len(tree.perm)
     while True:
-        box = bounding_box(qx, qy, qz, order, lo, hi)
+        box = bounding_box(queries.x, queries.y, queries.z, queries.order, lo, hi)
         side = max(box[3] - box[0], box[4] - box[1], box[5] - box[2])
         if hi - lo > 1 and side * side > 4.0 * reach2:
             hi = lo + 1
             continue
-        count = gather(
-            tree, box, reach2, copies, limit, near.stack, near.x, near.y, near.z, near.at
-        )
+        count = gather(tree, box, reach2, copies, limit, near)
         if count >= need or (count >= 0 and reach2 >= cap2):
             return hi, count, reach2
         if count >= 0:
@@ -132,12 +152,17 @@ def gather_near(tree, qx, qy, qz, order, lo, hi, need, within2, cap2, reach2, ne
 
 
 @device(forceinline=True)
-def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
-    """Sort the neighbors of one query into near.sorted and near.pos; how many, or -1 where `reach2` is too short."""
+def sort_near(near, count, point, wanted, reach2):
+    """Sort the neighbors of a point (x, y, z) into near.sorted and near.pos.
+
+    Return how many there are, or -1 where `reach2` is too short.
+    """
     x, y, z, d2, bins, hist = near.x, near.y, near.z, near.d2, near.bins, near.hist
+    need, within2, cap2 = wanted.need, wanted.within2, wanted.cap2
+    px, py, pz = point
     scale = BINS / max(reach2, TINY)
     for i in range(count):
-        dx, dy, dz = x[i] - qx, y[i] - qy, z[i] - qz
+        dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
         d = dx * dx + dy * dy + dz * dz
         d2[i] = d
         b = d * scale
@@ -150,11 +175,8 @@ def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
     if there < need and reach2 < cap2:
         return -1
     most = there if within2 > 0.0 else min(need, there)
-    end, last, largest = (
-        0,
-        0,
-        0,
-    )  # where each bin starts; up to which the bins hold enough; what one holds
+    # Where each bin starts; up to which bin they hold enough; the largest number in one.
+    end, last, largest = 0, 0, 0
     while end < most:
         size = hist[last]
         hist[last] = end
@@ -179,7 +201,7 @@ def sort_near(near, count, qx, qy, qz, need, within2, cap2, reach2):
 
 @device(forceinline=True)
 def _before(d, a, e, b, x, y, z):
-    """Whether candidate a at squared distance d comes before candidate b at e."""
+    """Return whether candidate a at squared distance d comes before candidate b at e."""
     if d != e:
         return d < e
     if x[a] != x[b]:
@@ -191,7 +213,7 @@ def _before(d, a, e, b, x, y, z):
 
 @device
 def _shell_sort(d, pos, end, largest, x, y, z):
-    """Sort the first `end` of candidates that lie at most `largest` places from theirs (Shell 1959, Knuth's gaps)."""
+    """Sort the first `end` candidates, at most `largest` places from theirs (Shell 1959, Knuth)."""
     gap = 1
     while 9 * gap < largest:
         gap = 3 * gap + 1

@@ -20,10 +20,13 @@ from .moments import FEATURES
 from .moments import ROW as MOMENT_ROW
 from .registry import SURFACE_FEATURES, rows_of
 
-#: Columns of the table of surfaces, float32: unit normal, surface variation, distance to the
-#: farthest of the 10 (infinite where there are fewer).
-NX, NY, NZ, VARIATION, FAR = range(5)
-SURFACE = 5
+# Columns of the table of surfaces, float32.
+NX = 0  #: unit normal
+NY = 1
+NZ = 2
+VARIATION = 3  #: surface variation
+FAR = 4  #: meters to the farthest of the 10 neighbors, infinite where there are fewer
+SURFACE = 5  #: number of columns
 
 #: Where :func:`moments.finish` writes what the 10 nearest make, all but the reach.
 COLUMNS = np.full(FEATURES, -1)
@@ -45,8 +48,8 @@ def _write(out, column, value):
 
 
 @device(forceinline=True)
-def agreement(surfaces, near, count, own, columns, out):
-    """Write features of the first `count` neighbors of a query whose surface is `own`.
+def agreement(surfaces, near, count, surface, columns, out):
+    """Write features of the first `count` neighbors of a query with the given `surface`.
 
     `columns` has the column of `out` for each of :data:`ROW`; -1: not wanted. Returns the distance
     in meters from the query to the farthest point that the features depend on.
@@ -56,7 +59,7 @@ def agreement(surfaces, near, count, own, columns, out):
         wanted |= columns[row] >= 0
     if not wanted:
         return 0.0
-    nx, ny, nz = np.float64(own[NX]), np.float64(own[NY]), np.float64(own[NZ])
+    nx, ny, nz = np.float64(surface[NX]), np.float64(surface[NY]), np.float64(surface[NZ])
     first = np.float64(surfaces[near.at[near.pos[0]], VARIATION])
     agree = total = squares = far = 0.0
     low = first
@@ -76,4 +79,4 @@ def agreement(surfaces, near, count, own, columns, out):
     _write(out, columns[ROW.SurfaceVariationMin], low)
     _write(out, columns[ROW.SurfaceVariationMean], first + mean)
     _write(out, columns[ROW.SurfaceVariationStd], deviation)
-    return max(far, np.float64(own[FAR]))
+    return max(far, np.float64(surface[FAR]))

@@ -1,24 +1,15 @@
-"""Where points lie, for searches around them: the absolute grid and the k-d tree.
+"""A cloud sorted by the cells of the absolute grid, and a sparse table of its cells.
 
-The grid: a cloud sorted once, by cell and then by coordinates, and a sparse table of its cells.
-
-Cells are anchored to absolute coordinates (``floor(x / cell)``) and their size follows from the
-neighborhoods alone, never from the cloud, so every tile of a cloud sees the same cells with the
-same points in the same order. That order is what makes sums the same to the last bit however the
-points were stored.
-
-Only occupied cells are kept, so one stray point a million kilometers away costs one cell.
-
-The tree: balanced, for searches whose cost does not depend on how points lie: facades, strays,
-copies. Every node halves its points along the longest side of their bounding box. Only a
-permutation (4 bytes a point) and the nodes' boxes (about 6 bytes a point) are stored. A box is
-skipped only if the distance computed to it is larger than the reach, and computed distances are
-monotone in the coordinates: which points are gathered never depends on rounding.
+The size of cells follows from the neighborhoods alone, never from the cloud, so every tile of a cloud
+sees the same cells with the same points in the same order. That order is what makes sums the same to
+the last bit however the points were stored. Only occupied cells are kept, so one stray point a million
+kilometers away costs one cell.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +21,19 @@ LIMIT = 1e12
 
 #: Values behind the last coordinate that kernels may read.
 SPARE = 8
+
+
+class GridTables(NamedTuple):
+    """A sorted cloud and its occupied cells as kernels take them; see :class:`CellGrid`."""
+
+    cell: float
+    x: np.ndarray  # with spare values behind, as y and z
+    y: np.ndarray
+    z: np.ndarray
+    cell_ix: np.ndarray
+    cell_start: np.ndarray
+    row_iy: np.ndarray
+    row_start: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,7 @@ class CellGrid:
     row_start: np.ndarray
 
     def __len__(self) -> int:
+        """Return the number of points."""
         return len(self.order)
 
     @property
@@ -72,17 +77,18 @@ class CellGrid:
 
     @property
     def coordinates(self) -> np.ndarray:
-        """(n, 3) the sorted cloud, a view."""
+        """The sorted cloud (n, 3), a view."""
         return self.xyz[:, : len(self)].T
 
-    def tables(self) -> tuple[np.ndarray, ...]:
-        """The arrays kernels take: x, y, z (with spare values behind), cell_ix, cell_start, row_iy, row_start."""
+    def tables(self) -> GridTables:
+        """Return the grid as kernels take it."""
         x, y, z = self.xyz
-        return x, y, z, self.cell_ix, self.cell_start, self.row_iy, self.row_start
+        cells = self.cell_ix, self.cell_start, self.row_iy, self.row_start
+        return GridTables(self.cell, x, y, z, *cells)
 
 
 def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
-    """`xyz` as an (n, 3) float64 array, or a StageError that says what is wrong with it.
+    """Return coordinates as an (n, 3) float64 array; StageError if they cannot be.
 
     No copy is made of an array that already is one. NaN, infinite and absurdly large (beyond 1e12
     m) coordinates are refused and counted, and so is float32 too coarse for the size of its
@@ -127,7 +133,8 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
     if array.dtype == np.float32 and largest > 1e5:
         raise StageError(
             f"'{what}' is float32, too coarse for coordinates of this size",
-            found=f"up to {largest:.0f} m, where float32 has steps of {float(np.spacing(np.float32(largest))):.2g} m",
+            found=f"up to {largest:.0f} m, where float32 has steps of "
+            f"{float(np.spacing(np.float32(largest))):.2g} m",
             cure="Read the coordinates as float64",
         )
     return array if array.dtype == np.float64 else array.astype(np.float64)
@@ -140,7 +147,7 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
     """
     n = len(xyz)
     key, _ = compact_keys(xyz[:, :2], cell)
-    order = _sorted(xyz, key, cell)
+    order = _order(xyz, key, cell)
     starts = np.flatnonzero(begins_run(key[order]))
     del key
     ix, iy = (cell_numbers(xyz[order[starts], axis], cell) for axis in range(2))
@@ -161,8 +168,11 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
     )
 
 
-def _sorted(xyz: np.ndarray, key: np.ndarray, cell: float) -> np.ndarray:
-    """Order of the points by cell and coordinates: by one number of cell and x first, of which few are equal."""
+def _order(xyz: np.ndarray, key: np.ndarray, cell: float) -> np.ndarray:
+    """Return the order of points by cell and coordinates.
+
+    They are sorted by one number of cell and x first, of which few are equal.
+    """
     bits = min(62 - int(key.max(initial=0)).bit_length(), 30)
     x = xyz[:, 0] * (1.0 / cell)
     fine = (key << bits) + np.floor((x - np.floor(x)) * 2.0**bits).astype(np.int64)

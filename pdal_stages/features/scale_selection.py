@@ -22,13 +22,20 @@ MARGIN = 2e-6
 #: Entropies closer than this are equal.
 TIE = 1e-9
 
-#: Entropy of what is no candidate.
+#: Entropy of what is not a candidate: more than ln 3, which no matrix exceeds.
 NEVER = 9.0
+
+#: Smaller parts of the trace count as this, whose logarithm is finite.
+LEAST_PART = 1e-16
 
 
 @device
-def add_up(near, qx, qy, qz, ends, first, last, s):
-    """Moments s[:MOMENTS, j] of the first ends[j] neighbors, for j from `first` to `last`, for which ends ascend."""
+def add_up(near, point, ends, first, last, s):
+    """Write moments s[:MOMENTS, j] of the first ends[j] neighbors, for j from `first` to `last`.
+
+    They are about the point, and the ends of these ascend.
+    """
+    qx, qy, qz = point
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
     low, high = np.inf, -np.inf
     i = 0
@@ -57,14 +64,14 @@ def add_up(near, qx, qy, qz, ends, first, last, s):
 
 @device
 def write_moments(s, j, table, column):
-    """The sums `j` as a column of a table of moments."""
+    """Write the sums `j` to a column of a table of moments."""
     for m in range(MOMENTS):
         table[m, column] = s[m, j]
 
 
 @device(fastmath=set(FAST), forceinline=True)
 def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
-    """Eigenentropy of a covariance matrix to 1e-7, in closed form and without a branch.
+    """Return the eigenentropy of a covariance matrix to 1e-7, in closed form without a branch.
 
     ``NEVER`` where the trace is not above `noise`.
 
@@ -73,8 +80,8 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
     8 (fitted at Chebyshev nodes, error 7e-10); r < 0 is its mirror image.
     """
     trace = xx + yy + zz
-    some = trace > noise
-    scale = 1.0 / (trace if some else 1.0)
+    real = trace > noise
+    scale = 1.0 / (trace if real else 1.0)
     third = 1.0 / 3.0
     a, b, c = xx * scale - third, yy * scale - third, zz * scale - third
     d, e, f = xy * scale, xz * scale, yz * scale
@@ -97,19 +104,19 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
     ss = (1.0 - r) * g
     cosine = sign * p * math.sqrt(1.0 - ss)
     sine = 1.7320508075688772 * p * math.sqrt(ss)
-    one = third + 2.0 * cosine
-    two = third - cosine + sine
-    three = third - cosine - sine
-    one = one if one > 1e-16 else 1e-16
-    two = two if two > 1e-16 else 1e-16
-    three = three if three > 1e-16 else 1e-16
-    entropy = -(one * log_fast(one) + two * log_fast(two) + three * log_fast(three))
-    return entropy if some else NEVER
+    e1 = third + 2.0 * cosine
+    e2 = third - cosine + sine
+    e3 = third - cosine - sine
+    e1 = e1 if e1 > LEAST_PART else LEAST_PART
+    e2 = e2 if e2 > LEAST_PART else LEAST_PART
+    e3 = e3 if e3 > LEAST_PART else LEAST_PART
+    entropy = -(e1 * log_fast(e1) + e2 * log_fast(e2) + e3 * log_fast(e3))
+    return entropy if real else NEVER
 
 
 @device
 def eigenvalues_of(s, j):
-    """Eigenvalues of the covariance matrix of the sums `j`, and the mean squared distance to the query."""
+    """Return eigenvalues of the covariance of the sums `j`, and their mean squared distance."""
     w = 1.0 / s[N, j]
     x, y, z = s[SX, j] * w, s[SY, j] * w, s[SZ, j] * w
     xx, yy, zz = s[SXX, j] * w, s[SYY, j] * w, s[SZZ, j] * w
@@ -121,8 +128,10 @@ def eigenvalues_of(s, j):
 
 
 @device
-def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last, least):
+def estimate_entropies(s, entropy, first, last, least):
     """Estimate the eigenentropies of the candidates first..last - 1 of at least `least` members."""
+    n, x, y, z = s[N], s[SX], s[SY], s[SZ]
+    xx, xy, xz, yy, yz, zz = s[SXX], s[SXY], s[SXZ], s[SYY], s[SYZ], s[SZZ]
     for j in range(first, last):
         w = 1.0 / n[j]
         a, b, c = x[j] * w, y[j] * w, z[j] * w
@@ -135,7 +144,9 @@ def estimate_entropies(n, x, y, z, xx, xy, xz, yy, yz, zz, entropy, first, last,
 
 @device
 def lowest_entropy(s, first, last, least_members):
-    """The candidate of first..last - 1 with the lowest eigenentropy; last - 1 where none qualifies.
+    """Return the candidate of first..last - 1 with the lowest eigenentropy; or last - 1.
+
+    The last one is taken where none qualifies.
 
     Parameters
     ----------
@@ -148,10 +159,7 @@ def lowest_entropy(s, first, last, least_members):
     if last - first <= 1:
         return last - 1
     entropy = s[MOMENTS]
-    estimate_entropies(
-        s[N], s[SX], s[SY], s[SZ], s[SXX], s[SXY], s[SXZ], s[SYY], s[SYZ], s[SZZ],
-        entropy, first, last, least_members,
-    )  # fmt: skip
+    estimate_entropies(s, entropy, first, last, least_members)
     least = NEVER
     for j in range(first, last):
         least = min(least, entropy[j])

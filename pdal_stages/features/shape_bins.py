@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,17 @@ from .registry import SHAPE_BINS, SHAPES
 METRICS = tuple(SHAPES)
 #: Inner thresholds of the bins.
 INNER = SHAPE_BINS - 1
+#: How a metric in radians or meters becomes the value that kernels compare, and the way back.
+COMPARABLE: dict[str, tuple[Callable, Callable]] = {
+    "A3": (
+        lambda t: -np.cos(t) * np.abs(np.cos(t)),
+        lambda v: np.arccos(np.clip(-np.sign(v) * np.sqrt(np.abs(v)), -1, 1)),
+    ),
+    "D1": (np.square, np.sqrt),
+    "D2": (np.square, np.sqrt),
+    "D3": (lambda t: 4 * t**4, lambda v: (v / 4) ** 0.25),
+    "D4": (lambda t: 6 * t**3, lambda v: np.cbrt(v / 6)),
+}
 
 _CURE = "Fit the thresholds again, or take them from the model file as it was written"
 
@@ -40,12 +51,12 @@ class ShapeBins:
 
     def __init__(self, thresholds: Mapping[str, Any]) -> None:
         self._thresholds = {
-            str(token): _checked(str(token), rows) for token, rows in thresholds.items()
+            str(token): _check(str(token), rows) for token, rows in thresholds.items()
         }
 
     @classmethod
     def fit(cls, values: Mapping[str, np.ndarray]) -> ShapeBins:
-        """Thresholds at the 10 %, 20 %, ... 90 % quantiles of sample values.
+        """Return thresholds at the 10 %, 20 %, ... 90 % quantiles of sample values.
 
         A threshold is one of the values, so values that often repeat (areas of 0 on a line) make
         equal thresholds and empty bins, and nothing else does. `values` are the pulls (m, 5, 255)
@@ -61,11 +72,11 @@ class ShapeBins:
                 column = np.asarray(sample)[:, m, :].ravel()
                 column = np.sort(column[np.isfinite(column)]).astype(np.float64)
                 if len(column):
-                    at = (
-                        np.ceil(len(column) * np.arange(1, INNER + 1) / (INNER + 1)).astype(int) - 1
-                    )
-                    rows[m] = column[at]
-            result[token] = _to_units(rows)
+                    place = np.ceil(len(column) * np.arange(1, SHAPE_BINS) / SHAPE_BINS)
+                    rows[m] = column[place.astype(int) - 1]
+            result[token] = [
+                COMPARABLE[name][1](row) for name, row in zip(METRICS, rows, strict=True)
+            ]
         return cls(result)
 
     @property
@@ -74,7 +85,7 @@ class ShapeBins:
         return tuple(self._thresholds)
 
     def thresholds(self, token: str) -> np.ndarray:
-        """Thresholds of one neighborhood: (5, 9) float64, in radians and meters."""
+        """Return the thresholds of one neighborhood, (metrics, 9) float64, in radians and meters."""
         try:
             return self._thresholds[token].copy()
         except KeyError:
@@ -85,16 +96,16 @@ class ShapeBins:
             ) from None
 
     def comparable(self, tokens: Iterable[str]) -> np.ndarray:
-        """Thresholds as the kernels compare them: (neighborhoods, 5, 9) float32."""
-        found = []
-        for token in tokens:
-            a3, d1, d2, d3, d4 = self.thresholds(token)
-            cosine = np.cos(a3)
-            found.append([-cosine * np.abs(cosine), d1**2, d2**2, 4 * d3**4, 6 * d4**3])
-        return np.array(found, np.float32).reshape(-1, len(METRICS), INNER)
+        """Return thresholds as the kernels compare them: (neighborhoods, metrics, 9) float32."""
+        rows = [
+            COMPARABLE[name][0](row)
+            for token in tokens
+            for name, row in zip(METRICS, self.thresholds(token), strict=True)
+        ]
+        return np.array(rows, np.float32).reshape(-1, len(METRICS), INNER)
 
     def to_dict(self) -> dict[str, Any]:
-        """``{"c1": {"A3": [9 numbers], "D1": ...}, ...}``, JSON-able and exact."""
+        """Return ``{"c1": {"A3": [9 numbers], "D1": ...}, ...}``, JSON-able and exact."""
         return {
             token: {name: [float(v) for v in row] for name, row in zip(METRICS, rows, strict=True)}
             for token, rows in self._thresholds.items()
@@ -102,7 +113,7 @@ class ShapeBins:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> ShapeBins:
-        """The bins that :meth:`to_dict` described; OptionError where it is not such a description."""
+        """Return the bins that :meth:`to_dict` described; OptionError for another description."""
         each = data.values() if isinstance(data, Mapping) else [None]
         if not all(isinstance(rows, Mapping) and set(rows) == set(METRICS) for rows in each):
             raise OptionError(
@@ -113,10 +124,12 @@ class ShapeBins:
         return cls({token: [rows[name] for name in METRICS] for token, rows in data.items()})
 
     def __eq__(self, other: object) -> bool:
+        """Return whether all thresholds are equal."""
         return isinstance(other, ShapeBins) and self.to_dict() == other.to_dict()
 
 
-def _checked(token: str, rows: Any) -> np.ndarray:
+def _check(token: str, rows: Any) -> np.ndarray:
+    """Return thresholds as an array (metrics, 9); OptionError where they cannot be."""
     try:
         array = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError):
@@ -138,18 +151,3 @@ def _checked(token: str, rows: Any) -> np.ndarray:
                 cure=_CURE,
             )
     return array
-
-
-def _to_units(rows: np.ndarray) -> np.ndarray:
-    """Comparable values (see ``shapes``) as radians and meters."""
-    a3, d1, d2, d3, d4 = rows
-    cosine = -np.sign(a3) * np.sqrt(np.abs(a3))
-    return np.array(
-        [
-            np.arccos(np.clip(cosine, -1, 1)),
-            np.sqrt(d1),
-            np.sqrt(d2),
-            (d3 / 4) ** 0.25,
-            np.cbrt(d4 / 6),
-        ]
-    )

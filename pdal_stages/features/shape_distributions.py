@@ -15,6 +15,9 @@ share their chance, for a third of the memory traffic. Where members run out (n 
 drawn ones take the empty places: c, d = a, b for two members, d = a for three, so areas or volumes
 are 0, as they are. The angle is 0 where b or c coincides with a.
 
+A new metric is an entry of ``registry.SHAPES``, a line in :func:`measure` and an entry of
+``shape_bins.COMPARABLE``; columns, groups and the size of every array follow.
+
 **No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's float64
 coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the
 same bits for any order of points, tile or number of threads.
@@ -35,7 +38,7 @@ import numpy as np
 from ..base.hashing import GOLDEN, finalize
 from ..base.jit import device, njit
 from .plan import Columns, columns_of
-from .registry import SHAPE_FEATURES
+from .registry import MOMENT_FEATURES, SHAPE_BINS, SHAPE_FEATURES, SHAPES, rows_of
 from .shape_bins import ShapeBins
 
 #: x, y and z of points, (m,) float64 each.
@@ -47,11 +50,23 @@ PULLS = 255
 #: Arrays are padded to whole vectors.
 ROOM = 256
 
-BINS = 10
+#: Points that a pull draws.
+DRAWN = 4
 
-#: Sample neighborhoods to which bins are fitted [B16 3.2.2], and points hashed at a time to choose
-#: them.
-SAMPLES, _TOGETHER = 500, 1_000_000
+#: Rows of the metrics, by name, and their number.
+ROW = rows_of(*SHAPES)
+METRICS = len(ROW)
+
+#: Inner thresholds of a metric's bins.
+INNER = SHAPE_BINS - 1
+
+#: Features of a neighborhood.
+FEATURES = METRICS * SHAPE_BINS
+
+#: Sample neighborhoods to which bins are fitted [B16 3.2.2].
+SAMPLES = 500
+#: Points that are hashed at a time to choose them.
+_BATCH = 1_000_000
 
 #: Product of two squared lengths (m^4) below which an angle is not defined, and 0.
 NO_ANGLE = 1e-30
@@ -60,60 +75,100 @@ NO_ANGLE = 1e-30
 class Work(NamedTuple):
     """Scratch of one thread."""
 
-    draws: np.ndarray  # (4 * ROOM,) uint32: members drawn, all a, then all b, ...
-    points: np.ndarray  # (16 * ROOM,) float32: their records
-    values: np.ndarray  # (5 * ROOM,) float32: the metrics, comparable
-    above: np.ndarray  # (5, 9) float32
+    draws: np.ndarray  # (DRAWN * ROOM,) uint32: members drawn, all a, then all b, ...
+    points: np.ndarray  # (DRAWN * 4 * ROOM,) float32: their records
+    values: np.ndarray  # (METRICS * ROOM,) float32: the metrics, comparable
+    above: np.ndarray  # (METRICS, INNER) float32
 
 
 class Shapes(NamedTuple):
     """The shape distributions wanted of k neighborhoods for m queries, and what they take."""
 
-    shaped: np.ndarray  # (k,) bool: of which neighborhoods
-    columns: np.ndarray  # (k, 50) int64: columns of the output, or -1
-    thresholds: np.ndarray  # (k, 5, 9) float32: of the bins, comparable
+    shaped: np.ndarray  # (k,) bool: which neighborhoods have some
+    columns: np.ndarray  # (k, FEATURES) int64: columns of the output, or -1
+    thresholds: np.ndarray  # (k, METRICS, INNER) float32: of the bins, comparable
     seeds: np.ndarray  # (k, m) uint64: ``point_seeds`` of the queries, used where `shaped`
-    # (k, m, 5, 255) float32: gets the pulls' metrics in place of the output; m = 0 for none
+    # (k, m, METRICS, PULLS) float32: takes the pulls' metrics in place of the output; m = 0: none
     values: np.ndarray
-    counts: np.ndarray  # (50,) float32: scratch
+    counts: np.ndarray  # (FEATURES,) float32: scratch
     work: Work
 
 
 def make_work() -> Work:
-    """Scratch for one thread."""
+    """Return scratch for one thread."""
     u, f = np.uint32, np.float32
     return Work(
-        np.zeros(4 * ROOM, u), np.zeros(16 * ROOM, f), np.zeros(5 * ROOM, f), np.zeros((5, 9), f)
+        np.zeros(DRAWN * ROOM, u),
+        np.zeros(DRAWN * 4 * ROOM, f),
+        np.zeros(METRICS * ROOM, f),
+        np.zeros((METRICS, INNER), f),
     )
 
 
 def shapes_of(chosen: Sequence[Columns], points: Axes, seed: int, bins: ShapeBins | None) -> Shapes:
-    """What a kernel makes of the shapes of the `chosen` neighborhoods of points.
+    """Return what a kernel takes to compute the shapes of the `chosen` neighborhoods of points.
 
-    Counts in `bins`, or, without, the metrics of all pulls, to which bins are fitted.
+    It counts pulls in `bins`, or, without, writes the metrics of all pulls, to which bins are
+    fitted.
     """
     k, m = len(chosen), len(points[0])
-    thresholds, seeds = np.zeros((k, 5, 9), np.float32), np.zeros((k, m), np.uint64)
-    for number, one in enumerate(chosen):
-        if one.shapes:
-            seeds[number] = point_seeds(*points, seed, one.neighborhood.token)
+    thresholds, seeds = np.zeros((k, METRICS, INNER), np.float32), np.zeros((k, m), np.uint64)
+    for number, columns in enumerate(chosen):
+        if columns.shapes:
+            token = columns.neighborhood.token
+            seeds[number] = point_seeds(*points, seed, token)
             if bins is not None:
-                thresholds[number] = bins.comparable([one.neighborhood.token])[0]
-    values = np.empty((k, m if bins is None else 0, 5, PULLS), np.float32)
-    shaped = np.array([one.shapes for one in chosen])
-    return Shapes(
-        shaped,
-        columns_of(chosen, SHAPE_FEATURES),
-        thresholds,
-        seeds,
-        values,
-        np.empty(50, np.float32),
-        make_work(),
-    )
+                thresholds[number] = bins.comparable([token])[0]
+    values = np.empty((k, m if bins is None else 0, METRICS, PULLS), np.float32)
+    shaped = np.array([columns.shapes for columns in chosen])
+    features, counts = columns_of(chosen, SHAPE_FEATURES), np.empty(FEATURES, np.float32)
+    return Shapes(shaped, features, thresholds, seeds, values, counts, make_work())
+
+
+class Fitted(NamedTuple):
+    """What follows from a cloud, or was given, beside a plan."""
+
+    bins: ShapeBins | None = None  #: thresholds of the shape distributions, where shapes are wanted
+    copt_threshold: float | None = None  #: curvature that parts scattered from regular points
+    seed: int = 0  #: of the random pulls
+
+
+class NeighborhoodGroup:
+    """Neighborhoods of a plan that one kind of kernel computes."""
+
+    def __init__(self, chosen: list[Columns]) -> None:
+        self.chosen = chosen
+        #: In the order of what ``fill`` counts.
+        self.tokens = [columns.neighborhood.token for columns in chosen]
+        self.columns = columns_of(chosen, MOMENT_FEATURES)
+
+    def __len__(self) -> int:
+        """Return the number of neighborhoods."""
+        return len(self.chosen)
+
+    def shapes(self, points: Axes, fitted: Fitted) -> Shapes | None:
+        """Return what kernels take to compute shapes of points; None where none are wanted."""
+        if not any(columns.shapes for columns in self.chosen):
+            return None
+        return shapes_of(self.chosen, points, fitted.seed, fitted.bins)
+
+    def measure_shapes(self, points: Axes, shapes: Shapes, fitted: Fitted) -> None:
+        """Write the metrics of all pulls into `shapes`."""
+        raise NotImplementedError
+
+    def shape_values(self, points: Axes, fitted: Fitted) -> dict[str, np.ndarray]:
+        """Return by token the metrics of all pulls round points, (m, METRICS, PULLS), comparable."""
+        fitted = fitted._replace(bins=None)
+        shapes = self.shapes(points, fitted)
+        if shapes is None:
+            return {}
+        self.measure_shapes(points, shapes, fitted)
+        shaped = [k for k, columns in enumerate(self.chosen) if columns.shapes]
+        return {self.tokens[k]: shapes.values[k] for k in shaped}
 
 
 def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: str) -> np.ndarray:
-    """Where the random numbers of each query start, (m,) uint64, from coordinates, seed and the neighborhood's token.
+    """Return the seeds (m,) uint64 of queries from their coordinates, a seed and the token.
 
     Every bit of the coordinates (m,) counts, except that -0.0 is 0.0.
     """
@@ -127,13 +182,13 @@ def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: s
 
 
 def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The SAMPLES points with the smallest hash of (seed, coordinates); copies of a point count once.
+    """Return the SAMPLES points with the smallest hashes of seed and coordinates.
 
-    Hashes (m,), ascending, and rows (m,) of the points.
+    Copies of a point count once. Hashes (m,), ascending, and rows (m,) of the points.
     """
     hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
-    for start in range(0, len(xyz), _TOGETHER):
-        part = np.asarray(xyz[start : start + _TOGETHER])
+    for start in range(0, len(xyz), _BATCH):
+        part = np.asarray(xyz[start : start + _BATCH])
         x, y, z = part.T
         hashes = np.concatenate((hashes, point_seeds(x, y, z, seed, "samples")))
         rows = np.concatenate((rows, np.arange(start, start + len(part))))
@@ -143,26 +198,26 @@ def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]
 
 
 @device
-def write_shapes(shapes, number, q, record, n, gx, gy, gz, out):
-    """Write the shapes of one neighborhood of a query, of n members with the centroid (gx, gy, gz)."""
+def write_shapes(shapes, number, q, record, n, centroid, out):
+    """Write the shapes of neighborhood `number` of query q, of n members, to row q of `out`."""
     seed = shapes.seeds[number, q]
     if shapes.values.shape[1]:
         shapes.values[number, q] = np.nan
         if n > 0:
-            shape_values(record, n, gx, gy, gz, seed, shapes.work, shapes.values[number, q])
+            shape_values(record, n, centroid, seed, shapes.work, shapes.values[number, q])
         return
     counts = shapes.counts
     counts[:] = 0.0
     if n > 0:
-        shape_counts(record, n, gx, gy, gz, seed, shapes.thresholds[number], shapes.work, counts)
-    for f in range(50):
+        shape_counts(record, n, centroid, seed, shapes.thresholds[number], shapes.work, counts)
+    for f in range(FEATURES):
         if shapes.columns[number, f] >= 0:
             out[q, shapes.columns[number, f]] = counts[f]
 
 
 @device(forceinline=True)
 def _mix32(h):
-    """Bijective 32-bit hash of low bias (Wellons 2018: "lowbias32")."""
+    """Return a bijective 32-bit hash of low bias (Wellons 2018: "lowbias32")."""
     h = np.uint32(h ^ np.uint32(h >> np.uint32(16)))
     h = np.uint32(h * np.uint32(0x7FEB352D))
     h = np.uint32(h ^ np.uint32(h >> np.uint32(15)))
@@ -172,7 +227,7 @@ def _mix32(h):
 
 @device(forceinline=True)
 def _below(h, n):
-    """A number in 0 .. n - 1 from 32 random bits (multiply-high)."""
+    """Return a number in 0 .. n - 1 from 32 random bits (multiply-high)."""
     return np.uint32((np.uint64(h) * np.uint64(n)) >> np.uint64(32))
 
 
@@ -180,7 +235,7 @@ def _below(h, n):
 def draw(seed, n, draws):
     """Draw four members of n for every pull, different ones while there are enough."""
     low, high = np.uint32(seed & np.uint64(0xFFFFFFFF)), np.uint32(seed >> np.uint64(32))
-    if n < 4:
+    if n < DRAWN:
         _draw_few(low, high, n, draws)
         return
     n0, n1, n2, n3 = np.uint32(n), np.uint32(n - 1), np.uint32(n - 2), np.uint32(n - 3)
@@ -210,6 +265,7 @@ def draw(seed, n, draws):
 
 @device
 def _draw_few(low, high, n, draws):
+    """Draw from fewer than four members: the first drawn ones take the empty places."""
     for i in range(ROOM):
         u = _mix32(np.uint32(low + np.uint32(np.uint32(i) * np.uint32(0x9E3779B9))))
         v = _mix32(np.uint32(u + high))
@@ -229,7 +285,7 @@ def _draw_few(low, high, n, draws):
 @device
 def fetch(record, draws, points):
     """Copy the drawn members' records one after another (16 bytes at once: loads and stores, no more)."""
-    for i in range(4 * ROOM):
+    for i in range(DRAWN * ROOM):
         p = draws[i]
         x, y, z, w = record[p, 0], record[p, 1], record[p, 2], record[p, 3]
         points[4 * i] = x
@@ -239,8 +295,9 @@ def fetch(record, draws, points):
 
 
 @device
-def measure(points, gx, gy, gz, values):
-    """The five metrics of every pull, comparable; gx, gy, gz is the centroid."""
+def measure(points, centroid, values):
+    """Write the metrics of every pull, comparable."""
+    gx, gy, gz = centroid
     for i in range(ROOM):
         a, b, c, d = 4 * i, 4 * (ROOM + i), 4 * (2 * ROOM + i), 4 * (3 * ROOM + i)
         ax, ay, az = points[a], points[a + 1], points[a + 2]
@@ -253,33 +310,31 @@ def measure(points, gx, gy, gz, values):
         bc = bx * cx + by * cy + bz * cz
         nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
         both = bb * cc
-        some = both > np.float32(NO_ANGLE)
-        cosine = -bc * abs(bc) / (both if some else np.float32(1.0))
-        values[i] = cosine if some else np.float32(-1.0)
-        values[ROOM + i] = ex * ex + ey * ey + ez * ez
-        values[2 * ROOM + i] = bb
-        values[3 * ROOM + i] = nx * nx + ny * ny + nz * nz
-        values[4 * ROOM + i] = abs(nx * dx + ny * dy + nz * dz)
+        defined = both > np.float32(NO_ANGLE)
+        cosine = -bc * abs(bc) / (both if defined else np.float32(1.0))
+        values[ROW.A3 * ROOM + i] = cosine if defined else np.float32(-1.0)
+        values[ROW.D1 * ROOM + i] = ex * ex + ey * ey + ez * ez
+        values[ROW.D2 * ROOM + i] = bb
+        values[ROW.D3 * ROOM + i] = nx * nx + ny * ny + nz * nz
+        values[ROW.D4 * ROOM + i] = abs(nx * dx + ny * dy + nz * dz)
 
 
 @device
-def pull(record, n, gx, gy, gz, seed, work):
-    """The metrics of all pulls, into work.values."""
+def pull(record, n, centroid, seed, work):
+    """Write the metrics of all pulls into work.values."""
     draw(seed, n, work.draws)
     fetch(record, work.draws, work.points)
-    measure(work.points, gx, gy, gz, work.values)
-    for m in range(5):  # the last places pad to whole vectors: above no threshold
+    measure(work.points, centroid, work.values)
+    for m in range(METRICS):  # the last places pad to whole vectors: above no threshold
         for i in range(PULLS, ROOM):
             work.values[m * ROOM + i] = -np.inf
 
 
-@device(
-    fastmath={"reassoc", "nsz"}
-)  # sums of ones, exact in any order: what lets LLVM vectorize them
+@device(fastmath={"reassoc", "nsz"})  # sums of ones are exact in any order, so LLVM vectorizes them
 def count_above(values, t, above):
-    """How many of each metric's values lie above each of nine thresholds (no scatter: compare and add)."""
-    for m in range(5):
-        for b in range(9):
+    """Count the values of each metric above each threshold (no scatter: compare and add)."""
+    for m in range(METRICS):
+        for b in range(INNER):
             threshold, count = t[m, b], np.float32(0.0)
             for i in range(ROOM):
                 count += np.float32(1.0) if values[m * ROOM + i] > threshold else np.float32(0.0)
@@ -287,8 +342,8 @@ def count_above(values, t, above):
 
 
 @njit
-def shape_counts(record, n, gx, gy, gz, seed, thresholds, work, out):
-    """The 50 shape features of one neighborhood: counts / 255 in ten bins of A3, D1, D2, D3, D4.
+def shape_counts(record, n, centroid, seed, thresholds, work, out):
+    """Write the shape features of one neighborhood: shares of the pulls in the bins of each metric.
 
     Bin i holds the pulls with threshold[i - 1] < value <= threshold[i].
 
@@ -299,30 +354,30 @@ def shape_counts(record, n, gx, gy, gz, seed, thresholds, work, out):
         used.
     n : int
         Members, at least 1.
-    gx, gy, gz : float32
-        Offset of their centroid.
+    centroid : tuple of float32
+        Offset x, y, z of their centroid.
     seed : uint64
         See :func:`point_seeds`.
-    thresholds : ndarray of float32, shape (5, 9)
+    thresholds : ndarray of float32, shape (METRICS, INNER)
         See :meth:`shape_bins.ShapeBins.comparable`.
     work : Work
-    out : ndarray of float32, shape (50,)
+    out : ndarray of float32, shape (FEATURES,)
     """
-    pull(record, n, gx, gy, gz, seed, work)
+    pull(record, n, centroid, seed, work)
     above = work.above
     count_above(work.values, thresholds, above)
-    for m in range(5):
+    for m in range(METRICS):
         before = np.float32(PULLS)
-        for b in range(9):
-            out[10 * m + b] = (before - above[m, b]) / np.float32(PULLS)
+        for b in range(INNER):
+            out[SHAPE_BINS * m + b] = (before - above[m, b]) / np.float32(PULLS)
             before = above[m, b]
-        out[10 * m + 9] = before / np.float32(PULLS)
+        out[SHAPE_BINS * m + INNER] = before / np.float32(PULLS)
 
 
 @njit
-def shape_values(record, n, gx, gy, gz, seed, work, out):
-    """The metrics of the pulls that :func:`shape_counts` would count, comparable, into out (5, 255)."""
-    pull(record, n, gx, gy, gz, seed, work)
-    for m in range(5):
+def shape_values(record, n, centroid, seed, work, out):
+    """Write the metrics of the pulls that :func:`shape_counts` counts, (METRICS, PULLS)."""
+    pull(record, n, centroid, seed, work)
+    for m in range(METRICS):
         for i in range(PULLS):
             out[m, i] = work.values[m * ROOM + i]
