@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import DimensionError, OptionError
-from pdal_stages.stages.selection import Expression
+from pdal_stages.stages.where_expression import Expression
 
 ARRAYS = {
     "X": np.array([0.0, 1.0, 2.0, 3.0]),

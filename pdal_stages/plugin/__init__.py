@@ -1,1 +1,3 @@
-"""Our stages as native PDAL plugins: the build of ``stage.cpp``, and the Python code that it calls."""
+"""Our stages as native PDAL plugins: the build of ``stage.cpp``, and the Python code that it
+calls.
+"""

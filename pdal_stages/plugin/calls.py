@@ -1,8 +1,9 @@
 """The Python side of ``stage.cpp``, which calls it through ``filters.python`` in two steps.
 
-`prepare` is called before any point is read: it checks the options and returns the dimensions they create. `run` processes
-one point view. Answers are metadata of the script, a list of named texts; a failure is named ``pdal_stages_error``, which
-the plugin throws as a PDAL error. No exception leaves this module.
+`prepare` is called before any point is read: it checks the options and returns the dimensions they
+create. `run` processes one point view. Answers are metadata of the script, a list of named texts; a
+failure is named ``pdal_stages_error``, which the plugin throws as a PDAL error. No exception leaves
+this module.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     Parameters
     ----------
     module : dict
-        Globals of the script: PDAL's `pdalargs` (the question), `metadata` and `spatialreference`. `out_metadata` is
-        set in it.
+        Globals of the script: PDAL's `pdalargs` (the question), `metadata` and `spatialreference`.
+        `out_metadata` is set in it.
     ins, outs : dict
         PDAL's dimensions, and the ones to write back.
     """
@@ -81,7 +82,9 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
 
 
 def _stages(text: str) -> list[dict[str, Any]]:
-    """The pipeline up to the stage itself, as PDAL writes it; before PDAL 2.9 all values are text."""
+    """The pipeline up to the stage itself, as PDAL writes it; before PDAL 2.9 all values are
+    text.
+    """
     try:
         found = json.loads(text)["pipeline"]
     except (ValueError, KeyError):  # `user_data` that is not JSON
@@ -100,9 +103,11 @@ def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
 
 
 def _end_on_interrupt() -> None:
-    """Within a program that is not Python, such as `pdal`, let Ctrl-C end it at once, as PDAL's own stages do.
+    """Within a program that is not Python, such as `pdal`, let Ctrl-C end it at once, as PDAL's own
+    stages do.
 
-    There filters.python starts an interpreter, which takes the signal and keeps it while PDAL works.
+    There filters.python starts an interpreter, which takes the signal and keeps it while PDAL
+    works.
     """
     if not sys.orig_argv and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         with suppress(ValueError):  # of another thread

@@ -22,7 +22,9 @@ _KINDS = {
 
 
 def header() -> str:
-    """The text of ``declarations.hpp``, which ``stage.cpp`` includes below its types of stages and options."""
+    """The text of ``declarations.hpp``, which ``stage.cpp`` includes below its types of stages and
+    options.
+    """
     options, stages = [], []
     for number, kind in enumerate(stage_types().values()):
         name = f"OPTIONS_{number}"
@@ -30,7 +32,8 @@ def header() -> str:
         texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")
         gathers = str(bool(kind.instead_of_tiles)).lower()
         stages.append(
-            f"    {{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option), {gathers} }},"
+            "    "
+            f"{{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option), {gathers} }},"
         )
     version = f"constexpr const char *VERSION = {json.dumps(__version__)};"
     names = ", ".join(map(json.dumps, sorted({"filters.merge", *SPLITS})))
@@ -42,7 +45,9 @@ def header() -> str:
 
 
 def digest(kind: type[Stage]) -> str:
-    """Return a digest of what PDAL sees of a stage: names, types and defaults of its options, not their help."""
+    """Return a digest of what PDAL sees of a stage: names, types and defaults of its options, not
+    their help.
+    """
     gathers = bool(kind.instead_of_tiles)
     held = f"{kind.type} {gathers} {[fields[:-1] for fields in _fields(kind)]}"
     return hashlib.sha256(held.encode()).hexdigest()[:16]

@@ -1,4 +1,6 @@
-"""Compile the plugin for the installed PDAL, install it where PDAL looks, check and uninstall it."""
+"""Compile the plugin for the installed PDAL, install it where PDAL looks, check and uninstall
+it.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ _STILL_WORK = "pdal-stages pipeline and pdal-stages expand still work"
 
 
 def libraries() -> list[str]:
-    """The files that PDAL looks for: ``filters.hag_minima`` is in ``libpdal_plugin_filter_hag_minima.so``."""
+    """The files that PDAL looks for: ``filters.hag_minima`` is in
+    ``libpdal_plugin_filter_hag_minima.so``.
+    """
     parts = (name.partition(".") for name in stage_types())
     return [
         f"libpdal_plugin_{family.removesuffix('s')}_{name}{SUFFIX}" for family, _, name in parts
@@ -48,7 +52,8 @@ def usual_folder() -> Path:
 
 
 def install(folder: Path | None = None) -> list[Path]:
-    """Compile the plugin and install it into a folder, by default beside ``filters.python``; returns the files.
+    """Compile the plugin and install it into a folder, by default beside ``filters.python``;
+    returns the files.
 
     A missing `folder` is created.
     """
@@ -61,7 +66,8 @@ def install(folder: Path | None = None) -> list[Path]:
         raise StageError(
             "the folder of PDAL's plugins cannot be written to",
             found=target,
-            cure="Run this as its owner, or give --folder a folder of your own and add it to PDAL_DRIVER_PATH",
+            cure="Run this as its owner, or give --folder a folder of your own and add it to "
+            "PDAL_DRIVER_PATH",
         )
     # In the same folder, so that a file is renamed into place; PDAL looks only at names of its own.
     with tempfile.TemporaryDirectory(prefix=".pdal_stages_", dir=target) as work:
@@ -100,7 +106,9 @@ def uninstall(folder: Path | None = None) -> list[Path]:
 
 
 def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
-    """What is installed, and what is missing with its cure. An outdated plugin is reported when it runs."""
+    """What is installed, and what is missing with its cure. An outdated plugin is reported when it
+    runs.
+    """
     good: list[str] = []
     bad: list[str] = []
     looks = (
@@ -119,7 +127,8 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
         if not lacking:
             return [*good, f"plugin: {len(libraries())} stages in {folder}"], []
         bad.append(
-            f"the plugin is not in {folder} (missing {', '.join(lacking[:3])}). pdal-stages plugin --install"
+            f"the plugin is not in {folder} (missing {', '.join(lacking[:3])}). pdal-stages plugin "
+            "--install"
         )
     return good, bad
 
@@ -141,13 +150,16 @@ def compiler() -> list[str]:
     raise DependencyError(
         "there is no C++ compiler",
         found=f"CXX={' '.join(named)}" if named else "neither c++, g++ nor clang++ on PATH",
-        cure="Debian, Ubuntu: apt-get install g++. Fedora: dnf install gcc-c++. macOS: xcode-select --install. conda: "
+        cure="Debian, Ubuntu: apt-get install g++. Fedora: dnf install gcc-c++. macOS: "
+        "xcode-select --install. conda: "
         f"conda install -c conda-forge cxx-compiler. Without one, {_STILL_WORK}",
     )
 
 
 def pdal() -> Pdal:
-    """PDAL's library and headers; :class:`DependencyError` with the cure where they are missing or do not fit."""
+    """PDAL's library and headers; :class:`DependencyError` with the cure where they are missing or
+    do not fit.
+    """
     library, version = _library_folder(), pdal_env.dotted_version()
     for prefix in dict.fromkeys([*library.parents, Path(sys.prefix)]):
         headers = prefix / "include"
@@ -164,7 +176,8 @@ def pdal() -> Pdal:
     raise DependencyError(
         "PDAL's headers are missing",
         found=f"no include/pdal beside {library}",
-        cure="Debian, Ubuntu: apt-get install libpdal-dev. conda-forge: conda install -c conda-forge libpdal-core. "
+        cure="Debian, Ubuntu: apt-get install libpdal-dev. conda-forge: conda install -c "
+        "conda-forge libpdal-core. "
         f"Without them, {_STILL_WORK}",
     )
 
@@ -182,7 +195,8 @@ def plugin_folder() -> Path:
     raise DependencyError(
         "PDAL's plugin filters.python is missing, which runs our stages",
         found=f"{_PYTHON_FILTER} in none of {', '.join(map(str, tried))}",
-        cure="It comes with pdal-plugins: conda install -c conda-forge pdal-plugins, or pip install pdal-plugins; where it "
+        cure="It comes with pdal-plugins: conda install -c conda-forge pdal-plugins, or pip "
+        "install pdal-plugins; where it "
         "is there already, set PDAL_DRIVER_PATH to the folder that holds it",
     )
 
@@ -232,6 +246,7 @@ def _run(command: Sequence[str]) -> None:
         lines = done.stderr.splitlines()
         raise StageError(
             "the plugin does not compile",
-            found=f"{command[0]}: {'; '.join([line for line in lines if 'error' in line][:3] or lines[-1:])}",
+            found=f"{command[0]}: "
+            f"{'; '.join([line for line in lines if 'error' in line][:3] or lines[-1:])}",
             cure=f"Report it with PDAL's version; without the plugin, {_STILL_WORK}",
         )

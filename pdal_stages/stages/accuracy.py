@@ -1,4 +1,6 @@
-"""``filters.accuracy``: compare a class dimension with a reference, report figures [B16 4.3, W18 4.3]."""
+"""``filters.accuracy``: compare a class dimension with a reference, report figures [B16 4.3, W18
+4.3].
+"""
 
 from __future__ import annotations
 
@@ -43,6 +45,8 @@ class Sides(NamedTuple):
 
 
 class AccuracyStage(Stage):
+    """Compare classes with a reference; the figures go to tables, JSON and HTML."""
+
     type = "filters.accuracy"
     summary = "Compare a class dimension with a reference dimension; report as table, JSON and HTML"
     source = "[B16] section 4.3, [W18] section 4.3"
@@ -54,13 +58,16 @@ class AccuracyStage(Stage):
     classes: list[int] = option(
         "codes",
         (),
-        "Reference classes to compare, after merging; default: those of the model, or else every one found",
+        "Reference classes to compare, after merging; default: those of the model, or else every "
+        "one found",
     )
     ignore: Selection | None = option(
         "selection",
         None,
-        "Points left out and counted: reference codes (before merging), ranges of other dimensions, or the word withheld; "
-        f"default: withheld, and {', '.join(map(str, UNINFORMATIVE))} where neither 'classes' nor a model says what counts",
+        "Points left out and counted: reference codes (before merging), ranges of other "
+        "dimensions, or the word withheld; "
+        f"default: withheld, and {', '.join(map(str, UNINFORMATIVE))} where neither 'classes' nor "
+        "a model says what counts",
         may_be_empty=True,
     )
     merge: dict | None = option(
@@ -73,7 +80,8 @@ class AccuracyStage(Stage):
     model_file: str | None = option(
         "model",
         None,
-        "Model file whose classes are scored and whose importances the report shows; default: that of the "
+        "Model file whose classes are scored and whose importances the report shows; default: that "
+        "of the "
         "filters.modelclassifier before",
         name="model",
     )
@@ -86,6 +94,7 @@ class AccuracyStage(Stage):
     def from_pipeline(
         cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
+        """Return options that follow from the stages before."""
         taken: dict[str, Any] = {"files": files_read(before)}
         models = [s["model"] for s in before if s.get("type") == ApplyModel.type and "model" in s]
         if models and given.get("dimension", "Classification") == "Classification":
@@ -93,23 +102,29 @@ class AccuracyStage(Stage):
         return taken
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         Merge.parse(self.merge)
         if self.model_file:
             loaded_model(self.model_file)
 
     def outputs(self) -> list[Output]:
+        """Return the files that are written."""
         found = [(self.json, "json", JSON), (self.html, "html", HTML)]
         return [Output(path, what, kind) for path, what, kind in found if path]
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         return [self.dimension, self.reference]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Compare the classes of the points and write what is asked for."""
         self.compare([("", points)], points.report)
         return {}
 
     def compare(self, parts: Sequence[tuple[str, Points]], report: Report) -> None:
-        """Compare the points of several files by one rule: a table of each, and one of all together."""
+        """Compare the points of several files by one rule: a table of each, and one of all
+        together.
+        """
         sides = [self._sides(points) for _, points in parts]
         rule = self._rule(sides, report)
         each = [
@@ -162,7 +177,9 @@ class AccuracyStage(Stage):
         return Sides(reference, predicted, confidence, inside)
 
     def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
-        """`classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`: see the stage's page."""
+        """`classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`: see the stage's
+        page.
+        """
         ignore = None if self.ignore is None else list(self.ignore.codes)
         rule: dict[str, Any] = {
             "classes": self.classes or None,
@@ -181,7 +198,8 @@ class AccuracyStage(Stage):
                 target = Merge.parse(rule["merge"]).target_of
                 rule["classes"] = sorted({int(target[code]) for code in known})
                 if self.ignore is None and rule["merge"] is not None:
-                    # A class's code need not be one of its labels: 1 is the background, or unclassified.
+                    # A class's code need not be one of its labels: 1 is the background, or
+                    # unclassified.
                     labels = {label for c in trained for label in c["labels"]}
                     rule["ignore"] = [code for code in known if code not in labels]
         if self.merge is not None or self.classes:
@@ -199,7 +217,8 @@ class AccuracyStage(Stage):
         ):
             rule["merge"] = {**(rule["merge"] or {}), HIGH: sorted({HIGH, *LOWER})}
             report.notes.append(
-                f"vegetation is one class, 5, in what is judged: of the reference {' and '.join(map(str, parts))} count as "
+                "vegetation is one class, 5, in what is judged: of the reference "
+                f"{' and '.join(map(str, parts))} count as "
                 "5, too. To compare them as they are: --filters.accuracy.merge='{}'"
             )
         return rule
@@ -243,6 +262,8 @@ class AccuracyStage(Stage):
 
 
 def _one_code_system(trained: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a model's labels and codes mean the same; not where label 5 became 6, and 8 became 5."""
+    """Whether a model's labels and codes mean the same; not where label 5 became 6, and 8 became
+    5.
+    """
     class_of = {label: c["code"] for c in trained for label in c["labels"]}
     return all(class_of.get(c["code"], c["code"]) == c["code"] for c in trained)

@@ -28,14 +28,16 @@ from .registry import stage_type
 from .selection import Selection
 
 HEIGHT = "HeightAboveGround"
-#: Where points have no Ground, they lie this near to given ground or do not become ground, meters: the default
-#: threshold of filters.hag_morphological.
+#: Where points have no Ground, they lie this near to given ground or do not become ground, meters:
+#: the default threshold of filters.hag_morphological.
 _TOLERANCE = 0.5
 #: Parts of the unit that compact outputs are rounded to: probabilities and the like, and heights.
 _PARTS, _PARTS_OF_HEIGHT = 64, 32
 
 
 class ApplyModel(Stage):
+    """Classify points with a model file."""
+
     type = "filters.modelclassifier"
     summary = "Apply a model file: compute what the model needs block by block, and write classes"
     source = "[B16] section 3.4, [W18] section 3.3, [WM19] for networks"
@@ -64,18 +66,21 @@ class ApplyModel(Stage):
     variance: bool = option(
         "boolean",
         False,
-        "Also write Variance: how much the probabilities vary over a network's batches (networks only)",
+        "Also write Variance: how much the probabilities vary over a network's batches (networks "
+        "only)",
     )
     device: str = option(
         "string",
         "cpu",
-        "Where a network is applied: with NumPy, which gives the same bits everywhere, or with PyTorch on a GPU",
+        "Where a network is applied: with NumPy, which gives the same bits everywhere, or with "
+        "PyTorch on a GPU",
         choices=("cpu", "cuda", "auto"),
     )
     reject_below: float | None = option(
         "number",
         None,
-        "Points with a lower Reliability are rejected: they do not get the winning class, and are counted",
+        "Points with a lower Reliability are rejected: they do not get the winning class, and are "
+        "counted",
         minimum=0,
         maximum=1,
     )
@@ -85,7 +90,8 @@ class ApplyModel(Stage):
     keep_sure: float | None = option(
         "number",
         None,
-        "Keep a class only where this share is expected to be right, e.g. 0.98; others get rejected_code (default 1)",
+        "Keep a class only where this share is expected to be right, e.g. 0.98; others get "
+        "rejected_code (default 1)",
         minimum=0.5,
         maximum=0.999,
     )
@@ -93,31 +99,36 @@ class ApplyModel(Stage):
         "Points that are left out, even as neighbors, and keep their class"
     )
     keep: Selection = keep_option(
-        "Points that are neighbors but keep their class, written as for ignore; default: 12, overlap of strips, which "
+        "Points that are neighbors but keep their class, written as for ignore; default: 12, "
+        "overlap of strips, which "
         "classifying would overwrite"
     )
     vegetation_heights: tuple[float, float] | None = option(
         "bands",
         None,
-        "Two heights in meters, e.g. 0.5,2: vegetation (5) below them becomes low (3) and medium (4)",
+        "Two heights in meters, e.g. 0.5,2: vegetation (5) below them becomes low (3) and medium "
+        "(4)",
         may_be_empty=True,
     )
     mark: str = option(
         "string",
         "",
-        "A dimension to write: 1 for points inside `where`, else 0. Later stages can take it in their own `where`, which "
+        "A dimension to write: 1 for points inside `where`, else 0. Later stages can take it in "
+        "their own `where`, which "
         "would see the new classes",
     )
     compact: bool = option(
         "boolean",
         False,
-        "Round HeightAboveGround to 1/32 of Z's unit, Reliability, Margin and probabilities to 1/64: compressed, they take "
+        "Round HeightAboveGround to 1/32 of Z's unit, Reliability, Margin and probabilities to "
+        "1/64: compressed, they take "
         "a third of the bytes",
     )
     given_ground: bool = option(
         "boolean",
         False,
-        "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is 1, or without that "
+        "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is "
+        "1, or without that "
         "dimension within 0.5 m of it (HeightAboveGround)",
     )
     memory: int = option(
@@ -129,6 +140,7 @@ class ApplyModel(Stage):
     )
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         self.limits  # noqa: B018  refused here where nothing is known of the model
         if self.mark and not re.fullmatch(r"[A-Za-z]\w*", self.mark):
             raise OptionError("option 'mark' must be a name of letters and digits", found=self.mark)
@@ -160,7 +172,9 @@ class ApplyModel(Stage):
 
     @property
     def preparation(self) -> list[dict[str, Any]]:
-        """The stages that made what the model was trained on; empty where the model does not say."""
+        """The stages that made what the model was trained on; empty where the model does not
+        say.
+        """
         return self.model.info.get("preparation") or []
 
     @property
@@ -182,20 +196,25 @@ class ApplyModel(Stage):
         return bool(types) and types <= {*OF_PDAL}
 
     def check_upstream(self) -> str | None:
+        """Return a warning about the stages upstream; None where they fit."""
         if not self.preparation or not self.upstream or same(self.upstream, self.preparation):
             return None
         if self.given_ground and same(self.upstream, with_given_ground(self.preparation)):
             return None
         made = ", ".join(self.made_from_ground)
         return (
-            f"{self.type}: the model was trained on other heights than this pipeline makes. Trained on: "
+            f"{self.type}: the model was trained on other heights than this pipeline makes. "
+            "Trained on: "
             f"{as_json(self.preparation)}. Here: {as_json(self.upstream)}"
-            f"{f', and from points of class 2 {made}' if made else ''}. Expect lower accuracy, or use the former"
+            f"{f', and from points of class 2 {made}' if made else ''}. Expect lower accuracy, or "
+            "use the former"
         )
 
     @property
     def made_from_ground(self) -> list[str]:
-        """Dimensions that the model needs beside heights, and that are computed from class 2 as PDAL made the heights."""
+        """Dimensions that the model needs beside heights, and that are computed from class 2 as
+        PDAL made the heights.
+        """
         if not self.measured_by_pdal or len(self.preparation) != 1 or not self._of_ground.creates():
             return []
         made = self._of_ground.creates().keys() - {HEIGHT}
@@ -210,6 +229,7 @@ class ApplyModel(Stage):
         return kind({**stage, **units, "threads": self.threads})
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         made = self.made_from_ground
         return list(
             dict.fromkeys(
@@ -221,6 +241,7 @@ class ApplyModel(Stage):
         )
 
     def creates(self) -> dict[str, str]:
+        """Return the dimensions that are written, with their PDAL types."""
         more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
         if self.probabilities:
             more += [f"Probability_{code}" for code, _ in self.model.classes]
@@ -232,10 +253,12 @@ class ApplyModel(Stage):
         }
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         more = self._of_ground.halo_m() if self.made_from_ground else 0.0
         return self.model.halo_m + more
 
     def largest_class(self) -> int:
+        """Return the largest class code that may be written."""
         return max([code for code, _ in self.model.classes] + [self._rejected or 0])
 
     @property
@@ -245,6 +268,7 @@ class ApplyModel(Stage):
         return unsure if self.rejected_code is None else self.rejected_code
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Classify the points."""
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
         current = points.class_codes
@@ -341,5 +365,7 @@ class ApplyModel(Stage):
 
 
 def _rounded(values: NDArray, parts: int) -> NDArray:
-    """To these parts: a power of two, so that the last bytes of the floats are zero and compress to nothing."""
+    """To these parts: a power of two, so that the last bytes of the floats are zero and compress to
+    nothing.
+    """
     return np.round(values * parts) / parts

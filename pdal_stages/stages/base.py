@@ -1,4 +1,6 @@
-"""Define what a stage is: an object made once from checked options, which then describes itself and runs."""
+"""Define what a stage is: an object made once from checked options, which then describes itself and
+runs.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,12 @@ from ..base.units import named_unit
 from .context import WHOLE_CLOUD, StageContext
 from .options import Option, option, parse_options
 from .points import Points
-from .selection import Expression
+from .where_expression import Expression
 
 #: What `where` means to stages of heights.
 HEIGHTS_OUTSIDE = (
-    "Points outside do not form the ground; they receive a height above it, unless they have one already or a stage "
+    "Points outside do not form the ground; they receive a height above it, unless they have one "
+    "already or a stage "
     "before made it"
 )
 
@@ -34,9 +37,10 @@ def files_read(stages: Sequence[Mapping[str, Any]]) -> list[str]:
 class Stage(ABC):
     """Base of all stages; a subclass in a module of this package is a stage of the product.
 
-    A subclass gives its type name and a one-line summary, declares its options in its body, says what it reads,
-    creates and how far it looks, and does the work in :meth:`run`. A stage object holds parsed options as attributes;
-    what is costly to make of them (a plan, a model) belongs in a ``functools.cached_property``.
+    A subclass gives its type name and a one-line summary, declares its options in its body, says
+    what it reads, creates and how far it looks, and does the work in :meth:`run`. A stage object
+    holds parsed options as attributes; what is costly to make of them (a plan, a model) belongs in
+    a ``functools.cached_property``.
 
     Parameters
     ----------
@@ -55,7 +59,8 @@ class Stage(ABC):
     Raises
     ------
     StageError
-        For options that are unknown, missing, wrong or contradictory, or name files that are; with `place` as where.
+        For options that are unknown, missing, wrong or contradictory, or name files that are; with
+        `place` as where.
     """
 
     type: ClassVar[str]
@@ -63,26 +68,30 @@ class Stage(ABC):
     source: ClassVar[str] = ""
     #: What becomes of the points outside `where`.
     where_help: ClassVar[str] = ""
-    #: Whether `where` only chooses what to compute, so that tiles may narrow it down to what is seen.
+    #: Whether `where` only chooses what to compute, so that tiles may narrow it down to what is
+    #: seen.
     where_chooses: ClassVar[bool] = False
     #: What a stage that cannot run without points does with them, as a message says it.
     needs_points: ClassVar[str] = ""
-    #: For a stage that makes one thing of all points, and gets them as one view: what to do instead of running it in tiles.
+    #: For a stage that makes one thing of all points, and gets them as one view: what to do instead
+    #: of running it in tiles.
     instead_of_tiles: str = ""
-    #: For a stage that a model file may carry, to be run by whoever applies it: the options that the file may give. Model
-    #: files come from strangers, so none that holds a path.
+    #: For a stage that a model file may carry, to be run by whoever applies it: the options that
+    #: the file may give. Model files come from strangers, so none that holds a path.
     in_models: ClassVar[tuple[str, ...]] = ()
-    #: For the same: raise it when results change. Models store it, and warn where they were trained with another one.
+    #: For the same: raise it when results change. Models store it, and warn where they were trained
+    #: with another one.
     algorithm_version: ClassVar[int] = 1
-    #: Counts that it puts into its report (:meth:`Points.tally`): name -> what these points are. Tiles add them up, and
-    #: `classify` prints them.
+    #: Counts that it puts into its report (:meth:`Points.tally`): name -> what these points are.
+    #: Tiles add them up, and `classify` prints them.
     counts: ClassVar[Mapping[str, str]] = {}
     #: Options of the example on its page; needed where an option is required.
     example: ClassVar[Mapping[str, Any]] = {}
-    #: Whether it forgets most dimensions (:meth:`Points.keep_only`) and then needs much memory: the next stage gets the
-    #: points from PDAL anew.
+    #: Whether it forgets most dimensions (:meth:`Points.keep_only`) and then needs much memory: the
+    #: next stage gets the points from PDAL anew.
     forgets: ClassVar[bool] = False
-    #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read wider.
+    #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read
+    #: wider.
     open_ended: ClassVar[bool] = False
 
     where: str | None = option(
@@ -102,7 +111,8 @@ class Stage(ABC):
         "Unit of z, where the spatial reference does not say; otherwise that of x and y",
     )
 
-    #: The stages before it in the pipeline that create what it reads, as a model's preprocessing holds them.
+    #: The stages before it in the pipeline that create what it reads, as a model's preprocessing
+    #: holds them.
     upstream: tuple[Mapping[str, Any], ...] = ()
 
     def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
@@ -156,11 +166,15 @@ class Stage(ABC):
 
     @property
     def hint(self) -> str | None:
-        """What to do where a dimension that it reads is missing, if it knows better than :data:`MAKERS`."""
+        """What to do where a dimension that it reads is missing, if it knows better than
+        :data:`MAKERS`.
+        """
         return None
 
     def inputs(self) -> list[str]:
-        """Files the stage reads, beside those that its options of kind ``filename`` and ``model`` name."""
+        """Files the stage reads, beside those that its options of kind ``filename`` and ``model``
+        name.
+        """
         return []
 
     def outputs(self) -> list[Output]:
@@ -172,7 +186,9 @@ class Stage(ABC):
         return []
 
     def creates(self) -> dict[str, str]:
-        """Dimensions made or overwritten: name -> PDAL type (``double``, ``float``, ``uint8_t``)."""
+        """Dimensions made or overwritten: name -> PDAL type (``double``, ``float``,
+        ``uint8_t``).
+        """
         return {}
 
     def halo_m(self) -> float:
@@ -184,7 +200,8 @@ class Stage(ABC):
         return 0
 
     def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
-        """Return how far around a tile lie the points that decide its results, for an open-ended stage.
+        """Return how far around a tile lie the points that decide its results, for an open-ended
+        stage.
 
         Parameters
         ----------
@@ -206,7 +223,9 @@ class Stage(ABC):
     def from_pipeline(
         cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
-        """Options that the stage takes from the stages before it in the pipeline, where its own do not give them."""
+        """Options that the stage takes from the stages before it in the pipeline, where its own do
+        not give them.
+        """
         return {}
 
     def points(
@@ -273,7 +292,9 @@ class ClassStage(Stage):
     where_chooses = True
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         return ["Classification"]
 
     def creates(self) -> dict[str, str]:
+        """Return the dimensions that are written, with their PDAL types."""
         return {"Classification": "uint8_t"}

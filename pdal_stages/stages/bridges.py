@@ -18,6 +18,8 @@ _VEGETATION = (3, 4, 5)
 
 
 class Bridges(ClassStage):
+    """Find bridge decks among the points above the ground (:mod:`..structures.decks`)."""
+
     type = "filters.bridges"
     summary = "Classify bridge decks, which are then no longer ground or building"
     source = "after Sithole, Vosselman 2006, ISPRS Journal of Photogrammetry and Remote Sensing 61(1), 33-46"
@@ -30,15 +32,19 @@ class Bridges(ClassStage):
     keep: Selection = keep_option()
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         return ["Classification", "Ground"]
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         return RULES.reach_m
 
     def largest_class(self) -> int:
+        """Return the largest class code that may be written."""
         return self.code
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Give points of bridge decks their class."""
         ignored, ground = points.ignored(self.ignore), points.dimension("Ground") != 0
         before = points.class_codes
         free = points.inside & ~ignored & ~points.chosen(self.keep)

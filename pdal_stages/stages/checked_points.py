@@ -1,8 +1,10 @@
-"""Points that a person checked: samples are drawn from these, and from others that keep what a base knows.
+"""Points that a person checked: samples are drawn from these, and from others that keep what a base
+knows.
 
-What is corrected lies where the base was unsure: from that alone a forest does not learn what the rest looks like. So of
-each class about as many points stand beside as were checked of the most frequent, among all of which the base is sure. A
-point's hash decides, so that the parts of a cloud need only be counted first.
+What is corrected lies where the base was unsure: from that alone a forest does not learn what the
+rest looks like. So of each class about as many points stand beside as were checked of the most
+frequent, among all of which the base is sure. A point's hash decides, so that the parts of a cloud
+need only be counted first.
 """
 
 from __future__ import annotations
@@ -32,13 +34,17 @@ class CheckedPoints(NamedTuple):
     codes: NDArray  #: (n,) class codes
 
     def counts(self, checked: int) -> dict[str, Any]:
-        """Points, those that a person checked wherever they lie, and how many of each class there are, as JSON has it."""
+        """Points, those that a person checked wherever they lie, and how many of each class there
+        are, as JSON has it.
+        """
         wanted, sure = (class_counts(self.codes[mask]) for mask in (self.wanted, self.sure))
         return {"points": len(self.codes), "checked": checked, "wanted": wanted, "sure": sure}
 
 
 class CheckedChoice:
-    """What samples are drawn from, of a cloud whose parts were counted; `known`: the classes of the base, if any."""
+    """What samples are drawn from, of a cloud whose parts were counted; `known`: the classes of the
+    base, if any.
+    """
 
     def __init__(
         self, known: Collection[int] | None, seed: int, parts: Iterable[Mapping[str, Any]]
@@ -58,7 +64,8 @@ class CheckedChoice:
             )
         both = [code for code in known or () if wanted[str(code)]]
         most = max((wanted[str(code)] for code in both), default=0)
-        #: Of each class the share of points of which the base is sure, and about how many these are.
+        #: Of each class the share of points of which the base is sure, and about how many these
+        #: are.
         self._shares = {code: min(1.0, most / n) for code in both if (n := sure[str(code)])}
         self._beside = sum(min(most, sure[str(code)]) for code in self._shares)
 
@@ -86,7 +93,8 @@ class CheckedChoice:
             said += " alone, the others are neighbors"
             if self._known is not None:
                 said += (
-                    "; nothing keeps the base where nobody looked, as no other point has a Reliability of "
+                    "; nothing keeps the base where nobody looked, as no other point has a "
+                    "Reliability of "
                     f"{SURE:g} or more"
                 )
         report.notes.append(said)

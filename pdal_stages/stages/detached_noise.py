@@ -1,4 +1,6 @@
-"""``filters.detachednoise``: points and small clusters detached from everything, as low and high noise."""
+"""``filters.detachednoise``: points and small clusters detached from everything, as low and high
+noise.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,8 @@ from .selection import Selection
 
 
 class DetachedNoise(ClassStage):
+    """Find points that belong to nothing, below the ground and in the air."""
+
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
     where_help = "Points outside are not marked but still serve as neighbors"
@@ -27,7 +31,8 @@ class DetachedNoise(ClassStage):
     gap: float = option(
         "number",
         2.5,
-        "Minimum height of high noise above everything nearby; more in clouds of less than 3 points/m2",
+        "Minimum height of high noise above everything nearby; more in clouds of less than 3 "
+        "points/m2",
         minimum=0,
         exclusive=True,
         maximum=1000,
@@ -49,12 +54,15 @@ class DetachedNoise(ClassStage):
     )
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         return REACH
 
     def largest_class(self) -> int:
+        """Return the largest class code that may be written."""
         return max(self.low_class, self.high_class)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Mark noise."""
         ignored = points.ignored(self.ignore)
         found = detached_noise(
             *points.axes,

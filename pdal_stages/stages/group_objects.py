@@ -1,4 +1,6 @@
-"""``filters.objects``: group classified points into buildings, trees, spans of wires and bridge decks."""
+"""``filters.objects``: group classified points into buildings, trees, spans of wires and bridge
+decks.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,8 @@ class ObjectOptions:
     refuse: list[str] = option(
         "list",
         (),
-        "Reject objects with any of these reasons to be checked (filters.objects: their points get refused_class); they are "
+        "Reject objects with any of these reasons to be checked (filters.objects: their points get "
+        "refused_class); they are "
         f"counted: {', '.join(REASONS)}",
         may_be_empty=True,
     )
@@ -77,6 +80,7 @@ class ObjectOptions:
         return {kind: tuple(int(c) for c in self.options[name]) for name, kind in _CODES.items()}
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         kind_of_code(self.classes)
         for name in self.options["refuse"]:
             checks.one_of("a reason in option 'refuse'", name, REASONS)
@@ -87,7 +91,8 @@ class ObjectOptions:
         Raises
         ------
         StageError
-            Where no point has a class of any kind, or none is ground; a warning in tiles, others of which may have some.
+            Where no point has a class of any kind, or none is ground; a warning in tiles, others of
+            which may have some.
         """
         cells = self.records(points)
         try:
@@ -99,7 +104,8 @@ class ObjectOptions:
         if thin := cells.sparse_kind():
             points.report.warnings.append(
                 f"cells of {cells.size:g} m hold fewer than {MIN_POINTS_PER_CELL:g} points of "
-                f"{thin[0]} on average, so objects may fall apart: set cell to {2 * cells.size:g} or more"
+                f"{thin[0]} on average, so objects may fall apart: set cell to {2 * cells.size:g} "
+                "or more"
             )
         return cells
 
@@ -126,11 +132,15 @@ _EXTENT = {Kind.BUILDING: "area", Kind.TREE: "area", Kind.SPAN: "length", Kind.D
 
 
 class GroupObjects(ObjectOptions, Stage):
+    """Number the objects that points belong to."""
+
     type = "filters.objects"
     summary = "Group classified points into buildings, trees, spans of wires and bridge decks"
     source = (
-        "crowns after Kwak, Lee, Lee, Biging, Gong 2007 (Journal of Forest Research 12, 425-434) and Chen, Baldocchi, "
-        "Gong, Kelly 2006 (Photogrammetric Engineering and Remote Sensing 72, 923-932); diameters of stems after Jucker and "
+        "crowns after Kwak, Lee, Lee, Biging, Gong 2007 (Journal of Forest Research 12, 425-434) "
+        "and Chen, Baldocchi, "
+        "Gong, Kelly 2006 (Photogrammetric Engineering and Remote Sensing 72, 923-932); diameters "
+        "of stems after Jucker and "
         "others 2017 (Global Change Biology 23, 177-190)"
     )
     where_help = "Points outside form no object, and keep what they have"
@@ -139,16 +149,19 @@ class GroupObjects(ObjectOptions, Stage):
     judged: bool = option(
         "boolean",
         False,
-        "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area; of spans the length)",
+        "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area; "
+        "of spans the length)",
     )
     refused_class: int = code_option(
         1, "Class code for the points of objects that 'refuse' rejects"
     )
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         return ["Classification"]
 
     def creates(self) -> dict[str, str]:
+        """Return the dimensions that are written, with their PDAL types."""
         out = {"ObjectID": "uint64_t"}
         if self.judged:
             out |= {"ObjectVerdict": "uint8_t", "ObjectHeight": "float", "ObjectExtent": "float"}
@@ -157,12 +170,15 @@ class GroupObjects(ObjectOptions, Stage):
         return out
 
     def largest_class(self) -> int:
+        """Return the largest class code that may be written."""
         return self.refused_class if self.refuse else 0
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         return MARGIN + 4 * self.settings.cell
 
     def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
+        """Return how far around a tile the points lie that decide its results, in meters."""
         wanted = context.used(points.arrays)
         if wanted is None or not wanted.any():
             return 0.0
@@ -193,6 +209,7 @@ class GroupObjects(ObjectOptions, Stage):
         return found.ids_at(points.xyz[:, 0], points.xyz[:, 1], kinds)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Find objects and number their points."""
         found = self._found(points, context)
         ids = self._ids(found, points)
         out: dict[str, NDArray] = {"ObjectID": ids}

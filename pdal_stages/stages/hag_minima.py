@@ -16,6 +16,8 @@ from .selection import Selection
 
 
 class HagMinima(Stage):
+    """Measure heights above the lowest points of large cells."""
+
     type = "filters.hag_minima"
     summary = "Height above a coarse terrain: the minima of a grid, interpolated"
     source = "[W18] section 3.2"
@@ -25,7 +27,8 @@ class HagMinima(Stage):
     cell: float = option(
         "number",
         20.0,
-        "Side of the coarse cells whose lowest points form the terrain; more than half the width of the largest building",
+        "Side of the coarse cells whose lowest points form the terrain; more than half the width "
+        "of the largest building",
         minimum=0.05,
         maximum=10_000,
         unit="m",
@@ -43,17 +46,21 @@ class HagMinima(Stage):
     )
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         check_sizes(self.cell, self.resolution)
 
     def creates(self) -> dict[str, str]:
+        """Return the dimensions that are written, with their PDAL types."""
         return {"HeightAboveGround": "float"}
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         # The bilinear patch reaches one and a half cells, whole cells are needed, and an
         # empty cell is filled from the nearest ones with points.
         return 4.0 * self.cell
 
     def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
+        """Return how far around a tile the points lie that decide its results, in meters."""
         used = context.used(points.arrays)
         if used is None:
             return 0.0
@@ -63,6 +70,7 @@ class HagMinima(Stage):
         )
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Compute heights above the minima."""
         x, y, z = points.xyz.T
         forms = points.usable(self.ignore)
         if points.mask is not None and not points.mask.any():  # which the report says

@@ -1,4 +1,6 @@
-"""``filters.hag_morphological``: height above ground that a progressive morphological filter finds [P13]."""
+"""``filters.hag_morphological``: height above ground that a progressive morphological filter finds
+[P13].
+"""
 
 from __future__ import annotations
 
@@ -35,6 +37,8 @@ _PART = 256
 
 
 class HagMorphological(FarReaching):
+    """Measure heights above the ground that a progressive morphological filter finds."""
+
     type = "filters.hag_morphological"
     summary = "Height above ground found by a progressive morphological filter"
     source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
@@ -59,7 +63,8 @@ class HagMorphological(FarReaching):
     slope: float = option(
         "number",
         0.12,
-        "Rise over run: a window removes what it lowers by more than this times its radius; raise it for rugged terrain "
+        "Rise over run: a window removes what it lowers by more than this times its radius; raise "
+        "it for rugged terrain "
         "without buildings",
         minimum=0,
         maximum=100,
@@ -96,7 +101,8 @@ class HagMorphological(FarReaching):
     openings: list[float] = option(
         "numbers",
         (),
-        "Also write heights above morphological openings of the minimum grid with windows of these widths in meters, e.g. "
+        "Also write heights above morphological openings of the minimum grid with windows of these "
+        "widths in meters, e.g. "
         "5,9,17,33,65: HeightAboveOpening_5, ...",
         may_be_empty=True,
     )
@@ -104,16 +110,19 @@ class HagMorphological(FarReaching):
     given_ground: bool = option(
         "boolean",
         False,
-        "Points of class 2 are the ground: nothing is filtered, heights are measured from them alone, and Ground is 1 for "
+        "Points of class 2 are the ground: nothing is filtered, heights are measured from them "
+        "alone, and Ground is 1 for "
         "them and for others that are as near to the surface as threshold and scalar say",
     )
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         self._filter = FilterOptions(
             **{one.name: self.options[one.name] for one in fields(FilterOptions)}
         )
 
     def creates(self) -> dict[str, str]:
+        """Return the dimensions that are written, with their PDAL types."""
         return {
             "HeightAboveGround": "float",
             **({"Ground": "uint8_t"} if self.ground else {}),
@@ -122,15 +131,19 @@ class HagMorphological(FarReaching):
         }
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         return ["Classification"] if self.given_ground else []
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         if self.given_ground:
             return reach_of_given(self._filter) * self.cell
         return self._filter.reach_of_points * self.cell
 
     def blocks(self) -> Blocks | None:
-        """How far the rounds before the tiles reach; all that a point's height depends on is in cells."""
+        """How far the rounds before the tiles reach; all that a point's height depends on is in
+        cells.
+        """
         if self.given_ground:
             return None
         cell = self.cell
@@ -138,7 +151,9 @@ class HagMorphological(FarReaching):
         return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
 
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
-        """First, what blocks need of the points ``around`` them, and those (n, 3) inside each (:func:`inside_block`)."""
+        """First, what blocks need of the points ``around`` them, and those (n, 3) inside each
+        (:func:`inside_block`).
+        """
         x, y, z = points.axes
         usable = points.usable(self.ignore)
         inside = by_block(x, y, z, usable, self.cell)
@@ -153,11 +168,15 @@ class HagMorphological(FarReaching):
         inside: Iterable[NDArray[np.float64]],
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
-        """Then, what tiles need of a block (column, row): from what was left around it and, in parts, inside."""
+        """Then, what tiles need of a block (column, row): from what was left around it and, in
+        parts, inside.
+        """
         return cells_of_block(around, block, self._filter, inside).in_parts(_PART)
 
     def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
-        """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have them."""
+        """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have
+        them.
+        """
         return GroundCells.names_within(_PART, *(math.floor(side / self.cell) for side in box))
 
     def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
@@ -165,6 +184,7 @@ class HagMorphological(FarReaching):
         return GroundCells.of_blocks(blocks, len(self.openings))
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Find the ground, or take the given one, and compute heights above it."""
         usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", context.created_before)
         all_wanted = bool(wanted.all())

@@ -28,6 +28,8 @@ _NAME_BYTES = 32
 
 
 class MultiscaleFeatures(Stage):
+    """Compute features of the neighborhoods of each point."""
+
     type = "filters.multiscalefeatures"
     summary = "Covariance, geometric and shape-distribution features of many neighborhoods"
     source = "[B16] sections 3.1-3.2, [W18] section 3.2, [H17] equations 1-3"
@@ -43,7 +45,8 @@ class MultiscaleFeatures(Stage):
     feature_set: list = option(
         "list",
         DEFAULT_FEATURES,
-        "Groups (covariance, geometric, shapes, surfaces, all) or single features (Linearity, A3, ...)",
+        "Groups (covariance, geometric, shapes, surfaces, all) or single features (Linearity, A3, "
+        "...)",
     )
     seed: int = option(
         "integer",
@@ -55,7 +58,8 @@ class MultiscaleFeatures(Stage):
     bins: str | None = option(
         "filename",
         None,
-        "JSON file with the thresholds of shape histograms and curvature: read if it exists, otherwise fitted to "
+        "JSON file with the thresholds of shape histograms and curvature: read if it exists, "
+        "otherwise fitted to "
         "these points and written, so that other clouds can use the same ones",
     )
     ignore: Selection = ignore_option(
@@ -64,14 +68,16 @@ class MultiscaleFeatures(Stage):
     copt_threshold: float | None = option(
         "number",
         None,
-        "Curvature from which on copt treats a point as scattered; default: by 2-means over the points, or that of 'bins'",
+        "Curvature from which on copt treats a point as scattered; default: by 2-means over the "
+        "points, or that of 'bins'",
         minimum=0,
         maximum=1,
     )
     voxel: float = option(
         "number",
         0.0,
-        "Voxel size, for very dense clouds: features are computed for one point per voxel, and its other points get the "
+        "Voxel size, for very dense clouds: features are computed for one point per voxel, and its "
+        "other points get the "
         "same; 0 for none",
         minimum=0,
         maximum=LARGEST,
@@ -96,6 +102,7 @@ class MultiscaleFeatures(Stage):
         return [name for name in self.plan.names if name not in self.plan.dimensions]
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         check_side(self.voxel)
         plan, (bins, threshold) = self.plan, self._thresholds()
         if self.bins and Path(self.bins).exists():
@@ -106,7 +113,8 @@ class MultiscaleFeatures(Stage):
                     bins.thresholds(part.neighborhood.token)  # refused where there are none
         elif plan.shapes or (plan.copt and threshold is None):
             self.instead_of_tiles = (
-                'Thresholds are fitted to the points: give "bins": "thresholds.json", and run the pipeline once without '
+                'Thresholds are fitted to the points: give "bins": "thresholds.json", and run the '
+                "pipeline once without "
                 "--tile on one typical file, which writes it"
             )
         for name in self.columns:
@@ -117,22 +125,28 @@ class MultiscaleFeatures(Stage):
                 )
 
     def _thresholds(self) -> tuple[ShapeBins | None, float | None]:
-        """Return the thresholds of shape distributions and the curvature threshold, None where the points decide."""
+        """Return the thresholds of shape distributions and the curvature threshold, None where the
+        points decide.
+        """
         bins, threshold = _read_bins(self.bins)
         return bins, threshold if self.copt_threshold is None else self.copt_threshold
 
     def outputs(self) -> list[Output]:
+        """Return the files that are written."""
         return (
             [Output(self.bins, "bins", JSON)] if self.bins and not Path(self.bins).exists() else []
         )
 
     def creates(self) -> dict[str, str]:
+        """Return the dimensions that are written, with their PDAL types."""
         return dict.fromkeys(self.columns, "float")
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         return self.plan.halo_m + self.voxel
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Compute features, block by block."""
         plan, names = self.plan, self.columns
         bins, threshold = self._thresholds()
         ignored = points.ignored(self.ignore)

@@ -36,11 +36,13 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a stage; see :func:`option`. Read from a stage object it gives the parsed value."""
+    """One option of a stage; see :func:`option`. Read from a stage object it gives the parsed
+    value.
+    """
 
-    #: A key of ``_KINDS``. ``list`` is a JSON list or comma-separated text; ``codes`` a list of class codes, or of
-    #: ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the same, of other dimensions too; ``bands`` two
-    #: heights in meters, the lower one first.
+    #: A key of ``_KINDS``. ``list`` is a JSON list or comma-separated text; ``codes`` a list of
+    #: class codes, or of ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the
+    #: same, of other dimensions too; ``bands`` two heights in meters, the lower one first.
     kind: str
     #: The value where the option is absent; None means "decided by the stage".
     default: Any
@@ -93,7 +95,9 @@ class Option:
         return out
 
     def parse(self, value: Any) -> Any:
-        """The value as the stage wants it, from JSON or from command-line text; OptionError where it does not fit."""
+        """The value as the stage wants it, from JSON or from command-line text; OptionError where
+        it does not fit.
+        """
         parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
         return (
             checks.one_of(f"option '{self.name}'", parsed, self.choices) if self.choices else parsed
@@ -189,7 +193,8 @@ class Option:
 
 
 def option(kind: str, default: Any, help: str, **more: Any) -> Any:
-    """Declare an option in a stage's class body: ``cell: float = option("number", 20.0, "Side of the cells")``.
+    """Declare an option in a stage's class body: ``cell: float = option("number", 20.0, "Side of
+    the cells")``.
 
     The annotation says what the parsed value is; all else is as for :class:`Option`.
     """
@@ -202,7 +207,9 @@ def code_option(default: int | None, help: str) -> Any:
 
 
 def ignore_option(points: str) -> Any:
-    """The option `ignore`, which noise and withheld points are unless told; says what becomes of the `points`."""
+    """The option `ignore`, which noise and withheld points are unless told; says what becomes of
+    the `points`.
+    """
     words = ": class codes, ranges such as Classification[7:7], or the word withheld"
     return option("selection", UNWANTED, points + words, may_be_empty=True)
 
@@ -218,7 +225,9 @@ def split_list(text: str) -> list[str]:
 
 
 def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Every declared option with its value, given or default; OptionError where what is given does not fit."""
+    """Every declared option with its value, given or default; OptionError where what is given does
+    not fit.
+    """
     known = {option.name: option for option in declared}
     for name in given:
         if name not in known:

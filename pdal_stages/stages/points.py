@@ -16,15 +16,18 @@ from ..base.errors import DimensionError, OptionError, StageError
 from ..base.memory import release_pages
 from ..base.report import Report
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
-from .selection import Expression, Selection
+from .selection import Selection
+from .where_expression import Expression
 
 #: Which stage makes a dimension that a user may lack.
 MAKERS = {
     "Z": "The reader does not give it: check its file and options",
     "HeightAboveGround": (
-        'Add {"type": "filters.hag_morphological"} before this stage, or the stage that the model was trained with'
+        'Add {"type": "filters.hag_morphological"} before this stage, or the stage that the model '
+        "was trained with"
     ),
-    "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": "Classification=>Reference"}',
+    "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": '
+    '"Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
     "Slope": 'Add {"type": "filters.hag_morphological", "terrain_slope": true} before this stage',
     **dict.fromkeys(
@@ -32,8 +35,8 @@ MAKERS = {
         "The reader does not give it; leave it out of the model's dimensions",
     ),
 }
-#: How the warnings begin that a `where` chooses no point, and that none of a file's polygons is near; in tiles they are
-#: told where it is so in all.
+#: How the warnings begin that a `where` chooses no point, and that none of a file's polygons is
+#: near; in tiles they are told where it is so in all.
 HOLDS_NOWHERE = "'where' holds for none of the points:"
 TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
 #: The dimension in which `classify` marks the points that its `where` selects.
@@ -42,7 +45,8 @@ SELECTED = "PdalStagesSelected"
 _STEPS_PER_UNIT = 1e6
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
-#: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical unit.
+#: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical
+#: unit.
 _HEIGHTS = "HeightAbove"
 
 
@@ -58,7 +62,8 @@ class Points:
     legacy_flags: bool = (
         False  #: whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`
     )
-    #: Whether class 12 (overlap) of LAS 1.0-1.3 may be read as class 0 with the flag Overlap, as PDAL from 2.6 on does.
+    #: Whether class 12 (overlap) of LAS 1.0-1.3 may be read as class 0 with the flag Overlap, as
+    #: PDAL from 2.6 on does.
     overlap_as_flag: bool = False
     #: Below zero for the points whose results are used: :meth:`tally` counts those alone.
     own: NDArray | None = None
@@ -90,7 +95,9 @@ class Points:
         return np.ones(self.count, bool) if self.mask is None else self.mask
 
     def tally(self, name: str, points: NDArray[np.bool_]) -> None:
-        """Put the number of these points (n,) into the report; in a tile, of those that lie in the tile itself."""
+        """Put the number of these points (n,) into the report; in a tile, of those that lie in the
+        tile itself.
+        """
         inside = points if self.own is None else points & (self.own < 0)
         self.report.figures[name] = int(np.count_nonzero(inside))
 
@@ -116,8 +123,9 @@ class Points:
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return coordinates in meters, x, y and z each by itself.
 
-        They are rounded to a millionth of the unit of the file: the same coordinates under another scale and offset
-        differ by the rounding of `X * scale + offset`, which puts points on the edge of a cell on either side of it.
+        They are rounded to a millionth of the unit of the file: the same coordinates under another
+        scale and offset differ by the rounding of `X * scale + offset`, which puts points on the
+        edge of a cell on either side of it.
 
         Raises
         ------
@@ -138,13 +146,16 @@ class Points:
             raise StageError(
                 "coordinates are not finite (NaN or infinite)",
                 found=f"{bad:,} of {self.count:,} points",
-                cure="Drop them first: pdal translate IN OUT range --filters.range.limits='X[:1e9],Y[:1e9],Z[-1e5:1e5]'; "
+                cure="Drop them first: pdal translate IN OUT range "
+                "--filters.range.limits='X[:1e9],Y[:1e9],Z[-1e5:1e5]'; "
                 'in a pipeline: {"type": "filters.range", "limits": "X[:1e9],Y[:1e9],Z[-1e5:1e5]"}',
             )
         return x, y, z
 
     def keep_only(self, names: Iterable[str]) -> None:
-        """Forget the other dimensions: from here on nobody reads them. Of coordinates :attr:`xyz` is left."""
+        """Forget the other dimensions: from here on nobody reads them. Of coordinates :attr:`xyz`
+        is left.
+        """
         self.xyz  # noqa: B018  before they are gone
         self.__dict__.pop("axes", None)
         kept, lent = set(names), self.arrays
@@ -229,7 +240,7 @@ class Points:
                 found |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
         for span in selection.spans:
             name = span.dimension
-            found |= span.holds(
+            found |= span.contains(
                 self.flag(name) if name in _FLAGS else self.dimension(name, meters=False)
             )
         return found
@@ -245,7 +256,9 @@ class Points:
         return self.inside & ~self.ignored(ignored)
 
     def changeable(self, ignored: Selection, kept: Selection) -> NDArray[np.bool_]:
-        """The points inside `where` that are neither ignored, which is counted, nor keep what they have."""
+        """The points inside `where` that are neither ignored, which is counted, nor keep what they
+        have.
+        """
         return self.usable(ignored) & ~self.chosen(kept)
 
     def wanting(self, name: str, made_before: bool) -> NDArray[np.bool_]:
@@ -253,7 +266,9 @@ class Points:
         return self.inside if made_before else self.inside | (self.arrays[name] == 0)
 
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """New class codes for `Classification`, with the flag bits of each point kept; they are counted in the report."""
+        """New class codes for `Classification`, with the flag bits of each point kept; they are
+        counted in the report.
+        """
         self.report.codes = class_counts(codes)
         limit = self.code_limit
         flags: Any = np.uint8(0)
@@ -261,7 +276,8 @@ class Points:
             flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
             if flags.any():
                 limit = limit or (
-                    f"class codes above {LEGACY_LIMIT} do not fit these points: read from LAS 1.0-1.3, some carry "
+                    f"class codes above {LEGACY_LIMIT} do not fit these points: read from LAS "
+                    "1.0-1.3, some carry "
                     "synthetic, key-point or withheld flags in the same byte",
                     "Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
                 )

@@ -15,6 +15,8 @@ from .selection import Selection
 
 
 class Polygons(ClassStage):
+    """Change the class of points inside polygons of a map."""
+
     type = "filters.polygons"
     summary = (
         "Set the class of points inside the polygons of any OGR file, such as water inside lakes"
@@ -23,25 +25,31 @@ class Polygons(ClassStage):
     polygons: list = option(
         "list",
         None,
-        "Files and classes, FILE=CODE: lakes.gpkg=9 makes ground (2) inside water, bridges.gpkg=17:2,6 ground and buildings "
-        "bridge decks, FILE=CODE:all everything inside; a layer is named as in lakes.gpkg|layername=canals=9",
+        "Files and classes, FILE=CODE: lakes.gpkg=9 makes ground (2) inside water, "
+        "bridges.gpkg=17:2,6 ground and buildings "
+        "bridge decks, FILE=CODE:all everything inside; a layer is named as in "
+        "lakes.gpkg|layername=canals=9",
         required=True,
     )
     ignore: Selection = ignore_option("Points that keep their class")
     keep: Selection = keep_option("Further points that keep their class")
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         self.overlays = [Overlay.parse(str(one)) for one in self.polygons]
         for overlay in self.overlays:
             with_vector(overlay.check)
 
     def inputs(self) -> list[str]:
+        """Return the files that are read."""
         return [overlay.file for overlay in self.overlays if "://" not in overlay.file]
 
     def largest_class(self) -> int:
+        """Return the largest class code that may be written."""
         return max((overlay.code for overlay in self.overlays), default=0)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Give points inside polygons their class."""
         change = points.changeable(self.ignore, self.keep)
         x, y = (np.asarray(points.arrays[name], np.float64) for name in "XY")
         box = float(x.min()), float(y.min()), float(x.max()), float(y.max())

@@ -1,8 +1,9 @@
-"""The stages before a classifier that made what it reads: kept in the model file, run by `classify`, compared elsewhere.
+"""The stages before a classifier that made what it reads: kept in the model file, run by
+`classify`, compared elsewhere.
 
-A model file may come from anybody. So a preparation holds only stages and options that are listed (:attr:`Stage.in_models`,
-:data:`PDAL_OPTIONS`): numbers in bounds, classes, conditions, never a path. Else it is refused when the file is loaded,
-and not stored by training.
+A model file may come from anybody. So a preparation holds only stages and options that are listed
+(:attr:`Stage.in_models`, :data:`PDAL_OPTIONS`): numbers in bounds, classes, conditions, never a
+path. Else it is refused when the file is loaded, and not stored by training.
 """
 
 from __future__ import annotations
@@ -36,12 +37,13 @@ OF_PDAL = (
     "filters.hag_delaunay",
     "filters.hag_dem",
 )
-#: Those that measure from points of class 2, and what must stand before them: PDAL 2.2 crashes where there are none.
+#: Those that measure from points of class 2, and what must stand before them: PDAL 2.2 crashes
+#: where there are none.
 NEEDS_GROUND, MAKES_GROUND = ("filters.hag_nn", "filters.hag_delaunay"), "filters.smrf"
 _COUNT = Option("integer", None, "", 1, 1000, name="count")
 _EXTRAPOLATION = Option("boolean", None, "", name="allow_extrapolation")
-#: PDAL's stages that a model may carry, and their options. They read no file, move no point and leave none out; each writes
-#: `Classification` or `HeightAboveGround` alone.
+#: PDAL's stages that a model may carry, and their options. They read no file, move no point and
+#: leave none out; each writes `Classification` or `HeightAboveGround` alone.
 PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
     "filters.smrf": (
         Option("number", None, "", 0.2, 100, name="cell"),
@@ -59,8 +61,8 @@ PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
     ),
     "filters.hag_delaunay": (_COUNT, _EXTRAPOLATION),
 }
-#: Options that say where in a pipeline a stage stands, how it is run, or in what units the points at hand are; not what
-#: it makes.
+#: Options that say where in a pipeline a stage stands, how it is run, or in what units the points
+#: at hand are; not what it makes.
 _ASIDE = (
     "tag",
     "inputs",
@@ -100,7 +102,9 @@ def _spelled(stages: Sequence[Mapping[str, Any]]) -> list[Any]:
 
 
 def algorithm_versions(preparation: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Return type -> version of the algorithm in this release, for stages of ours; PDAL's have none."""
+    """Return type -> version of the algorithm in this release, for stages of ours; PDAL's have
+    none.
+    """
     types = [str(stage["type"]) for stage in preparation]
     return {kind: stage_type(kind).algorithm_version for kind in types if kind in stage_types()}
 
@@ -111,7 +115,8 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     Raises
     ------
     ModelError
-        For a stage or an option that a model cannot carry, or a value out of its bounds; it names the stage.
+        For a stage or an option that a model cannot carry, or a value out of its bounds; it names
+        the stage.
     """
     try:
         if len(preparation) > _MOST:
@@ -204,10 +209,11 @@ def made_of_coordinates(
     threads: int | None = None,
     classes: npt.NDArray[np.uint8] | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
-    """The dimensions that a preparation's only stage makes of coordinates in meters; none where it is not one of ours.
+    """The dimensions that a preparation's only stage makes of coordinates in meters; none where it
+    is not one of ours.
 
-    `usable` (n,) are points that may form the ground; the others only receive heights. `classes` (n,) are needed where
-    ground is given.
+    `usable` (n,) are points that may form the ground; the others only receive heights. `classes`
+    (n,) are needed where ground is given.
     """
     if (
         len(preparation) != 1

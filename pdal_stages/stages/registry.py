@@ -1,7 +1,9 @@
-"""Find stages by type name: one module each in this folder, and those of other packages through an entry point.
+"""Find stages by type name: one module each in this folder, and those of other packages through an
+entry point.
 
-A module of this folder that defines a stage holds a line ``type = "filters.NAME"`` in the body of its class; no list
-names it anywhere else. Other packages declare the entry point ``pdal_stages.stages``: type name -> ``module:Class``.
+A module of this folder that defines a stage holds a line ``type = "filters.NAME"`` in the body of
+its class; no list names it anywhere else. Other packages declare the entry point
+``pdal_stages.stages``: type name -> ``module:Class``.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ class _Registry(Mapping[str, type[Stage]]):
 
     @functools.cached_property
     def _modules(self) -> dict[str, str]:
-        """Type name -> module of this folder. Read as text: importing all of them takes half a second."""
+        """Type name -> module of this folder. Read as text: importing all of them takes half a
+        second.
+        """
         return {
             name: path.stem
             for path in sorted(Path(__file__).parent.glob("*.py"))

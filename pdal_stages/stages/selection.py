@@ -1,16 +1,13 @@
-"""Points that are chosen: by class codes and ranges of dimensions (``Classification[7:7]``), or by a `where` condition.
+"""Points chosen by class codes and by ranges of dimensions, as PDAL writes them.
 
-PDAL hands a filter with `where` only the points inside; our stages need those outside too, as neighbors, so they evaluate
-the condition themselves, with the meaning that PDAL gives it. PDAL's functions (from 2.7 on) are not read.
+``Classification[7:7]`` is class 7, ``ReturnNumber[0:0]`` what has no return number.
 """
 
 from __future__ import annotations
 
-import ast
-import functools
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
-from ..base.errors import DimensionError, OptionError, suggest
+from ..base.errors import OptionError
 
-#: Noise, and points that their supplier withheld: neither neighbors nor overwritten, unless told.
+#: Noise, and points that their supplier withheld: by default neither neighbors nor overwritten.
 UNWANTED = (*NOISE, "withheld")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
 #: One range as PDAL writes it.
@@ -30,7 +27,9 @@ _CURE = "Write 7,18 or, as PDAL has it, Classification[7:7]; withheld is short f
 
 @dataclass(frozen=True)
 class Span:
-    """A range of a dimension: ``Name[low:high]``, ``(`` and ``)`` leave the ends out, ``!`` turns it round."""
+    """A range of a dimension: ``Name[low:high]``, ``(`` and ``)`` leave the ends out, ``!`` turns
+    it round.
+    """
 
     dimension: str
     low: float
@@ -39,8 +38,8 @@ class Span:
     with_high: bool
     outside: bool
 
-    def holds(self, values: NDArray) -> NDArray[np.bool_]:
-        """Which values lie in it."""
+    def contains(self, values: NDArray) -> NDArray[np.bool_]:
+        """Return which values (n,) lie in the range."""
         inside = (values >= self.low) if self.with_low else (values > self.low)
         inside &= (values <= self.high) if self.with_high else (values < self.high)
         return ~inside if self.outside else inside
@@ -54,188 +53,30 @@ class Selection:
     spans: tuple[Span, ...] = ()
 
     def __bool__(self) -> bool:
+        """Return whether anything is selected."""
         return bool(self.codes or self.spans)
 
     @classmethod
     def parse(cls, items: Iterable[Any], option: str) -> Selection:
-        """From class codes, ranges and the word ``withheld``; errors name the option."""
+        """Read class codes, ranges and the word ``withheld``; errors name the option."""
         codes: list[int] = []
         spans: list[Span] = []
-        for item in (str(item).strip() for item in items):
-            if not item:
-                continue
-            found = RANGE.fullmatch("Withheld[1:1]" if item.lower() == "withheld" else item)
+        for item in filter(None, (str(item).strip() for item in items)):
             if item in map(str, range(256)):
                 codes.append(int(item))
-            elif found is None:
+                continue
+            match = RANGE.fullmatch("Withheld[1:1]" if item.lower() == "withheld" else item)
+            if match is None:
                 raise OptionError(
                     f"option '{option}' must list class codes of 0 to 255, or ranges",
                     found=repr(item),
                     cure=_CURE,
                 )
+            name, outside, opens, low, high, closes = match.groups()
+            low, high = float(low or -math.inf), float(high or math.inf)
+            span = Span(name, low, high, opens == "[", closes == "]", bool(outside))
+            if name.lower() == "classification":
+                codes += np.flatnonzero(span.contains(np.arange(256.0))).tolist()
             else:
-                name, out, opens, low, high, closes = found.groups()
-                span = Span(
-                    name,
-                    float(low) if low else -math.inf,
-                    float(high) if high else math.inf,
-                    opens == "[",
-                    closes == "]",
-                    bool(out),
-                )
-                if name.lower() == "classification":
-                    codes += np.flatnonzero(span.holds(np.arange(256.0))).tolist()
-                else:
-                    spans.append(span)
+                spans.append(span)
         return cls(tuple(dict.fromkeys(codes)), tuple(dict.fromkeys(spans)))
-
-
-_TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!]))",
-    re.ASCII,
-)
-_DEEPEST = 200
-_IN_PYTHON = {"&&": "and", "||": "or", "!": "not"}
-
-
-def _divide(a, b):
-    """PDAL's division: by zero it gives NaN, not infinity."""
-    return np.where(np.equal(b, 0), np.nan, np.divide(a, b))
-
-
-#: What takes numbers, and what takes truths.
-_OF_NUMBERS: dict[type, Callable] = {
-    ast.Eq: np.equal, ast.NotEq: np.not_equal, ast.Lt: np.less, ast.LtE: np.less_equal, ast.Gt: np.greater,
-    ast.GtE: np.greater_equal, ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: _divide,
-    ast.USub: np.negative,
-}  # fmt: skip
-_OF_TRUTHS: dict[type, Callable] = {
-    ast.And: np.logical_and,
-    ast.Or: np.logical_or,
-    ast.Not: np.logical_not,
-}
-#: Other names that PDAL takes for dimensions, in small letters.
-_ALIASES = {
-    "class": "Classification",
-    "cls": "Classification",
-    "hag": "HeightAboveGround",
-    "nearinfrared": "Infrared",
-    "scanangle": "ScanAngleRank",
-}
-_Values = Mapping[str, NDArray]
-
-
-class Expression:
-    """A `where` expression, such as ``Classification == 2 && Z > 3``, read by Python's own parser.
-
-    Raises
-    ------
-    OptionError
-        If it cannot be read; the message points at the place.
-    """
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-        python, self._places = (
-            "",
-            list[int](),
-        )  # where in the text the characters of the Python come from
-        position, end = 0, len(text.rstrip())
-        while position < end:
-            match = _TOKEN.match(text, position)
-            if match is None:
-                position += len(text[position:]) - len(text[position:].lstrip())
-                raise self._error(f"'{text[position]}' is not understood", position)
-            kind = str(match.lastgroup)
-            word = _IN_PYTHON.get(match[kind], match[kind])
-            if kind == "number":
-                word = repr(float(word)).replace("inf", "1e999")
-            elif kind == "name":
-                word = f"_{word}"  # some are words of Python
-            python += f"{word} "
-            self._places += [match.start(kind)] * (len(word) + 1)
-            position = match.end()
-        self._places.append(end)
-        try:
-            self._root = ast.parse(python, mode="eval").body
-            if _depth(self._root) > _DEEPEST:
-                raise RecursionError
-        except SyntaxError as error:
-            if "nested" in error.msg:
-                raise self._error("it is nested too deeply", 0) from None
-            place = self._places[(error.offset or 0) - 1]  # 0: it ends too early
-            raise self._error("it is not a condition of this form", place) from None
-        except (MemoryError, RecursionError):
-            raise self._error("it is nested too deeply", 0) from None
-        self._names = {node.id[1:] for node in ast.walk(self._root) if isinstance(node, ast.Name)}
-        if self._value(self._root, dict.fromkeys(self._names, np.zeros(0))).dtype != bool:
-            raise self._error("it gives a number, not true or false", 0)
-
-    def evaluate(self, arrays: _Values) -> NDArray[np.bool_]:
-        """The mask of points for which the expression holds.
-
-        Raises
-        ------
-        DimensionError
-            If it names a dimension the points do not have.
-        """
-        values = {name: arrays[_find(name, arrays)] for name in sorted(self._names)}
-        size = len(next(iter(arrays.values()))) if arrays else 0
-        return np.broadcast_to(self._value(self._root, values), (size,)).copy()
-
-    def _error(self, what: str, place: int) -> OptionError:
-        return OptionError(
-            f"the 'where' expression cannot be read: {what}, at character {place + 1}",
-            found=repr(self.text),
-            cure='Example: "Classification == 2 && Z > 3"',
-        )
-
-    def _value(self, node: ast.expr, values: _Values) -> Any:
-        """What a part gives, truths or numbers; an error where it takes the others."""
-        match node:
-            case ast.Constant(value=float(number)):
-                return np.float64(number)
-            case ast.Name(id=word):
-                return np.asarray(values[word[1:]], np.float64)
-            case ast.BoolOp(op=op, values=nodes):
-                parts = nodes
-            case ast.UnaryOp(op=ast.Not() | ast.USub() as op, operand=part):
-                parts = [part]
-            case (
-                ast.BinOp(left=left, op=op, right=right)
-                | ast.Compare(left=left, ops=[op], comparators=[right])
-            ):
-                parts = [left, right]
-            case _:
-                raise self._error(
-                    "it is not a condition of this form", self._places[node.col_offset]
-                )
-        takes_truth = type(op) in _OF_TRUTHS
-        found = [self._value(part, values) for part in parts]
-        for part, value in zip(parts, found, strict=True):
-            if (value.dtype == bool) != takes_truth:
-                needed = "a condition" if takes_truth else "a number"
-                raise self._error(f"{needed} is needed", self._places[part.col_offset])
-        function = (_OF_TRUTHS if takes_truth else _OF_NUMBERS)[type(op)]
-        with np.errstate(all="ignore"):
-            return functools.reduce(function, found) if len(found) > 1 else function(found[0])
-
-
-def _depth(node: ast.AST) -> int:
-    return 1 + max(map(_depth, ast.iter_child_nodes(node)), default=0)
-
-
-def _find(name: str, arrays: _Values) -> str:
-    """The dimension a name means: PDAL takes known ones in any case, and some by another name."""
-    if name in arrays:
-        return name
-    wanted = _ALIASES.get(name.lower(), name).lower()
-    for known in arrays:
-        if known.lower() == wanted:
-            return known
-    raise DimensionError(
-        f"'where' names the dimension '{name}', which the points do not have",
-        found=", ".join(arrays),
-        cure=suggest(name, arrays) or None,
-    )

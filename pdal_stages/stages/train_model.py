@@ -1,4 +1,6 @@
-"""``writers.classifiermodel``: train a classifier on labeled points, write one model file [B16, W18]."""
+"""``writers.classifiermodel``: train a classifier on labeled points, write one model file [B16,
+W18].
+"""
 
 from __future__ import annotations
 
@@ -52,13 +54,17 @@ AUTO = "auto"
 
 
 def trained(name: str, /, **other: Any) -> Any:
-    """An option of training, as it is declared there; `other` is what is different here, as for :class:`Option`."""
+    """An option of training, as it is declared there; `other` is what is different here, as for
+    :class:`Option`.
+    """
     field = _TRAINING[name]
     declared = {key: value for key, value in field.metadata.items() if key != "check"}
     return option(**{"default": field.default, **declared, **other})
 
 
 class TrainModel(Stage):
+    """Train a model on labeled points."""
+
     type = "writers.classifiermodel"
     summary = "Train a classifier on the labeled points that reach it, and write one model file"
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
@@ -81,7 +87,8 @@ class TrainModel(Stage):
     dimensions: list = trained(
         "dimensions",
         default=(AUTO,),
-        help=f"{_TRAINING['dimensions'].metadata['help']}; auto: HeightAboveGround and, where the points have them, Ground, "
+        help=f"{_TRAINING['dimensions'].metadata['help']}; auto: HeightAboveGround and, where the "
+        "points have them, Ground, "
         "HeightAboveOpening_5, HeightAboveOpening_17 and returns",
         may_be_empty=True,
     )
@@ -107,12 +114,14 @@ class TrainModel(Stage):
     survey: str = option(
         "string",
         "",
-        "Dimension that numbers the surveys: points of different surveys are not neighbors, and surveys have equal weight",
+        "Dimension that numbers the surveys: points of different surveys are not neighbors, and "
+        "surveys have equal weight",
     )
     checked_only: bool = option(
         "boolean",
         True,
-        f"If points have the dimension {CHECKED} (from the command corrections), and it is not 0 everywhere, draw samples "
+        f"If points have the dimension {CHECKED} (from the command corrections), and it is not 0 "
+        "everywhere, draw samples "
         "only where it is 1",
     )
     thin: list = trained("thin", may_be_empty=True)
@@ -120,7 +129,8 @@ class TrainModel(Stage):
     ignore: Selection = option(
         "selection",
         UNWANTED,
-        "Points to leave out, even as neighbors: labels (unless 'classes' names them), ranges of other dimensions such as "
+        "Points to leave out, even as neighbors: labels (unless 'classes' names them), ranges of "
+        "other dimensions such as "
         "ReturnNumber[0:0], or the word withheld",
         may_be_empty=True,
     )
@@ -155,20 +165,26 @@ class TrainModel(Stage):
     def from_pipeline(
         cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
+        """Return options that follow from the stages before."""
         return {"files": files_read(before)}
 
     @classmethod
     def describe_choices(cls) -> str:
+        """Return a text on options whose words stand for several values."""
         return describe_recipes()
 
     def check_upstream(self) -> str | None:
+        """Return a warning about the stages upstream; None where they fit."""
         try:
             check(self.upstream)
         except ModelError as error:
             return (
-                f"{self.type}: the model will not hold the stages before it, so `classify` cannot run them by itself: "
-                f"{error.what}{f' (found {error.found})' if error.found is not None else ''}. Write a pipeline with "
-                f"the same stages, {', '.join(self._upstream_types)}, before filters.modelclassifier"
+                f"{self.type}: the model will not hold the stages before it, so `classify` cannot "
+                "run them by itself: "
+                f"{error.what}{f' (found {error.found})' if error.found is not None else ''}. "
+                "Write a pipeline with "
+                f"the same stages, {', '.join(self._upstream_types)}, before "
+                "filters.modelclassifier"
             )
         return None
 
@@ -212,6 +228,7 @@ class TrainModel(Stage):
         return replace(self.training, dimensions=(*DEFAULT_DIMENSIONS, *there))
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         self.training.inputs  # noqa: B018  words that mean nothing are refused
         if self.label in required_dimensions(self.training.inputs):
             raise OptionError(
@@ -223,13 +240,16 @@ class TrainModel(Stage):
             ClassMap.parse(self.training.classes)
 
     def outputs(self) -> list[Output]:
+        """Return the files that are written."""
         return [Output(self.filename, "model", MODEL), *self._trainer.outputs(self.training)]
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         own = [name for name in (self.survey, self.groups) if name]
         return [self.label, *own, *required_dimensions(self.training.inputs)]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Train on the points and write the model."""
         training = self.training_on(points)
         clouds = [cloud for _, cloud in self.surveys(self.cloud_of(points, training))]
         self.finish(train(clouds, training), points.report)
@@ -244,8 +264,9 @@ class TrainModel(Stage):
     def cloud_of(
         self, points: Points, training: TrainingOptions, marks: Mapping[str, NDArray] | None = None
     ) -> TrainingCloud:
-        """The points as a cloud to train on, all of one survey; with `marks` as more dimensions, from which follows later
-        what samples are drawn from."""
+        """The points as a cloud to train on, all of one survey; with `marks` as more dimensions,
+        from which follows later what samples are drawn from.
+        """
         needed = required_dimensions((*training.inputs, *filter(None, [self.groups])))
         dimensions = {name: points.dimension(name) for name in needed}
         dimensions |= {
@@ -289,12 +310,15 @@ class TrainModel(Stage):
             report.figures["copt_threshold"] = threshold
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
-                f"the base assigns {held:,} of {all_:,} samples of class {code} to classes without labels, where they stay: "
-                "label some of those classes too, or train this class alone (strategy binary, target)"
+                f"the base assigns {held:,} of {all_:,} samples of class {code} to classes without "
+                "labels, where they stay: "
+                "label some of those classes too, or train this class alone (strategy binary, "
+                "target)"
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(
-                f"{short:,} samples have neighbors farther away than their tile shows, and may differ from those of a run "
+                f"{short:,} samples have neighbors farther away than their tile shows, and may "
+                "differ from those of a run "
                 "in one piece: give more --memory"
             )
         if unscored := model.info["training"].get("unscored"):
@@ -302,14 +326,17 @@ class TrainModel(Stage):
         crossed = model.info["accuracy"]["cross_validation"] or {}
         if "instead" in crossed:
             report.notes.append(
-                f"blocks are held out, not {model_description.groups_word(self.groups)}: {crossed['instead']}"
+                f"blocks are held out, not {model_description.groups_word(self.groups)}: "
+                f"{crossed['instead']}"
             )
         if model_description.held_out(model.info):
             report.figures["score"] = model_description.score(model.info)
             report.notes.append(report.figures["score"])
 
     def choice(self, parts: Iterable[Mapping[str, Any]]) -> CheckedChoice:
-        """What chooses points to draw samples from, where some were checked by a person: by :meth:`CheckedPoints.counts`."""
+        """What chooses points to draw samples from, where some were checked by a person: by
+        :meth:`CheckedPoints.counts`.
+        """
         known = None if self.base is None else loaded_model(self.base).codes.tolist()
         return CheckedChoice(known, self.seed, parts)
 
@@ -328,8 +355,9 @@ class TrainModel(Stage):
         return looked, looked.counts(int(np.count_nonzero(checked)))
 
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
-        """The points that samples are drawn from: those inside `where`, and where any was checked by a person, of these
-        the checked ones alone."""
+        """The points that samples are drawn from: those inside `where`, and where any was checked
+        by a person, of these the checked ones alone.
+        """
         if CHECKED not in points.arrays or not self.checked_only:
             return points.mask
         looked, counts = self.checked_points(points)

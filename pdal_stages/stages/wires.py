@@ -1,4 +1,6 @@
-"""``filters.wires``: class of wires, long thin lines that hang in the air, and of the towers that hold them."""
+"""``filters.wires``: class of wires, long thin lines that hang in the air, and of the towers that
+hold them.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +19,8 @@ from .selection import Selection
 
 
 class Wires(ClassStage):
+    """Find wires and, on request, the towers that carry them."""
+
     type = "filters.wires"
     summary = "Classify wires, long thin lines in the air, and the towers that carry them"
     where_help = "Points outside keep their class but still serve as neighbors"
@@ -32,15 +36,19 @@ class Wires(ClassStage):
     keep: Selection = keep_option()
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         return ["Classification", "HeightAboveGround"]
 
     def halo_m(self) -> float:
+        """Return how far around a tile points change its results, in meters."""
         return RULES.reach_m + (towers.RULES.reach_m if self.towers else 0.0)
 
     def largest_class(self) -> int:
+        """Return the largest class code that may be written."""
         return max(self.code, self.tower_code) if self.towers else self.code
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Give points of wires and towers their class."""
         ignored = points.ignored(self.ignore)
         height = np.asarray(points.dimension("HeightAboveGround"), np.float64)
         free = points.inside & ~ignored & ~points.chosen(self.keep)

@@ -1,4 +1,6 @@
-"""``writers.objects``: buildings, trees, spans and decks as polygons, points and lines with what was measured of them."""
+"""``writers.objects``: buildings, trees, spans and decks as polygons, points and lines with what
+was measured of them.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +20,8 @@ STRAIGHT, CELLS = "straight", "cells"
 
 
 class WriteObjects(ObjectOptions, Stage):
+    """Write objects as polygons, points and lines."""
+
     type = "writers.objects"
     summary = "Write buildings, trees, spans of wires and bridge decks to a vector file"
     instead_of_tiles = "Write the points first, then: pdal-stages objects FILES town.gpkg"
@@ -26,7 +30,8 @@ class WriteObjects(ObjectOptions, Stage):
     filename: str = option(
         "filename",
         None,
-        "File to write: .gpkg with all layers, or .geojson, .fgb, .shp, one for each layer, named after it",
+        "File to write: .gpkg with all layers, or .geojson, .fgb, .shp, one for each layer, named "
+        "after it",
         required=True,
     )
     outlines: str = option(
@@ -37,6 +42,7 @@ class WriteObjects(ObjectOptions, Stage):
     )
 
     def check(self) -> None:
+        """Refuse options that contradict each other."""
         from ..reports.object_layers import LAYERS
         from ..reports.vector_files import check_target
 
@@ -44,15 +50,18 @@ class WriteObjects(ObjectOptions, Stage):
         with_vector(check_target, self.filename, LAYERS)
 
     def outputs(self) -> list[Output]:
+        """Return the files that are written."""
         from ..reports.object_layers import LAYERS
         from ..reports.vector_files import target_files
 
         return [Output(str(file), "objects") for file in target_files(self.filename, LAYERS)]
 
     def reads(self) -> list[str]:
+        """Return the dimensions that the points must have."""
         return ["Classification"]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Find objects and write them."""
         from ..reports.object_layers import write_objects
 
         found, refused = find_objects(self.cells(points, context), self.settings).without(
