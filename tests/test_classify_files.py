@@ -284,7 +284,7 @@ def test_a_where_that_chooses_nothing_is_said_once(folder, classify, tmp_path, w
         "--workers",
         "0",
     )
-    told = [line for line in err.splitlines() if "'where' holds for none" in line]
+    told = [line for line in err.splitlines() if "'where' matches no points" in line]
     assert code == 0 and len(told) == said, err
     assert all(where in line and "PdalStages" not in line for line in told)
 

@@ -9,7 +9,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.stages.context import WHOLE_CLOUD
+from pdal_stages.stages.context import WHOLE_CLOUD, StageContext
 from pdal_stages.stages.registry import stage_type
 from pdal_stages.synthetic import write_town
 
@@ -129,3 +129,21 @@ def test_a_tile_without_ground_is_only_warned_of(tmp_path, write_las):
     assert not run.failures
     whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
     np.testing.assert_array_equal(whole["ObjectID"], tiled["ObjectID"])
+
+
+@pytest.mark.parametrize(("unit", "meters"), [("meter", 1.0), ("foot", 0.3048)])
+def test_a_building_reaches_as_far_in_feet_as_in_meters(unit, meters):
+    """The left 30 m of a building lie in the tile, 50 m beside it."""
+    x, y = (axis.ravel() for axis in np.mgrid[1000.25:1100:0.5, 0.25:20:0.5])
+    roof = (x > 1000) & (x < 1080)
+    arrays = {
+        "X": x / meters,
+        "Y": y / meters,
+        "Z": np.where(roof, 8.0, 0.0) / meters,
+        "Classification": np.where(roof, 6, 2).astype(np.uint8),
+        "Outside": np.where(x < 1030, -1.0, x - 1030),
+    }
+    stage = stage_type("filters.objects")({"horizontal_unit": unit, "vertical_unit": unit})
+    context = StageContext(outside="Outside")
+    reach = stage.reach_of(stage.points(arrays, context), context, (1000, 0, 1030, 20))
+    assert reach == pytest.approx(50 + stage.halo_m(), abs=1.0)

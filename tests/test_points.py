@@ -24,7 +24,7 @@ def test_coordinates_in_meters():
 
 def test_what_is_not_kept_is_let_go_of_and_coordinates_stay():
     given = arrays()
-    points = Points(dict(given), own=given["Mine"])
+    points = Points(dict(given), meters_outside=given["Mine"])
     points.keep_only(["Classification", "HeightAboveGround"])
     assert set(points.arrays) == {"Classification"} and points.count == 1000
     with pytest.raises(DimensionError, match="GpsTime"):

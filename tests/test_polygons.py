@@ -196,7 +196,7 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las, run_job):
     for words in ([], ["--tile", "30", "--workers", "0", "--no-progress"]):
         code, _, err = run_job([source, lay, out], *words)
         found.append(np.asarray(laspy.read(out).classification))
-        said = [line for line in err.splitlines() if "no polygon is where" in line]
+        said = [line for line in err.splitlines() if "no polygon lies where" in line]
         assert code == 0 and len(said) == 1 and "elsewhere.gpkg" in said[0]
     assert np.array_equal(*found) and (found[0] == 9).sum() > 300
     with pytest.raises(StageError):

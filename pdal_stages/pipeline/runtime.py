@@ -14,7 +14,7 @@ import json
 import sys
 import uuid
 from collections import ChainMap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
@@ -154,7 +154,11 @@ def _run_one(
 
 
 def points_of(
-    stage: Stage, context: StageContext, module: Mapping[str, Any], ins: Mapping[str, Any]
+    stage: Stage,
+    context: StageContext,
+    module: Mapping[str, Any],
+    ins: Mapping[str, Any],
+    lent_by_pdal: Set[str] = frozenset(),
 ) -> Points:
     """The points of a view, as a stage sees them, from what PDAL sets in a script's globals."""
     metadata = module.get("metadata")
@@ -164,6 +168,7 @@ def points_of(
         wkt=wkt_of(module.get("spatialreference")),
         legacy_flags=pdal_env.flags_inside_classification(ins, metadata),
         overlap_as_flag=pdal_env.overlap_as_flag(ins, metadata),
+        lent_by_pdal=lent_by_pdal,
     )
 
 
@@ -197,13 +202,13 @@ def run_on_view(
 ) -> Report:
     """Run a stage on one view; its report."""
     _refuse_overwritten(module.get("metadata"))
-    points = points_of(stage, context, module, ins)
+    lent = ins.keys() - outs.keys() if isinstance(ins, dict) else frozenset()
+    points = points_of(stage, context, module, ins, lent)
     for name in stage.reads():
         if name not in ins:
             raise points.missing(name, stage.hint)
     if not points.count:
         return run_on_nothing(stage)
-    points.lent_by_pdal = ins.keys() - outs.keys() if isinstance(ins, dict) else set()
     for name, values in stage.run(points, context).items():
         target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.

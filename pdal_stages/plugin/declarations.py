@@ -38,8 +38,8 @@ def header() -> str:
     version = f"constexpr const char *VERSION = {json.dumps(__version__)};"
     names = ", ".join(map(json.dumps, sorted({"filters.merge", *SPLITS})))
     one_view = (
-        "// Stages after which there is one view, or several are what the user asked for.\n"
-        f"const std::set<std::string> ONE_VIEW {{ {names} }};"
+        "// Stages after which there is one view, or several are what the user asked for.\nconst "
+        f"std::set<std::string> ONE_VIEW {{ {names} }};"
     )
     return "\n".join([version, one_view, *options, "const Stage STAGES[] = {", *stages, "};", ""])
 

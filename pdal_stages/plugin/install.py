@@ -127,8 +127,8 @@ def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
         if not lacking:
             return [*good, f"plugin: {len(libraries())} stages in {folder}"], []
         bad.append(
-            f"the plugin is not in {folder} (missing {', '.join(lacking[:3])}). pdal-stages plugin "
-            "--install"
+            f"the plugin is not in {folder} (missing {', '.join(lacking[:3])}). pdal-stages "
+            "plugin --install"
         )
     return good, bad
 
@@ -151,8 +151,8 @@ def compiler() -> list[str]:
         "there is no C++ compiler",
         found=f"CXX={' '.join(named)}" if named else "neither c++, g++ nor clang++ on PATH",
         cure="Debian, Ubuntu: apt-get install g++. Fedora: dnf install gcc-c++. macOS: "
-        "xcode-select --install. conda: "
-        f"conda install -c conda-forge cxx-compiler. Without one, {_STILL_WORK}",
+        "xcode-select --install. conda: conda install -c conda-forge cxx-compiler. Without one, "
+        f"{_STILL_WORK}",
     )
 
 
@@ -177,8 +177,7 @@ def pdal() -> Pdal:
         "PDAL's headers are missing",
         found=f"no include/pdal beside {library}",
         cure="Debian, Ubuntu: apt-get install libpdal-dev. conda-forge: conda install -c "
-        "conda-forge libpdal-core. "
-        f"Without them, {_STILL_WORK}",
+        f"conda-forge libpdal-core. Without them, {_STILL_WORK}",
     )
 
 
@@ -196,8 +195,8 @@ def plugin_folder() -> Path:
         "PDAL's plugin filters.python is missing, which runs our stages",
         found=f"{_PYTHON_FILTER} in none of {', '.join(map(str, tried))}",
         cure="It comes with pdal-plugins: conda install -c conda-forge pdal-plugins, or pip "
-        "install pdal-plugins; where it "
-        "is there already, set PDAL_DRIVER_PATH to the folder that holds it",
+        "install pdal-plugins; where it is there already, set PDAL_DRIVER_PATH to the folder that "
+        "holds it",
     )
 
 

@@ -65,9 +65,9 @@ class AccuracyStage(Stage):
         "selection",
         None,
         "Points left out and counted: reference codes (before merging), ranges of other "
-        "dimensions, or the word withheld; "
-        f"default: withheld, and {', '.join(map(str, UNINFORMATIVE))} where neither 'classes' nor "
-        "a model says what counts",
+        "dimensions, or the word withheld; default: withheld, and "
+        f"{', '.join(map(str, UNINFORMATIVE))} where neither 'classes' nor a model says what "
+        "counts",
         may_be_empty=True,
     )
     merge: dict | None = option(
@@ -80,9 +80,8 @@ class AccuracyStage(Stage):
     model_file: str | None = option(
         "model",
         None,
-        "Model file whose classes are scored and whose importances the report shows; default: that "
-        "of the "
-        "filters.modelclassifier before",
+        "Model file whose classes are scored and whose importances the report shows; default: "
+        "that of the filters.modelclassifier before",
         name="model",
     )
     files: list[str] = option(
@@ -92,12 +91,12 @@ class AccuracyStage(Stage):
 
     @classmethod
     def from_pipeline(
-        cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
+        cls, raw_options: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
         """Return options that follow from the stages before."""
         taken: dict[str, Any] = {"files": files_read(before)}
         models = [s["model"] for s in before if s.get("type") == ApplyModel.type and "model" in s]
-        if models and given.get("dimension", "Classification") == "Classification":
+        if models and raw_options.get("dimension", "Classification") == "Classification":
             taken["model"] = models[-1]
         return taken
 

@@ -100,8 +100,7 @@ class ApplyModel(Stage):
     )
     keep: Selection = keep_option(
         "Points that are neighbors but keep their class, written as for ignore; default: 12, "
-        "overlap of strips, which "
-        "classifying would overwrite"
+        "overlap of strips, which classifying would overwrite"
     )
     vegetation_heights: tuple[float, float] | None = option(
         "bands",
@@ -114,22 +113,19 @@ class ApplyModel(Stage):
         "string",
         "",
         "A dimension to write: 1 for points inside `where`, else 0. Later stages can take it in "
-        "their own `where`, which "
-        "would see the new classes",
+        "their own `where`, which would see the new classes",
     )
     compact: bool = option(
         "boolean",
         False,
         "Round HeightAboveGround to 1/32 of Z's unit, Reliability, Margin and probabilities to "
-        "1/64: compressed, they take "
-        "a third of the bytes",
+        "1/64: compressed, they take a third of the bytes",
     )
     given_ground: bool = option(
         "boolean",
         False,
         "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is "
-        "1, or without that "
-        "dimension within 0.5 m of it (HeightAboveGround)",
+        "1, or without that dimension within 0.5 m of it (HeightAboveGround)",
     )
     memory: int = option(
         "integer",
@@ -204,10 +200,9 @@ class ApplyModel(Stage):
         made = ", ".join(self.made_from_ground)
         return (
             f"{self.type}: the model was trained on other heights than this pipeline makes. "
-            "Trained on: "
-            f"{as_json(self.preparation)}. Here: {as_json(self.upstream)}"
-            f"{f', and from points of class 2 {made}' if made else ''}. Expect lower accuracy, or "
-            "use the former"
+            f"Trained on: {as_json(self.preparation)}. Here: "
+            f"{as_json(self.upstream)}{f', and from points of class 2 {made}' if made else ''}. "
+            "Expect lower accuracy, or use the former"
         )
 
     @property

@@ -1,12 +1,10 @@
-"""Define what a stage is: an object made once from checked options, which then describes itself and
-runs.
-"""
+"""Base class of stages: a stage is made once from checked options, describes itself, and runs."""
 
 from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
@@ -23,38 +21,37 @@ from .where_expression import Expression
 #: What `where` means to stages of heights.
 HEIGHTS_OUTSIDE = (
     "Points outside do not form the ground; they receive a height above it, unless they have one "
-    "already or a stage "
-    "before made it"
+    "already or a stage before made it"
 )
 
 
 def files_read(stages: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Files of the readers among stages, as they are written."""
+    """Return the files of the readers among stages, as they are written."""
     readers = [stage for stage in stages if str(stage.get("type")).startswith("readers.")]
     return [str(stage["filename"]) for stage in readers if "filename" in stage]
 
 
 class Stage(ABC):
-    """Base of all stages; a subclass in a module of this package is a stage of the product.
+    """Base of all stages; see docs/adding-a-stage.md.
 
-    A subclass gives its type name and a one-line summary, declares its options in its body, says
-    what it reads, creates and how far it looks, and does the work in :meth:`run`. A stage object
-    holds parsed options as attributes; what is costly to make of them (a plan, a model) belongs in
-    a ``functools.cached_property``.
+    A subclass declares its type, a summary and its options in its body, describes what it reads
+    and creates and how far it looks, and does the work in :meth:`run`. Options are attributes. What
+    is costly to derive from them (a plan, a model) is a ``functools.cached_property``. A stage
+    cannot be changed after it is made.
 
     Parameters
     ----------
-    given : mapping
-        Options as the user gave them, from JSON or from the command line.
+    raw_options : mapping
+        Options as the user wrote them, from JSON or from the command line.
     place : str, optional
-        What errors call the stage; by default its type.
+        How errors name the stage; by default its type.
 
     Attributes
     ----------
     options : dict
         Every option's parsed value by its name.
-    given : frozenset of str
-        Names of the options that the user gave.
+    set_options : frozenset of str
+        Names of the options that are not left to their defaults.
 
     Raises
     ------
@@ -68,30 +65,26 @@ class Stage(ABC):
     source: ClassVar[str] = ""
     #: What becomes of the points outside `where`.
     where_help: ClassVar[str] = ""
-    #: Whether `where` only chooses what to compute, so that tiles may narrow it down to what is
-    #: seen.
+    #: Whether `where` only selects what to compute: tiles compute only results that are used.
     where_chooses: ClassVar[bool] = False
-    #: What a stage that cannot run without points does with them, as a message says it.
+    #: Verb for the error on missing points ("there are no points to train on"); empty where a run
+    #: without points is no error.
     needs_points: ClassVar[str] = ""
-    #: For a stage that makes one thing of all points, and gets them as one view: what to do instead
-    #: of running it in tiles.
+    #: For a stage that needs all points at once: the cure that is shown where it is run in tiles.
     instead_of_tiles: str = ""
-    #: For a stage that a model file may carry, to be run by whoever applies it: the options that
-    #: the file may give. Model files come from strangers, so none that holds a path.
+    #: For a stage that a model file may carry in its preprocessing: the options that the file may
+    #: set. Model files come from strangers, so never an option that holds a path.
     in_models: ClassVar[tuple[str, ...]] = ()
-    #: For the same: raise it when results change. Models store it, and warn where they were trained
-    #: with another one.
+    #: Raise it when the results change: models that were trained with another one warn.
     algorithm_version: ClassVar[int] = 1
     #: Counts that it puts into its report (:meth:`Points.tally`): name -> what these points are.
     #: Tiles add them up, and `classify` prints them.
     counts: ClassVar[Mapping[str, str]] = {}
     #: Options of the example on its page; needed where an option is required.
     example: ClassVar[Mapping[str, Any]] = {}
-    #: Whether it forgets most dimensions (:meth:`Points.keep_only`) and then needs much memory: the
-    #: next stage gets the points from PDAL anew.
+    #: Whether it calls :meth:`Points.keep_only`: the next stage gets the points from PDAL anew.
     forgets: ClassVar[bool] = False
-    #: Whether points beyond the halo may matter; tiles then ask :meth:`reach_of`, and are read
-    #: wider.
+    #: Whether points beyond the halo may matter; tiles then call :meth:`reach_of` and read farther.
     open_ended: ClassVar[bool] = False
 
     where: str | None = option(
@@ -115,11 +108,11 @@ class Stage(ABC):
     #: holds them.
     upstream: tuple[Mapping[str, Any], ...] = ()
 
-    def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
+    def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
         self.place = place or self.type
-        self.given = frozenset(given)
+        self.set_options = frozenset(raw_options)
         try:
-            self.options = parse_options(self.all_options(), given)
+            self.options = parse_options(self.all_options(), raw_options)
             for name in ("horizontal_unit", "vertical_unit"):
                 if self.options[name]:
                     named_unit(self.options[name], name)
@@ -132,6 +125,7 @@ class Stage(ABC):
         self._frozen = True
 
     def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse to change a stage after it is made."""
         if "_frozen" in self.__dict__:
             raise AttributeError(f"a stage cannot be changed after it is made: '{name}' is set")
         super().__setattr__(name, value)
@@ -144,21 +138,22 @@ class Stage(ABC):
 
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:
-        """The stage's own options, then those all stages share."""
-        every = [
-            one for kind in cls.__mro__ for one in vars(kind).values() if isinstance(one, Option)
-        ]
-        where = every.index(vars(Stage)["where"])
-        every[where] = replace(every[where], help=f"{every[where].help}. {cls.where_help}")
-        return tuple(every)
+        """Return the stage's own options, then those that all stages share."""
+        where = vars(Stage)["where"]
+        declared = [value for kind in cls.__mro__ for value in vars(kind).values()]
+        return tuple(
+            replace(value, help=f"{value.help}. {cls.where_help}") if value is where else value
+            for value in declared
+            if isinstance(value, Option)
+        )
 
     @classmethod
     def describe_choices(cls) -> str:
-        """Return text on options whose words stand for more than a value, shown after them."""
+        """Return a text on options whose words stand for several values."""
         return ""
 
     def check(self) -> None:
-        """Refuse options that contradict each other; read the files they name."""
+        """Refuse options that contradict each other; read the files that they name."""
 
     def check_upstream(self) -> str | None:
         """Return a warning about the stages upstream (:attr:`upstream`); None where they fit."""
@@ -166,42 +161,35 @@ class Stage(ABC):
 
     @property
     def hint(self) -> str | None:
-        """What to do where a dimension that it reads is missing, if it knows better than
-        :data:`MAKERS`.
-        """
+        """Return the cure where a dimension is missing; None for that of :data:`.points.MAKERS`."""
         return None
 
     def inputs(self) -> list[str]:
-        """Files the stage reads, beside those that its options of kind ``filename`` and ``model``
-        name.
-        """
+        """Return the files that are read, without those of options that are file names."""
         return []
 
     def outputs(self) -> list[Output]:
-        """Files the stage will write."""
+        """Return the files that will be written."""
         return []
 
     def reads(self) -> list[str]:
-        """Dimensions the points must have, beyond X, Y, Z."""
+        """Return the dimensions that the points must have, beyond X, Y and Z."""
         return []
 
     def creates(self) -> dict[str, str]:
-        """Dimensions made or overwritten: name -> PDAL type (``double``, ``float``,
-        ``uint8_t``).
-        """
+        """Return the dimensions that are written: name -> PDAL type, such as ``uint8_t``."""
         return {}
 
     def halo_m(self) -> float:
-        """How far beyond a tile, in meters, points can change the tile's results."""
+        """Return how far around a tile points change its results, in meters."""
         return 0.0
 
     def largest_class(self) -> int:
-        """The largest class code the stage may write to `Classification` (0: none)."""
+        """Return the largest class code that may be written to `Classification`; 0 for none."""
         return 0
 
     def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
-        """Return how far around a tile lie the points that decide its results, for an open-ended
-        stage.
+        """Return how far around a tile the points lie that decide its results (`open_ended`).
 
         Parameters
         ----------
@@ -221,11 +209,9 @@ class Stage(ABC):
 
     @classmethod
     def from_pipeline(
-        cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
+        cls, raw_options: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
-        """Options that the stage takes from the stages before it in the pipeline, where its own do
-        not give them.
-        """
+        """Return options that follow from the stages before, where the user does not set them."""
         return {}
 
     def points(
@@ -236,8 +222,9 @@ class Stage(ABC):
         wkt: str = "",
         legacy_flags: bool = False,
         overlap_as_flag: bool = False,
+        lent_by_pdal: Set[str] = frozenset(),
     ) -> Points:
-        """PDAL's arrays as this stage sees them: with its `where` and its units."""
+        """Return PDAL's arrays as this stage sees them: with its `where` and its units."""
         units = (self.horizontal_unit, self.vertical_unit)
         return Points(
             arrays,
@@ -249,6 +236,7 @@ class Stage(ABC):
             arrays.get(context.outside),
             context.used(arrays) if self.where_chooses else None,
             context.code_limit,
+            lent_by_pdal,
         )
 
     @abstractmethod
@@ -270,7 +258,7 @@ class Stage(ABC):
 
     @classmethod
     def schema(cls) -> dict[str, Any]:
-        """JSON Schema of the stage's object in a pipeline."""
+        """Return the JSON Schema of the stage's object in a pipeline."""
         properties: dict[str, Any] = {
             "type": {"const": cls.type},
             "tag": {"type": "string"},
@@ -287,7 +275,7 @@ class Stage(ABC):
 
 
 class ClassStage(Stage):
-    """Base of the stages that give points another class, and change nothing else."""
+    """Base of stages that change the class of points, and nothing else."""
 
     where_chooses = True
 

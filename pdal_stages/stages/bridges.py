@@ -22,7 +22,10 @@ class Bridges(ClassStage):
 
     type = "filters.bridges"
     summary = "Classify bridge decks, which are then no longer ground or building"
-    source = "after Sithole, Vosselman 2006, ISPRS Journal of Photogrammetry and Remote Sensing 61(1), 33-46"
+    source = (
+        "after Sithole, Vosselman 2006, ISPRS Journal of Photogrammetry and Remote Sensing 61(1), "
+        "33-46"
+    )
     where_help = "Points outside keep their class but still serve as neighbors"
     counts = {"decks": "bridge decks (bridges)"}
     code: int = code_option(BRIDGE, "Class code of bridge decks")

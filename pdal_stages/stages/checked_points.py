@@ -94,7 +94,6 @@ class CheckedChoice:
             if self._known is not None:
                 said += (
                     "; nothing keeps the base where nobody looked, as no other point has a "
-                    "Reliability of "
-                    f"{SURE:g} or more"
+                    f"Reliability of {SURE:g} or more"
                 )
         report.notes.append(said)

@@ -30,9 +30,7 @@ class StageContext:
     blocks: Any = None
 
     def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_] | None:
-        """Return which points (n,) have results that are used; None outside tiles, where all
-        are.
-        """
+        """Return which points (n,) have results that are used; None outside tiles: all."""
         meters = arrays.get(self.outside)
         if meters is None:
             return None

@@ -1,6 +1,4 @@
-"""``filters.detachednoise``: points and small clusters detached from everything, as low and high
-noise.
-"""
+"""``filters.detachednoise``: mark points and small clusters detached from everything as noise."""
 
 from __future__ import annotations
 
@@ -24,7 +22,8 @@ class DetachedNoise(ClassStage):
     cluster: int = option(
         "integer",
         60,
-        "Maximum number of points of a noise cluster; clusters with points above them may have more",
+        "Maximum number of points of a noise cluster; clusters with points above them may have "
+        "more",
         minimum=1,
         maximum=1_000_000,
     )
@@ -64,7 +63,7 @@ class DetachedNoise(ClassStage):
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Mark noise."""
         ignored = points.ignored(self.ignore)
-        found = detached_noise(
+        noise = detached_noise(
             *points.axes,
             mask=None if not ignored.any() else ~ignored,
             cluster=self.cluster,
@@ -72,13 +71,12 @@ class DetachedNoise(ClassStage):
             depth=self.depth,
         )
         if points.mask is not None:
-            found[~points.mask] = 0
+            noise[~points.mask] = 0
         codes = points.class_codes.copy()
-        for name, code, given in zip(
-            ("low", "high"), NOISE, (self.low_class, self.high_class), strict=True
-        ):
-            codes[found == code] = given
-            points.tally(name, found == code)
-        if found.any():
-            points.report.figures["classes"] = class_counts(codes[found != 0])
+        targets = {"low": self.low_class, "high": self.high_class}
+        for code, (name, target) in zip(NOISE, targets.items(), strict=True):
+            codes[noise == code] = target
+            points.tally(name, noise == code)
+        if noise.any():
+            points.report.figures["classes"] = class_counts(codes[noise != 0])
         return {"Classification": points.with_codes(codes)}

@@ -1,9 +1,8 @@
-"""What a stage declares that looks too far for the surroundings of a tile: rounds before the tiles
-work for it in blocks.
+"""Protocol of stages that look too far for the surroundings of a tile: a first round serves them.
 
-Each tile's own points are reduced to what matters far away (:meth:`FarReaching.left_of`), blocks of
-a grid are computed from that (:meth:`FarReaching.block_of`), and a tile takes what it needs of the
-blocks (:meth:`FarReaching.made_of_blocks`).
+The points of each tile are reduced to what matters far away (:meth:`FarReaching.left_of`), blocks
+of a grid are computed from that (:meth:`FarReaching.block_of`), and a tile joins the parts of the
+blocks that it needs (:meth:`FarReaching.made_of_blocks`).
 """
 
 from __future__ import annotations
@@ -20,9 +19,7 @@ from .points import Points
 
 
 class Blocks(NamedTuple):
-    """Squares of a grid that are computed once, from points far around, before the tiles; lengths
-    in meters.
-    """
+    """Squares of a grid that are computed once before the tiles; lengths in meters."""
 
     side: float
     reach: float  #: how far around a block points matter
@@ -41,14 +38,14 @@ class FarReaching(Stage):
 
     @abstractmethod
     def blocks(self) -> Blocks | None:
-        """Return the blocks that the stage needs; None where its options make it look no farther
-        than its halo.
-        """
+        """Return the blocks that the stage needs; None where it looks no farther than its halo."""
 
     @abstractmethod
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
-        """Return what blocks need of points: (n, 4) ``around`` them, and (n, 3) inside each
-        (:func:`inside_block`).
+        """Return what blocks need of points.
+
+        That is an array (n, 4) ``around``, for blocks that the points do not lie in, and (n, 3)
+        for each block that they lie in (:func:`inside_block`).
         """
 
     @abstractmethod
@@ -58,18 +55,12 @@ class FarReaching(Stage):
         inside: Iterable[NDArray[np.float64]],
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
-        """Return what tiles need of a block (column, row), from what was left around it and, in
-        parts, inside.
-        """
+        """Compute a block (column, row) from what :meth:`left_of` returned around and in it."""
 
     @abstractmethod
     def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
-        """Return names of the arrays of blocks that a box (min x, min y, max x, max y) in meters
-        needs.
-        """
+        """Return names of arrays that a box (min x, min y, max x, max y, meters) needs."""
 
     @abstractmethod
     def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
-        """Return :attr:`StageContext.blocks` made of these arrays of the blocks that a box
-        touches.
-        """
+        """Join these arrays of the blocks that a box touches to :attr:`StageContext.blocks`."""

@@ -1,6 +1,4 @@
-"""``filters.objects``: group classified points into buildings, trees, spans of wires and bridge
-decks.
-"""
+"""``filters.objects``: number the buildings, trees, spans and decks that points belong to."""
 
 from __future__ import annotations
 
@@ -33,7 +31,9 @@ from .options import code_option, ignore_option, option
 from .points import Points
 from .selection import Selection
 
-_SETTINGS = {one.name: one for one in fields(ObjectSettings)}
+#: Settings of the search, each of which is an option.
+_SETTINGS = {field.name: field for field in fields(ObjectSettings)}
+#: Option -> kind of object whose class codes it lists.
 _CODES = {
     "ground": Kind.GROUND,
     "buildings": Kind.BUILDING,
@@ -60,9 +60,8 @@ class ObjectOptions:
     refuse: list[str] = option(
         "list",
         (),
-        "Reject objects with any of these reasons to be checked (filters.objects: their points get "
-        "refused_class); they are "
-        f"counted: {', '.join(REASONS)}",
+        "Reject objects with any of these reasons to be checked (filters.objects: their points "
+        f"get refused_class); they are counted: {', '.join(REASONS)}",
         may_be_empty=True,
     )
     ignore: Selection = ignore_option("Points that belong to no object")
@@ -71,12 +70,12 @@ class ObjectOptions:
 
     @cached_property
     def settings(self) -> ObjectSettings:
-        """How objects are told apart."""
+        """Return the settings of the search."""
         return ObjectSettings(**{name: self.options[name] for name in _SETTINGS})
 
     @cached_property
     def classes(self) -> dict[Kind, tuple[int, ...]]:
-        """Class codes of each kind."""
+        """Return the class codes of each kind."""
         return {kind: tuple(int(c) for c in self.options[name]) for name, kind in _CODES.items()}
 
     def check(self) -> None:
@@ -86,13 +85,13 @@ class ObjectOptions:
             checks.one_of("a reason in option 'refuse'", name, REASONS)
 
     def cells(self, points: Points, context: StageContext) -> Cells:
-        """Records of the points that may be of objects, or are ground.
+        """Return cells with the points that may belong to objects, or are ground.
 
         Raises
         ------
         StageError
-            Where no point has a class of any kind, or none is ground; a warning in tiles, others of
-            which may have some.
+            Where no point has a class of any kind, or none is ground. In tiles that is a warning,
+            as other tiles may have some.
         """
         cells = self.records(points)
         try:
@@ -110,20 +109,20 @@ class ObjectOptions:
         return cells
 
     def records(self, points: Points) -> Cells:
-        """The same of a part of the points, whatever classes it has."""
+        """Return cells with a part of a cloud's points, whatever classes it has."""
         usable = points.usable(self.ignore)
         x, y, z = points.axes
-        codes, told = points.class_codes, points.arrays.get("Reliability")
+        codes, reliability = points.class_codes, points.arrays.get("Reliability")
         if not usable.all():
             x, y, z, codes = x[usable], y[usable], z[usable], codes[usable]
-            told = None if told is None else told[usable]
+            reliability = None if reliability is None else reliability[usable]
         return Cells.from_points(
-            x, y, z, codes, self.settings.cell, reliability=told, classes=self.classes
+            x, y, z, codes, self.settings.cell, reliability=reliability, classes=self.classes
         )
 
 
-for _name, _one in _SETTINGS.items():
-    setattr(ObjectOptions, _name, option(name=_name, default=_one.default, **_one.metadata))
+for _name, _field in _SETTINGS.items():
+    setattr(ObjectOptions, _name, option(name=_name, default=_field.default, **_field.metadata))
 
 
 #: What each kind of object is measured by, as points carry it: height and area or length.
@@ -138,10 +137,9 @@ class GroupObjects(ObjectOptions, Stage):
     summary = "Group classified points into buildings, trees, spans of wires and bridge decks"
     source = (
         "crowns after Kwak, Lee, Lee, Biging, Gong 2007 (Journal of Forest Research 12, 425-434) "
-        "and Chen, Baldocchi, "
-        "Gong, Kelly 2006 (Photogrammetric Engineering and Remote Sensing 72, 923-932); diameters "
-        "of stems after Jucker and "
-        "others 2017 (Global Change Biology 23, 177-190)"
+        "and Chen, Baldocchi, Gong, Kelly 2006 (Photogrammetric Engineering and Remote Sensing "
+        "72, 923-932); diameters of stems after Jucker and others 2017 (Global Change Biology 23, "
+        "177-190)"
     )
     where_help = "Points outside form no object, and keep what they have"
     counts = {"refused_points": "points of rejected objects (refuse)"}
@@ -182,14 +180,13 @@ class GroupObjects(ObjectOptions, Stage):
         wanted = context.used(points.arrays)
         if wanted is None or not wanted.any():
             return 0.0
-        unit, size = points.units.horizontal, self.settings.cell
-        west, south, east, north = (value * unit for value in box)
-        found = self._found(points, context)
-        mine = np.unique(self._ids(found, points)[wanted])
+        size, (west, south, east, north) = self.settings.cell, box
+        objects = self._find(points, context)
+        ids = np.unique(self._ids(objects, points)[wanted])
         away = 0.0
         for kind in (Kind.BUILDING, Kind.SPAN, Kind.DECK):
-            table = found.tables[kind]
-            for number in np.flatnonzero(np.isin(table.ids, mine)).tolist():
+            table = objects.tables[kind]
+            for number in np.flatnonzero(np.isin(table.ids, ids)).tolist():
                 row, column, _ = table.cells_of(number)
                 beyond = (
                     west - column.min() * size,
@@ -200,28 +197,30 @@ class GroupObjects(ObjectOptions, Stage):
                 away = max(away, *beyond)
         return float(away) + self.halo_m()
 
-    def _found(self, points: Points, context: StageContext) -> Objects:
+    def _find(self, points: Points, context: StageContext) -> Objects:
+        """Return the objects of the points."""
         return find_objects(self.cells(points, context), self.settings, progress=False)
 
-    def _ids(self, found: Objects, points: Points) -> NDArray[np.int64]:
+    def _ids(self, objects: Objects, points: Points) -> NDArray[np.int64]:
+        """Return the number of each point's object (n,); 0 for points of none."""
         kinds = kind_of_code(self.classes)[points.class_codes]
         kinds[~points.inside | points.chosen(self.ignore)] = -1
-        return found.ids_at(points.xyz[:, 0], points.xyz[:, 1], kinds)
+        return objects.ids_at(points.xyz[:, 0], points.xyz[:, 1], kinds)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Find objects and number their points."""
-        found = self._found(points, context)
-        ids = self._ids(found, points)
+        objects = self._find(points, context)
+        ids = self._ids(objects, points)
         out: dict[str, NDArray] = {"ObjectID": ids}
         if self.judged:
             for name in ("ObjectVerdict", "ObjectHeight", "ObjectExtent"):
                 out[name] = np.array(points.arrays[name])
                 out[name][points.inside] = 0
         points.report.figures |= {
-            name: one for name, one in found.summary().items() if one["objects"]
+            kind: counts for kind, counts in objects.summary().items() if counts["objects"]
         }
         refused = np.zeros(points.count, bool)
-        for kind, table in found.tables.items():
+        for kind, table in objects.tables.items():
             if not len(table):
                 continue
             place, there = places_among(table.ids, ids)

@@ -1,6 +1,4 @@
-"""``filters.hag_morphological``: height above ground that a progressive morphological filter finds
-[P13].
-"""
+"""``filters.hag_morphological``: height above ground of a morphological filter [P13]."""
 
 from __future__ import annotations
 
@@ -41,7 +39,10 @@ class HagMorphological(FarReaching):
 
     type = "filters.hag_morphological"
     summary = "Height above ground found by a progressive morphological filter"
-    source = "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30"
+    source = (
+        "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote "
+        "Sensing 77, 21-30"
+    )
     algorithm_version = 3
     where_help = HEIGHTS_OUTSIDE
     in_models = (
@@ -64,8 +65,7 @@ class HagMorphological(FarReaching):
         "number",
         0.12,
         "Rise over run: a window removes what it lowers by more than this times its radius; raise "
-        "it for rugged terrain "
-        "without buildings",
+        "it for rugged terrain without buildings",
         minimum=0,
         maximum=100,
     )
@@ -101,9 +101,8 @@ class HagMorphological(FarReaching):
     openings: list[float] = option(
         "numbers",
         (),
-        "Also write heights above morphological openings of the minimum grid with windows of these "
-        "widths in meters, e.g. "
-        "5,9,17,33,65: HeightAboveOpening_5, ...",
+        "Also write heights above morphological openings of the minimum grid with windows of "
+        "these widths in meters, e.g. 5,9,17,33,65: HeightAboveOpening_5, ...",
         may_be_empty=True,
     )
 
@@ -111,14 +110,14 @@ class HagMorphological(FarReaching):
         "boolean",
         False,
         "Points of class 2 are the ground: nothing is filtered, heights are measured from them "
-        "alone, and Ground is 1 for "
-        "them and for others that are as near to the surface as threshold and scalar say",
+        "alone, and Ground is 1 for them and for others that are as near to the surface as "
+        "threshold and scalar say",
     )
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
         self._filter = FilterOptions(
-            **{one.name: self.options[one.name] for one in fields(FilterOptions)}
+            **{field.name: self.options[field.name] for field in fields(FilterOptions)}
         )
 
     def creates(self) -> dict[str, str]:
@@ -141,9 +140,7 @@ class HagMorphological(FarReaching):
         return self._filter.reach_of_points * self.cell
 
     def blocks(self) -> Blocks | None:
-        """How far the rounds before the tiles reach; all that a point's height depends on is in
-        cells.
-        """
+        """Return the blocks of the raster; a point's height depends on cells alone."""
         if self.given_ground:
             return None
         cell = self.cell
@@ -151,9 +148,7 @@ class HagMorphological(FarReaching):
         return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
 
     def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
-        """First, what blocks need of the points ``around`` them, and those (n, 3) inside each
-        (:func:`inside_block`).
-        """
+        """Return the lowest points that blocks around need, and the points inside each block."""
         x, y, z = points.axes
         usable = points.usable(self.ignore)
         inside = by_block(x, y, z, usable, self.cell)
@@ -168,19 +163,15 @@ class HagMorphological(FarReaching):
         inside: Iterable[NDArray[np.float64]],
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
-        """Then, what tiles need of a block (column, row): from what was left around it and, in
-        parts, inside.
-        """
+        """Compute the cells of a block, in squares that tiles read by themselves."""
         return cells_of_block(around, block, self._filter, inside).in_parts(_PART)
 
     def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
-        """Names of the arrays that a box (min x, min y, max x, max y) needs, as far as blocks have
-        them.
-        """
+        """Return names of the squares that a box needs."""
         return GroundCells.names_within(_PART, *(math.floor(side / self.cell) for side in box))
 
     def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
-        """At last, the context's `blocks` out of these arrays of the blocks that a box touches."""
+        """Join the squares of several blocks."""
         return GroundCells.of_blocks(blocks, len(self.openings))
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
@@ -188,14 +179,14 @@ class HagMorphological(FarReaching):
         usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", context.created_before)
         all_wanted = bool(wanted.all())
-        given = usable & (points.class_codes == GROUND) if self.given_ground else None
-        if given is not None and not given.any():
+        ground = usable & (points.class_codes == GROUND) if self.given_ground else None
+        if ground is not None and not ground.any():
             raise NoTerrainError(
                 "no ground is given: none of the points has class 2",
                 found=f"{points.count:,} points",
                 cure="Classify the ground first, or leave 'given_ground' out: ground is then found",
             )
-        found = filtered_ground(
+        columns = filtered_ground(
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
             **vars(self._filter),
@@ -203,11 +194,11 @@ class HagMorphological(FarReaching):
             threads=self.threads,
             cells=context.blocks,
             figures=points.report.figures,
-            given=given if given is None or all_wanted else given[wanted],
+            given=ground if ground is None or all_wanted else ground[wanted],
         )
         out = {}
         for name in self.creates():
-            values = found.pop(name)
+            values = columns.pop(name)
             if name.startswith("HeightAbove") and points.units.vertical != 1.0:
                 values = values / points.units.vertical
             # As PDAL will have it; a copy more of each would be the most that this stage holds.

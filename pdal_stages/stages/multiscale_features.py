@@ -39,8 +39,8 @@ class MultiscaleFeatures(Stage):
     neighborhoods: list = option(
         "list",
         DEFAULT_NEIGHBORHOODS,
-        "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, copt) or a preset "
-        "(blomley2016, weinmann2018, he2017)",
+        "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, copt) or a "
+        "preset (blomley2016, weinmann2018, he2017)",
     )
     feature_set: list = option(
         "list",
@@ -59,8 +59,7 @@ class MultiscaleFeatures(Stage):
         "filename",
         None,
         "JSON file with the thresholds of shape histograms and curvature: read if it exists, "
-        "otherwise fitted to "
-        "these points and written, so that other clouds can use the same ones",
+        "otherwise fitted to these points and written, so that other clouds can use the same ones",
     )
     ignore: Selection = ignore_option(
         "Points that are left out, even as neighbors, and get no features"
@@ -76,9 +75,8 @@ class MultiscaleFeatures(Stage):
     voxel: float = option(
         "number",
         0.0,
-        "Voxel size, for very dense clouds: features are computed for one point per voxel, and its "
-        "other points get the "
-        "same; 0 for none",
+        "Voxel size, for very dense clouds: features are computed for one point per voxel, and "
+        "its other points get the same; 0 for none",
         minimum=0,
         maximum=LARGEST,
         unit="m",
@@ -114,8 +112,7 @@ class MultiscaleFeatures(Stage):
         elif plan.shapes or (plan.copt and threshold is None):
             self.instead_of_tiles = (
                 'Thresholds are fitted to the points: give "bins": "thresholds.json", and run the '
-                "pipeline once without "
-                "--tile on one typical file, which writes it"
+                "pipeline once without --tile on one typical file, which writes it"
             )
         for name in self.columns:
             if len(name.encode()) > _NAME_BYTES:

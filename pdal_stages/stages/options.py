@@ -36,9 +36,7 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a stage; see :func:`option`. Read from a stage object it gives the parsed
-    value.
-    """
+    """An option of a stage, made by :func:`option`; read from a stage, its parsed value."""
 
     #: A key of ``_KINDS``. ``list`` is a JSON list or comma-separated text; ``codes`` a list of
     #: class codes, or of ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the
@@ -62,27 +60,29 @@ class Option:
     name: str = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
+        """Take the attribute's name where the option has none of its own."""
         if not self.name:
             object.__setattr__(self, "name", name)
 
     def __get__(self, stage: Any, owner: type) -> Any:
+        """Return the parsed value of a stage's option."""
         return self if stage is None else stage.options[self.name]
 
     @property
     def typed_default(self) -> str:
-        """The default as a user would type it; empty where the stage decides."""
+        """Return the default as a user would type it; empty where the stage decides."""
         if self.default in (None, ""):
             return ""
-        given = self.default if isinstance(self.default, tuple) else (self.default,)
-        return ",".join(str(one).lower() if isinstance(one, bool) else str(one) for one in given)
+        values = self.default if isinstance(self.default, tuple) else (self.default,)
+        return ",".join(str(v).lower() if isinstance(v, bool) else str(v) for v in values)
 
     @property
     def shown_default(self) -> str:
-        """The same with its unit."""
+        """Return the default as a user would type it, with its unit."""
         return f"{self.typed_default} {self.unit}".strip() if self.typed_default else ""
 
     def schema(self) -> dict:
-        """The option's JSON Schema."""
+        """Return the option's JSON Schema."""
         out: dict[str, Any] = {"description": self.help, "type": _KINDS[self.kind][0]}
         if self.minimum is not None:
             out["exclusiveMinimum" if self.exclusive else "minimum"] = self.minimum
@@ -95,9 +95,7 @@ class Option:
         return out
 
     def parse(self, value: Any) -> Any:
-        """The value as the stage wants it, from JSON or from command-line text; OptionError where
-        it does not fit.
-        """
+        """Parse a value from JSON or the command line; OptionError where it does not fit."""
         parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
         return (
             checks.one_of(f"option '{self.name}'", parsed, self.choices) if self.choices else parsed
@@ -153,7 +151,7 @@ class Option:
         return list(value)
 
     def _parse_numbers(self, value: Any) -> list[float]:
-        return [self._parse_number(one) for one in self._parse_list(value)]
+        return [self._parse_number(item) for item in self._parse_list(value)]
 
     def _parse_bands(self, value: Any) -> tuple[float, float] | None:
         heights = self._parse_numbers(value)
@@ -193,29 +191,27 @@ class Option:
 
 
 def option(kind: str, default: Any, help: str, **more: Any) -> Any:
-    """Declare an option in a stage's class body: ``cell: float = option("number", 20.0, "Side of
-    the cells")``.
+    """Declare an option in a stage's class body.
 
-    The annotation says what the parsed value is; all else is as for :class:`Option`.
+    ``cell: float = option("number", 20.0, "Side of the cells", unit="m")``: the annotation is the
+    type of the parsed value, all else is as for :class:`Option`.
     """
     return Option(kind, default, help, **more)
 
 
 def code_option(default: int | None, help: str) -> Any:
-    """An option for a class code."""
+    """Declare an option for a class code."""
     return option("integer", default, help, minimum=0, maximum=255)
 
 
 def ignore_option(points: str) -> Any:
-    """The option `ignore`, which noise and withheld points are unless told; says what becomes of
-    the `points`.
-    """
+    """Declare the option `ignore`, by default noise and withheld points; `points` is its help."""
     words = ": class codes, ranges such as Classification[7:7], or the word withheld"
     return option("selection", UNWANTED, points + words, may_be_empty=True)
 
 
 def keep_option(points: str = "Points that are neighbors but keep their class") -> Any:
-    """The option `keep`, which overlap is unless told; says what becomes of the `points`."""
+    """Declare the option `keep`, by default overlap; `points` is its help."""
     return option("selection", (OVERLAP,), points, may_be_empty=True)
 
 
@@ -224,22 +220,20 @@ def split_list(text: str) -> list[str]:
     return [part.strip() for part in re.split(r",(?![^(]*\))", text) if part.strip()]
 
 
-def parse_options(declared: Iterable[Option], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Every declared option with its value, given or default; OptionError where what is given does
-    not fit.
-    """
+def parse_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the value of every declared option; OptionError where a raw one does not fit."""
     known = {option.name: option for option in declared}
-    for name in given:
+    for name in raw:
         if name not in known:
             raise OptionError(
                 f"there is no option '{name}'",
-                found=json.dumps(given[name], default=str)[:80],
+                found=json.dumps(raw[name], default=str)[:80],
                 cure=f"{suggest(name, known)}Options: {', '.join(sorted(known))}",
             )
     values: dict[str, Any] = {}
     for name, option in known.items():
-        if name in given:
-            values[name] = option.parse(given[name])
+        if name in raw:
+            values[name] = option.parse(raw[name])
         elif option.required:
             raise OptionError(f"option '{name}' is required", cure=option.help)
         elif option.kind == "selection" and option.default is not None:

@@ -35,18 +35,17 @@ MAKERS = {
         "The reader does not give it; leave it out of the model's dimensions",
     ),
 }
-#: How the warnings begin that a `where` chooses no point, and that none of a file's polygons is
-#: near; in tiles they are told where it is so in all.
-HOLDS_NOWHERE = "'where' holds for none of the points:"
-TOUCH_NONE = "no polygon is where the points are (has each the reference system that it says?):"
+#: How the warning begins that a `where` matches no point. Tiles show it if it holds for all.
+NO_POINT_MATCHES = "'where' matches no points:"
+#: The same for polygons of a file that lie nowhere near the points.
+NO_POLYGON_NEAR = "no polygon lies where the points are (check the reference systems of both):"
 #: The dimension in which `classify` marks the points that its `where` selects.
 SELECTED = "PdalStagesSelected"
 #: Steps to which coordinates are rounded; scales of LAS files are whole numbers of them, as a rule.
 _STEPS_PER_UNIT = 1e6
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
-#: How the names of dimensions begin that are lengths upward, as Z is, so they follow the vertical
-#: unit.
+#: Prefix of dimensions that are lengths upward, as Z is, and have its unit.
 _HEIGHTS = "HeightAbove"
 
 
@@ -59,21 +58,22 @@ class Points:
     where: Expression | None = None  #: points the stage acts on
     #: Names of the horizontal and the vertical unit; empty where the spatial reference says it.
     unit_names: tuple[str, str] = ("", "")
-    legacy_flags: bool = (
-        False  #: whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`
-    )
+    #: Whether the three flag bits of LAS 1.0-1.3 sit inside `Classification`.
+    legacy_flags: bool = False
     #: Whether class 12 (overlap) of LAS 1.0-1.3 may be read as class 0 with the flag Overlap, as
     #: PDAL from 2.6 on does.
     overlap_as_flag: bool = False
-    #: Below zero for the points whose results are used: :meth:`tally` counts those alone.
-    own: NDArray | None = None
-    used: NDArray[np.bool_] | None = None  #: in tiles: those for which anything is to be computed
-    #: Where they will be written with codes up to 31 alone: what to say of others, and the cure.
-    code_limit: tuple[str, str] | None = None
+    #: In tiles: how many meters each point lies outside the tile; negative for points inside, which
+    #: alone are counted (:meth:`tally`).
+    meters_outside: NDArray | None = None
+    #: In tiles: the points whose results are used.
+    used: NDArray[np.bool_] | None = None
+    code_limit: tuple[str, str] | None = None  #: as in :class:`.context.StageContext`
     #: Which of the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
     lent_by_pdal: Set[str] = frozenset()
 
     def __post_init__(self) -> None:
+        """Evaluate `where`."""
         self.count = len(self.arrays["X"]) if "X" in self.arrays else 0
         self.report = Report({"points": self.count})
         self.mask = self.used
@@ -87,23 +87,22 @@ class Points:
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             # Where `classify` marked no point, the stage that marks them has said so.
             if self.count and not self.report.figures["where"] and SELECTED not in self.where.text:
-                self.report.warnings.append(f"{HOLDS_NOWHERE} {self.where.text}")
+                self.report.warnings.append(f"{NO_POINT_MATCHES} {self.where.text}")
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """The points inside `where`; all, where there is none."""
+        """Return which points (n,) lie inside `where`; all without one."""
         return np.ones(self.count, bool) if self.mask is None else self.mask
 
     def tally(self, name: str, points: NDArray[np.bool_]) -> None:
-        """Put the number of these points (n,) into the report; in a tile, of those that lie in the
-        tile itself.
-        """
-        inside = points if self.own is None else points & (self.own < 0)
+        """Report the number of these points (n,), in a tile without its surroundings."""
+        outside = self.meters_outside
+        inside = points if outside is None else points & (outside < 0)
         self.report.figures[name] = int(np.count_nonzero(inside))
 
     @cached_property
     def units(self) -> Units:
-        """Meters per unit; refuses degrees. An assumption is put in the report."""
+        """Return meters per unit; degrees are refused, an assumption is reported."""
         x, y = (self.arrays[axis] for axis in "XY") if self.count else (np.zeros(0), np.zeros(0))
         place = (float(x[0]), float(y[0])) if self.count else None
         units = units_of_wkt(
@@ -116,7 +115,7 @@ class Points:
 
     @cached_property
     def xyz(self) -> NDArray[np.float64]:
-        """Coordinates in meters, shape (n, 3); errors as of :attr:`axes`."""
+        """Return coordinates in meters, shape (n, 3); errors as of :attr:`axes`."""
         return np.column_stack(self.axes)
 
     @cached_property
@@ -132,16 +131,16 @@ class Points:
         StageError
             If any is NaN or infinite, with the count.
         """
-        found = []
+        axes = []
         for name in "XYZ":
             with np.errstate(over="ignore"):  # such coordinates are refused below
                 values = np.asarray(self.dimension(name, meters=False)) * _STEPS_PER_UNIT
             np.rint(values, out=values)
             values /= _STEPS_PER_UNIT
             unit = self.units.vertical if name == "Z" else self.units.horizontal
-            found.append(values if unit == 1.0 else values * unit)
-        x, y, z = found
-        if not all(np.isfinite(values).all() for values in found):
+            axes.append(values if unit == 1.0 else values * unit)
+        x, y, z = axes
+        if not all(np.isfinite(values).all() for values in axes):
             bad = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))
             raise StageError(
                 "coordinates are not finite (NaN or infinite)",
@@ -153,40 +152,38 @@ class Points:
         return x, y, z
 
     def keep_only(self, names: Iterable[str]) -> None:
-        """Forget the other dimensions: from here on nobody reads them. Of coordinates :attr:`xyz`
-        is left.
-        """
+        """Forget the other dimensions, which nobody reads any more; keep `xyz`."""
         self.xyz  # noqa: B018  before they are gone
         self.__dict__.pop("axes", None)
         kept, lent = set(names), self.arrays
         self.arrays = {name: lent[name] for name in lent if name in kept}
         # PDAL makes these arrays for this one call, and frees them after it.
         for name in self.lent_by_pdal - kept:
-            if lent[name] is not self.own:
+            if lent[name] is not self.meters_outside:
                 release_pages(lent[name])
 
     def take_xyz(self) -> NDArray[np.float64]:
-        """:attr:`xyz`, not kept here: who takes it may let go of it."""
+        """Return :attr:`xyz` and forget it, so that the caller can free its memory."""
         xyz = self.xyz
         del self.__dict__["xyz"]
         self.__dict__.pop("axes", None)
         return xyz
 
     def missing(self, name: str, hint: str | None = None) -> DimensionError:
-        """What to say where they do not have a dimension."""
+        """Return the error on a dimension that the points do not have."""
         return DimensionError(
             f"the dimension '{name}' is missing",
             found=", ".join(self.arrays),
             cure=hint or MAKERS.get(name, "Add the stage that makes it before this one"),
         )
 
-    def _given(self, name: str) -> NDArray:
+    def _array(self, name: str) -> NDArray:
         if name not in self.arrays:
             raise self.missing(name)
         return self.arrays[name]
 
     def dimension(self, name: str, *, meters: bool = True) -> NDArray:
-        """A dimension's values; lengths upward are converted to meters.
+        """Return the values (n,) of a dimension; lengths upward are converted to meters.
 
         Raises
         ------
@@ -195,22 +192,22 @@ class Points:
         """
         if name == "Classification":
             return self.class_codes
-        values = self._given(name)
+        values = self._array(name)
         if meters and (name == "Z" or name.startswith(_HEIGHTS)) and self.units.vertical != 1.0:
             return values * self.units.vertical
         return values
 
     @cached_property
     def class_codes(self) -> NDArray[np.uint8]:
-        """`Classification` without the flag bits LAS 1.0-1.3 keeps in the same byte."""
+        """Return `Classification` (n,) without the flag bits of LAS 1.0-1.3."""
         return self.codes_of("Classification")
 
     def codes_of(self, name: str) -> NDArray[np.uint8]:
-        """A dimension that holds class codes, checked and freed of flag bits.
+        """Return a dimension (n,) that holds class codes, checked and freed of flag bits.
 
         A copy made by ``filters.ferry`` carries the flag bits along, so they are taken off it too.
         """
-        values = np.asarray(self._given(name))
+        values = np.asarray(self._array(name))
         with np.errstate(invalid="ignore"):
             codes = values.astype(np.uint8)
         if values.dtype != np.uint8 and (wrong := codes != values).any():
@@ -221,7 +218,7 @@ class Points:
         return codes & np.uint8(LEGACY_LIMIT) if self.legacy_flags else codes
 
     def flag(self, name: str) -> NDArray:
-        """A flag of each point, 0 or 1: a dimension in newer PDAL, a bit of another in PDAL 2.2."""
+        """Return a flag of each point (n,), 0 or 1; in PDAL 2.2 it is a bit of a dimension."""
         if name in self.arrays:
             return self.arrays[name]
         bit = _FLAGS.index(name)
@@ -232,42 +229,41 @@ class Points:
         return np.zeros(self.count, np.uint8)
 
     def chosen(self, selection: Selection) -> NDArray[np.bool_]:
-        """The points that a selection takes."""
-        found = np.zeros(self.count, bool)
+        """Return which points (n,) a selection takes."""
+        chosen = np.zeros(self.count, bool)
         if selection.codes and "Classification" in self.arrays:
-            found |= np.isin(self.class_codes, np.array(selection.codes, np.uint8))
+            chosen |= np.isin(self.class_codes, np.array(selection.codes, np.uint8))
             if OVERLAP in selection.codes and self.overlap_as_flag:
-                found |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
+                chosen |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
         for span in selection.spans:
             name = span.dimension
-            found |= span.contains(
+            chosen |= span.contains(
                 self.flag(name) if name in _FLAGS else self.dimension(name, meters=False)
             )
-        return found
+        return chosen
 
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:
-        """The same, counted in the report as ``ignored``, where they are inside `where`."""
-        found = self.chosen(selection)
-        self.tally("ignored", found if self.mask is None else found & self.mask)
-        return found
+        """Return which points (n,) a selection takes; report how many lie inside `where`."""
+        chosen = self.chosen(selection)
+        self.tally("ignored", chosen if self.mask is None else chosen & self.mask)
+        return chosen
 
     def usable(self, ignored: Selection) -> NDArray[np.bool_]:
-        """The points inside `where` that are not ignored; those that are, are counted."""
+        """Return which points (n,) inside `where` are not ignored; report how many are."""
         return self.inside & ~self.ignored(ignored)
 
     def changeable(self, ignored: Selection, kept: Selection) -> NDArray[np.bool_]:
-        """The points inside `where` that are neither ignored, which is counted, nor keep what they
-        have.
-        """
+        """Return which points (n,) may get another class; report how many are ignored."""
         return self.usable(ignored) & ~self.chosen(kept)
 
-    def wanting(self, name: str, made_before: bool) -> NDArray[np.bool_]:
-        """The points that get a height: those inside `where`, and others that have none yet (0)."""
-        return self.inside if made_before else self.inside | (self.arrays[name] == 0)
+    def wanting(self, name: str, created_before: bool) -> NDArray[np.bool_]:
+        """Return which points (n,) get a height: inside `where`, or without one (0)."""
+        return self.inside if created_before else self.inside | (self.arrays[name] == 0)
 
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """New class codes for `Classification`, with the flag bits of each point kept; they are
-        counted in the report.
+        """Return values of `Classification` (n,) for class codes: with each point's flag bits.
+
+        The report counts the codes.
         """
         self.report.codes = class_counts(codes)
         limit = self.code_limit
@@ -277,8 +273,7 @@ class Points:
             if flags.any():
                 limit = limit or (
                     f"class codes above {LEGACY_LIMIT} do not fit these points: read from LAS "
-                    "1.0-1.3, some carry "
-                    "synthetic, key-point or withheld flags in the same byte",
+                    "1.0-1.3, some carry synthetic, key-point or withheld flags in the same byte",
                     "Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
                 )
         if limit and (largest := codes.max(initial=0)) > LEGACY_LIMIT:
@@ -287,5 +282,5 @@ class Points:
 
 
 def class_counts(codes: NDArray[np.uint8]) -> dict[str, int]:
-    """Points of each class code that is there, for metadata."""
+    """Return the number of points by class code, as metadata has it; no code with 0."""
     return {str(code): n for code, n in enumerate(np.bincount(codes).tolist()) if n}

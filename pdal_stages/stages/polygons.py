@@ -10,7 +10,7 @@ from ..base.vector import with_vector
 from .base import ClassStage
 from .context import StageContext
 from .options import ignore_option, keep_option, option
-from .points import TOUCH_NONE, Points, class_counts
+from .points import NO_POLYGON_NEAR, Points, class_counts
 from .selection import Selection
 
 
@@ -26,9 +26,8 @@ class Polygons(ClassStage):
         "list",
         None,
         "Files and classes, FILE=CODE: lakes.gpkg=9 makes ground (2) inside water, "
-        "bridges.gpkg=17:2,6 ground and buildings "
-        "bridge decks, FILE=CODE:all everything inside; a layer is named as in "
-        "lakes.gpkg|layername=canals=9",
+        "bridges.gpkg=17:2,6 ground and buildings bridge decks, FILE=CODE:all everything inside; "
+        "a layer is named as in lakes.gpkg|layername=canals=9",
         required=True,
     )
     ignore: Selection = ignore_option("Points that keep their class")
@@ -36,7 +35,7 @@ class Polygons(ClassStage):
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
-        self.overlays = [Overlay.parse(str(one)) for one in self.polygons]
+        self.overlays = [Overlay.parse(str(text)) for text in self.polygons]
         for overlay in self.overlays:
             with_vector(overlay.check)
 
@@ -60,13 +59,13 @@ class Polygons(ClassStage):
             inside, polygons, note = with_vector(
                 inside_of, overlay, points.wkt, x[may], y[may], box
             )
-            found = may[inside]
-            codes[found] = overlay.code
+            rows = may[inside]
+            codes[rows] = overlay.code
             name = f"{overlay.file}|layername={overlay.layer}" if overlay.layer else overlay.file
-            counts[f"{name}={overlay.code}"] = {"polygons": polygons, "points": len(found)}
+            counts[f"{name}={overlay.code}"] = {"polygons": polygons, "points": len(rows)}
             notes += [note] if note else []
             if not polygons:
-                points.report.warnings.append(f"{TOUCH_NONE} {name}")
+                points.report.warnings.append(f"{NO_POLYGON_NEAR} {name}")
         points.report.figures["polygons"] = counts
         points.report.figures["classes"] = class_counts(codes[change])
         points.report.notes += notes

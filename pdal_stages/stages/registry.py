@@ -1,5 +1,4 @@
-"""Find stages by type name: one module each in this folder, and those of other packages through an
-entry point.
+"""Find stages by type name: in modules of this folder, and in packages with an entry point.
 
 A module of this folder that defines a stage holds a line ``type = "filters.NAME"`` in the body of
 its class; no list names it anywhere else. Other packages declare the entry point
@@ -31,9 +30,7 @@ class _Registry(Mapping[str, type[Stage]]):
 
     @functools.cached_property
     def _modules(self) -> dict[str, str]:
-        """Type name -> module of this folder. Read as text: importing all of them takes half a
-        second.
-        """
+        """Return type name -> module of this folder, read as text: importing all takes long."""
         return {
             name: path.stem
             for path in sorted(Path(__file__).parent.glob("*.py"))
@@ -42,26 +39,30 @@ class _Registry(Mapping[str, type[Stage]]):
 
     @functools.cached_property
     def _entry_points(self) -> dict[str, metadata.EntryPoint]:
-        """Type name -> entry point of another package; a stage of ours cannot be replaced."""
+        """Return type name -> entry point of another package; ours cannot be replaced."""
         return {
-            one.name: one
-            for one in metadata.entry_points(group=ENTRY_POINTS)
-            if one.name not in self._modules
+            entry.name: entry
+            for entry in metadata.entry_points(group=ENTRY_POINTS)
+            if entry.name not in self._modules
         }
 
     def __getitem__(self, name: str) -> type[Stage]:
+        """Import a stage."""
         if name in self._modules:
             module = importlib.import_module(f"{__package__}.{self._modules[name]}")
             return next(v for v in vars(module).values() if getattr(v, "type", None) == name)
         return _load(self._entry_points[name])
 
     def __contains__(self, name: object) -> bool:
+        """Return whether there is a stage of this name, without importing it."""
         return name in self._modules or name in self._entry_points
 
     def __iter__(self) -> Iterator[str]:
+        """Yield the names in alphabetical order."""
         return iter(sorted([*self._modules, *self._entry_points]))
 
     def __len__(self) -> int:
+        """Return the number of stages."""
         return len(self._modules) + len(self._entry_points)
 
 
@@ -74,13 +75,13 @@ def _load(entry: metadata.EntryPoint) -> type[Stage]:
     try:
         stage = entry.load()
         fits = isinstance(stage, type) and issubclass(stage, Stage) and stage.type == entry.name
-        found = None if fits else f"{entry.value} is not a Stage of type '{entry.name}'"
+        fault = "" if fits else f"{entry.value} is not a Stage of type '{entry.name}'"
     except Exception as error:
-        found = f"{type(error).__name__}: {error}"
-    if found:
+        fault = f"{type(error).__name__}: {error}"
+    if fault:
         raise StageError(
             f"the stage '{entry.name}' of the package {package} cannot be loaded",
-            found=found,
+            found=fault,
             cure=f"Update or uninstall {package}",
         )
     return stage

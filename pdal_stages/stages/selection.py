@@ -27,8 +27,9 @@ _CURE = "Write 7,18 or, as PDAL has it, Classification[7:7]; withheld is short f
 
 @dataclass(frozen=True)
 class Span:
-    """A range of a dimension: ``Name[low:high]``, ``(`` and ``)`` leave the ends out, ``!`` turns
-    it round.
+    """A range of a dimension.
+
+    ``Name[low:high]``; ``(`` and ``)`` exclude the ends, ``Name![low:high]`` is what lies outside.
     """
 
     dimension: str

@@ -88,8 +88,7 @@ class TrainModel(Stage):
         "dimensions",
         default=(AUTO,),
         help=f"{_TRAINING['dimensions'].metadata['help']}; auto: HeightAboveGround and, where the "
-        "points have them, Ground, "
-        "HeightAboveOpening_5, HeightAboveOpening_17 and returns",
+        "points have them, Ground, HeightAboveOpening_5, HeightAboveOpening_17 and returns",
         may_be_empty=True,
     )
     classes: dict | None = trained("classes")
@@ -121,8 +120,7 @@ class TrainModel(Stage):
         "boolean",
         True,
         f"If points have the dimension {CHECKED} (from the command corrections), and it is not 0 "
-        "everywhere, draw samples "
-        "only where it is 1",
+        "everywhere, draw samples only where it is 1",
     )
     thin: list = trained("thin", may_be_empty=True)
     voxel: float = trained("voxel")
@@ -130,8 +128,7 @@ class TrainModel(Stage):
         "selection",
         UNWANTED,
         "Points to leave out, even as neighbors: labels (unless 'classes' names them), ranges of "
-        "other dimensions such as "
-        "ReturnNumber[0:0], or the word withheld",
+        "other dimensions such as ReturnNumber[0:0], or the word withheld",
         may_be_empty=True,
     )
     passes: int | None = trained("passes")
@@ -163,7 +160,7 @@ class TrainModel(Stage):
 
     @classmethod
     def from_pipeline(
-        cls, given: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
+        cls, raw_options: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
     ) -> dict[str, Any]:
         """Return options that follow from the stages before."""
         return {"files": files_read(before)}
@@ -182,9 +179,8 @@ class TrainModel(Stage):
                 f"{self.type}: the model will not hold the stages before it, so `classify` cannot "
                 "run them by itself: "
                 f"{error.what}{f' (found {error.found})' if error.found is not None else ''}. "
-                "Write a pipeline with "
-                f"the same stages, {', '.join(self._upstream_types)}, before "
-                "filters.modelclassifier"
+                f"Write a pipeline with the same stages, {', '.join(self._upstream_types)}, "
+                "before filters.modelclassifier"
             )
         return None
 
@@ -310,16 +306,14 @@ class TrainModel(Stage):
             report.figures["copt_threshold"] = threshold
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
-                f"the base assigns {held:,} of {all_:,} samples of class {code} to classes without "
-                "labels, where they stay: "
-                "label some of those classes too, or train this class alone (strategy binary, "
-                "target)"
+                f"the base assigns {held:,} of {all_:,} samples of class {code} to classes "
+                "without labels, where they stay: label some of those classes too, or train this "
+                "class alone (strategy binary, target)"
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(
                 f"{short:,} samples have neighbors farther away than their tile shows, and may "
-                "differ from those of a run "
-                "in one piece: give more --memory"
+                "differ from those of a run in one piece: give more --memory"
             )
         if unscored := model.info["training"].get("unscored"):
             report.warnings.append(unscored)

@@ -1,6 +1,4 @@
-"""``filters.wires``: class of wires, long thin lines that hang in the air, and of the towers that
-hold them.
-"""
+"""``filters.wires``: class of wires and of the towers that carry them."""
 
 from __future__ import annotations
 

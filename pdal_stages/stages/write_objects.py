@@ -1,6 +1,4 @@
-"""``writers.objects``: buildings, trees, spans and decks as polygons, points and lines with what
-was measured of them.
-"""
+"""``writers.objects``: buildings, trees, spans and decks with their attributes as a vector file."""
 
 from __future__ import annotations
 
@@ -16,7 +14,8 @@ from .options import option
 from .points import Points
 
 #: How outlines are drawn.
-STRAIGHT, CELLS = "straight", "cells"
+STRAIGHT = "straight"
+CELLS = "cells"
 
 
 class WriteObjects(ObjectOptions, Stage):
@@ -64,14 +63,14 @@ class WriteObjects(ObjectOptions, Stage):
         """Find objects and write them."""
         from ..reports.object_layers import write_objects
 
-        found, refused = find_objects(self.cells(points, context), self.settings).without(
+        objects, refused = find_objects(self.cells(points, context), self.settings).without(
             self.refuse
         )
         if self.refuse:
             points.report.figures["refused"] = refused
         straight = self.outlines == STRAIGHT
         figures = with_vector(
-            write_objects, self.filename, found, straight, points.units, points.wkt
+            write_objects, self.filename, objects, straight, points.units, points.wkt
         )
         points.report.figures |= figures
         return {}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.messages import count_of
 from ..base.version import __version__
-from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE
+from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR
 
 if TYPE_CHECKING:
     from .inputs import InputSource
@@ -203,7 +203,7 @@ def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> 
     found: Counter[str] = Counter()
     for lines in ([j.record.get("messages", []) for j in done if j.record.get("points")], before):
         for text, n in Counter(text for each in lines for text in set(each)).items():
-            if not text.startswith((HOLDS_NOWHERE, TOUCH_NONE)):
+            if not text.startswith((NO_POINT_MATCHES, NO_POLYGON_NEAR)):
                 found[text] += n
             elif n == len(lines):  # that there is nothing to do in some tiles is normal
                 found[text] = max(found[text], n)

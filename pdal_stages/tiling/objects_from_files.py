@@ -103,7 +103,7 @@ def _find_in_files(
     wkt = references[inputs[0]].wkt
     cells = _all_cells(inputs, stage, wkt, workers)
     size, thin = cells.size, cells.sparse_kind()
-    widens = "cell" not in stage.given
+    widens = "cell" not in stage.set_options
     while widens and cells.sparse_kind() and cells.size < LARGEST:
         cells = cells.doubled()
     if thin:

@@ -20,7 +20,7 @@ from ..pipeline.runtime import Callbacks, Function, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
 from ..stages.context import WHOLE_CLOUD
 from ..stages.first_round import FarReaching
-from ..stages.points import HOLDS_NOWHERE, TOUCH_NONE, class_counts
+from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
 from ..stages.registry import stage_types
 from .checkpoint import save_arrays, written
 from .first_round import Changed, FromBefore, from_before, stage_of
@@ -139,7 +139,7 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
         about_piece = text.startswith((scratch, REPLACED)) or NO_REFERENCE in text
         if about_piece:  # the input has its own message
             continue
-        known = next((words for words in (TOUCH_NONE, HOLDS_NOWHERE) if words in text), "")
+        known = next((words for words in (NO_POLYGON_NEAR, NO_POINT_MATCHES) if words in text), "")
         lines.append(text[text.index(known) :])  # without its stage
     return lines
 

@@ -133,6 +133,6 @@ def test_right_after_all(command, tmp_path, cloud, options):
 
 def test_wheres_of_no_point_and_of_many_terms(command, tmp_path, cloud):
     done = command.runs(["pipeline", job(tmp_path, cloud, {**HAG, "where": "Z > 1e6"})])
-    assert "'where' holds for none of the points: Z > 1e6" in done.err
+    assert "'where' matches no points: Z > 1e6" in done.err
     where = " || ".join(f"Classification == {k % 256}" for k in range(4_000))
     command.runs(["pipeline", job(tmp_path, cloud, {**HAG, "where": where})])
