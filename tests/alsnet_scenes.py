@@ -4,7 +4,7 @@ import numpy as np
 
 from pdal_stages.alsnet.classifier import AlsNet
 from pdal_stages.alsnet.configuration import Configuration, Level
-from pdal_stages.alsnet.network import fresh
+from pdal_stages.alsnet.network import initial_weights
 
 TINY = Configuration(
     "test",
@@ -34,7 +34,7 @@ def scene(n=3000, side=24.0, seed=0, origin=(0.0, 0.0, 0.0)):
 def random_net(inputs=("Z",), classes=3, configuration=TINY, spacing=3.0, seed=0):
     """A network whose weights are random, normalizations included."""
     random = np.random.default_rng(seed)
-    weights = fresh(configuration, len(inputs), classes, seed)
+    weights = initial_weights(configuration, len(inputs), classes, seed)
     for name, array in weights.items():
         if name != "scores":
             array[:, -4:] = random.uniform(0.5, 1.5, (len(array), 4))
@@ -82,7 +82,7 @@ def model_of(net, codes=(2, 5, 6)):
     return Model((net,), [(c, str(c)) for c in codes], info)
 
 
-def coverage(circles):
-    """Circles each point is in."""
-    members = [circles.members(number) for number in range(len(circles))]
+def coverage(batches):
+    """Batches each point is in."""
+    members = [batches.members(number) for number in range(len(batches))]
     return np.bincount(np.concatenate(members))

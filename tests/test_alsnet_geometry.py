@@ -6,15 +6,15 @@ from alsnet_scenes import TINY, coverage, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.alsnet.batches import Circles, halo_m, spacing_for
+from pdal_stages.alsnet.batches import Batches, halo_m, spacing_for
 from pdal_stages.alsnet.configuration import parse_configuration
 from pdal_stages.alsnet.sampling_and_grouping import (
     ball_query,
-    build,
-    farthest_points,
-    scramble,
-    stack,
-    three_nearest,
+    build_pyramid,
+    farthest_point_sampling,
+    interpolation_weights,
+    join_pyramids,
+    random_order,
 )
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features.cell_means import density
@@ -62,7 +62,7 @@ clouds = st.builds(
 def test_farthest_points_equal_the_reference(p, data):
     count = data.draw(st.integers(1, len(p)))
     start = data.draw(st.integers(0, len(p) - 1))
-    found = farthest_points(p, count, start)
+    found = farthest_point_sampling(p, count, start)
     assert np.array_equal(found, slow_farthest(p, count, start))
     assert len(set(found.tolist())) == count
 
@@ -80,7 +80,7 @@ def test_ball_query_equals_the_reference(p, radius, samples, seed):
 @settings(max_examples=25, deadline=None)
 def test_three_nearest_weigh_by_inverse_square(p, m):
     coarse = p[:m]
-    index, weight = three_nearest(p, coarse)
+    index, weight = interpolation_weights(p, coarse)
     d2 = ((p[:, None, :] - coarse[None, :, :]) ** 2).sum(axis=2)
     k = min(3, len(coarse))
     np.testing.assert_allclose(
@@ -96,7 +96,7 @@ def test_three_nearest_weigh_by_inverse_square(p, m):
     assert not weight[:, k:].any()
 
 
-# ---- circles ------------------------------------------------------------------------------------------------
+# ---- batches ------------------------------------------------------------------------------------------------
 
 
 @given(
@@ -113,29 +113,29 @@ def test_every_point_is_in_a_batch_and_batches_are_the_nearest_points(seed, n, p
         xyz[: n // 2, :2] = random.normal([10.0, 10.0], 0.3, (n // 2, 2))
     if kind == "places":
         xyz = np.floor(xyz / 20.0) * 20.0
-    circles = Circles(xyz, points, spacing_for(points, n / 2400.0))
+    batches = Batches(xyz, points, spacing_for(points, n / 2400.0))
     seen = np.zeros(n, int)
-    for number, (x, y) in enumerate(circles.centers):
-        members = circles.members(number)
-        assert len(members) <= circles.sizes[number]
+    for number, (x, y) in enumerate(batches.centers):
+        members = batches.members(number)
+        assert len(members) <= batches.sizes[number]
         seen[members] += 1
         d2 = (xyz[:, 0] - x) ** 2 + (xyz[:, 1] - y) ** 2
-        expected = np.sort(d2[d2 <= circles.reach**2])[: circles.sizes[number]]
+        expected = np.sort(d2[d2 <= batches.reach**2])[: batches.sizes[number]]
         assert np.array_equal(np.sort(d2[members]), expected)
     assert seen.min() >= 1
-    assert np.array_equal(seen, coverage(circles))
+    assert np.array_equal(seen, coverage(batches))
     if kind == "even":
-        assert (circles.sizes == points).all()
+        assert (batches.sizes == points).all()
 
 
 def test_points_are_in_four_batches_on_average():
     xyz = np.random.default_rng(0).random((15_000, 3)) * [100.0, 100.0, 10.0]
     points = 1000
-    circles = Circles(xyz, points, spacing_for(points, density(xyz)))
-    assert coverage(circles).min() >= 1
-    assert 3.7 < coverage(circles).mean() < 4.3
+    batches = Batches(xyz, points, spacing_for(points, density(xyz)))
+    assert coverage(batches).min() >= 1
+    assert 3.7 < coverage(batches).mean() < 4.3
     inside = ((xyz[:, :2] > 20) & (xyz[:, :2] < 80)).all(axis=1)
-    assert 3.8 < coverage(circles)[inside].mean() < 4.2
+    assert 3.8 < coverage(batches)[inside].mean() < 4.2
 
 
 @given(st.integers(0, 2**32))
@@ -145,7 +145,7 @@ def test_batches_do_not_depend_on_the_order_of_the_points(seed):
     xyz = np.round(random.random((1500, 3)) * 30, 1)  # many at the same place
     inputs = random.integers(0, 3, (1500, 1))
     shuffled = random.permutation(len(xyz))
-    one, other = Circles(xyz, 200, 5.0, inputs), Circles(xyz[shuffled], 200, 5.0, inputs[shuffled])
+    one, other = Batches(xyz, 200, 5.0, inputs), Batches(xyz[shuffled], 200, 5.0, inputs[shuffled])
     assert np.array_equal(one.centers, other.centers)
     for number in range(len(one)):
         a, b = one.members(number), shuffled[other.members(number)]
@@ -164,21 +164,21 @@ def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
         ]
     )
     spacing = 4.0
-    whole = Circles(xyz, 200, spacing)
+    whole = Batches(xyz, 200, spacing)
     low, high = np.array([30.0, 30.0]), np.array([45.0, 50.0])
     own = ((xyz[:, :2] >= low) & (xyz[:, :2] < high)).all(axis=1)
     around = ((xyz[:, :2] >= low - halo_m(spacing)) & (xyz[:, :2] < high + halo_m(spacing))).all(
         axis=1
     )
     rows = np.flatnonzero(around)
-    tile = Circles(xyz[rows], 200, spacing)
+    tile = Batches(xyz[rows], 200, spacing)
 
-    def holding(circles, mine, back):
+    def holding(batches, mine, back):
         out = {}
-        for number in circles.needed(np.flatnonzero(mine)).tolist():
-            members = circles.members(number)
+        for number in batches.holding(np.flatnonzero(mine)).tolist():
+            members = batches.members(number)
             if mine[members].any():
-                out[tuple(circles.centers[number])] = back[members].tolist()
+                out[tuple(batches.centers[number])] = back[members].tolist()
         return out
 
     assert holding(whole, own, np.arange(len(xyz))) == holding(tile, own[rows], rows)
@@ -193,45 +193,46 @@ def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
 def test_pyramid_shapes_and_who_is_where():
     xyz, _, _ = scene(256, 6.0)
     local = xyz - xyz.mean(axis=0)
-    local = local[scramble(local)]
-    pyramid = build(local, np.zeros((256, 1), np.float32), TINY)
+    local = local[random_order(local)]
+    pyramid = build_pyramid(local, np.zeros((256, 1), np.float32), TINY)
     n, rows = len(local), local
     for level, step in zip(TINY.levels, pyramid.steps, strict=True):
         assert step.groups.shape == (level.centers, level.samples)
         assert step.offsets.shape == (level.centers, level.samples, 3)
-        assert step.near.shape == step.weights.shape == (n, 3)
+        assert step.nearest.shape == step.weights.shape == (n, 3)
         assert np.linalg.norm(step.offsets, axis=2).max() <= 1.0 + 1e-5
         np.testing.assert_allclose(step.weights.sum(axis=1), 1.0, rtol=1e-5)
         # a center is its own nearest coarse point
         center = rows[step.groups[0, 0]] - step.offsets[0, 0] * level.radius
         assert np.linalg.norm(rows - center, axis=1).min() < 1e-5
-        own = farthest_points(
+        own = farthest_point_sampling(
             rows,
             level.centers,
             0 if step is not pyramid.steps[0] else int(np.argmin((rows[:, :2] ** 2).sum(axis=1))),
         )
-        assert np.array_equal(step.near[own, 0], np.arange(level.centers))
+        assert np.array_equal(step.nearest[own, 0], np.arange(level.centers))
         rows, n = rows[own], level.centers
 
 
 def test_stacked_pyramids_do_not_mix():
     parts = [
-        build(scene(n, 6.0, n)[0], np.full((n, 1), n, np.float32), TINY) for n in (100, 256, 30)
+        build_pyramid(scene(n, 6.0, n)[0], np.full((n, 1), n, np.float32), TINY)
+        for n in (100, 256, 30)
     ]
-    whole = stack(parts)
+    whole = join_pyramids(parts)
     fine = np.repeat(np.arange(3), [100, 256, 30])
     for k, step in enumerate(whole.steps):
         coarse = np.repeat(np.arange(3), [len(part.steps[k].groups) for part in parts])
         assert (fine[step.groups] == coarse[:, None]).all()
-        assert (coarse[step.near] == fine[:, None]).all()
+        assert (coarse[step.nearest] == fine[:, None]).all()
         fine = coarse
 
 
 def test_scramble_follows_the_coordinates():
     xyz = np.random.default_rng(1).random((500, 3))
     shuffled = np.random.default_rng(2).permutation(500)
-    assert np.array_equal(xyz[scramble(xyz)], xyz[shuffled][scramble(xyz[shuffled])])
-    assert abs(np.corrcoef(np.arange(500), xyz[scramble(xyz)][:, 0])[0, 1]) < 0.2
+    assert np.array_equal(xyz[random_order(xyz)], xyz[shuffled][random_order(xyz[shuffled])])
+    assert abs(np.corrcoef(np.arange(500), xyz[random_order(xyz)][:, 0])[0, 1]) < 0.2
 
 
 # ---- configurations -----------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages import load_model
-from pdal_stages.alsnet.batches import Circles
-from pdal_stages.alsnet.classifier import AlsNet, make_pyramid, scaled
-from pdal_stages.alsnet.sampling_and_grouping import build, scramble
+from pdal_stages.alsnet.batches import Batches
+from pdal_stages.alsnet.classifier import AlsNet, make_pyramid, normalize_inputs
+from pdal_stages.alsnet.sampling_and_grouping import build_pyramid, random_order
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import model_file
 from pdal_stages.classifier.interface import PredictRequest
@@ -36,7 +36,7 @@ def test_a_level_equals_a_computation_by_hand():
     net = random_net(("Z",), 2, one)
     xyz = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 1.0], [0.0, 2.0, 0.5], [3.0, 3.0, 0.0]])
     values = xyz[:, 2:].astype(np.float32)
-    pyramid = build(xyz, values, one)
+    pyramid = build_pyramid(xyz, values, one)
     (step,) = pyramid.steps
 
     def layer(name, row):
@@ -55,11 +55,11 @@ def test_a_level_equals_a_computation_by_hand():
         balls.append(np.max(described, axis=0))
     expected = []
     for i in range(4):
-        carried = sum(step.weights[i, k] * balls[step.near[i, k]] for k in range(3))
+        carried = sum(step.weights[i, k] * balls[step.nearest[i, k]] for k in range(3))
         row = layer("head_1", layer("fp1_1", np.concatenate([carried, values[i]])))
         scores = net.weights["scores"][:, :-1] @ row + net.weights["scores"][:, -1]
         expected.append(np.exp(scores) / np.exp(scores).sum())
-    np.testing.assert_allclose(net.folded(pyramid), expected, rtol=1e-4)
+    np.testing.assert_allclose(net.network(pyramid), expected, rtol=1e-4)
 
 
 @given(st.integers(0, 2**32), st.integers(1, 300))
@@ -71,9 +71,11 @@ def test_probabilities_belong_to_points_not_to_their_order(seed, n):
     shuffled = random.permutation(n)
 
     def probabilities(points):
-        order = scramble(points)
+        order = random_order(points)
         out = np.empty((len(points), 3))
-        out[order] = net.folded(build(points[order], points[order, 2:].astype(np.float32), TINY))
+        out[order] = net.network(
+            build_pyramid(points[order], points[order, 2:].astype(np.float32), TINY)
+        )
         return out
 
     whole = probabilities(xyz)
@@ -94,23 +96,23 @@ def test_averages_equal_a_hand_computation():
     net = net_with()
     request = PredictRequest(xyz, dimensions, variance=True)
     ((_, mean, variance),) = net.predict(request)
-    columns = scaled(xyz, dimensions, net.inputs, net.mean, net.scale)
+    columns = normalize_inputs(xyz, dimensions, net.inputs, net.mean, net.scale)
     np.testing.assert_allclose(
         columns[:, 1], (dimensions["HeightAboveGround"] - 1.0) / 2.0, rtol=1e-5
     )
-    circles = Circles(xyz, TINY.points, net.spacing, columns)
+    batches = Batches(xyz, TINY.points, net.spacing, columns)
     each = [[] for _ in xyz]
-    for number in range(len(circles)):
-        members = circles.members(number)
-        order, pyramid = make_pyramid(xyz, columns, members, circles.centers[number], INPUTS, TINY)
-        for row, p in zip(members[order], net.folded(pyramid), strict=True):
+    for number in range(len(batches)):
+        members = batches.members(number)
+        order, pyramid = make_pyramid(xyz, columns, members, batches.centers[number], INPUTS, TINY)
+        for row, p in zip(members[order], net.network(pyramid), strict=True):
             each[row].append(p)
-    assert [len(part) for part in each] == coverage(circles).tolist()
+    assert [len(part) for part in each] == coverage(batches).tolist()
     for i, part in enumerate(each):
         np.testing.assert_allclose(mean[i], np.mean(part, axis=0), rtol=1e-9)
         np.testing.assert_allclose(variance[i], np.var(part, axis=0).mean(), rtol=1e-6, atol=1e-12)
-    assert request.report.figures["batches"] == len(circles)
-    assert request.report.figures["batches_per_point"]["least"] == coverage(circles).min()
+    assert request.report.figures["batches"] == len(batches)
+    assert request.report.figures["batches_per_point"]["least"] == coverage(batches).min()
 
 
 def test_order_of_points_threads_and_rows_do_not_matter():

@@ -15,19 +15,19 @@ from hypothesis import strategies as st
 
 import pdal_stages
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.alsnet.batches import Circles
+from pdal_stages.alsnet.batches import Batches
 from pdal_stages.alsnet.configuration import Configuration, Level
-from pdal_stages.alsnet.sampling_and_grouping import build
+from pdal_stages.alsnet.sampling_and_grouping import build_pyramid
 from pdal_stages.alsnet.training_batches import (
     JITTER,
     THIN,
-    augmented,
-    choose,
+    augment,
     class_weights,
-    covering,
+    cover,
+    histogram_deviation,
     hold_out,
-    side_by_side,
-    spread,
+    join_clouds,
+    select_batches,
 )
 from pdal_stages.base.errors import DependencyError, ModelError, OptionError
 from pdal_stages.base.files import CHECKPOINT, kind_of
@@ -67,13 +67,13 @@ def test_batches_of_one_class_are_passed_over_unless_a_class_would_be_lost():
     )  # left: one class; right: two, mixed
     lonely = (xyz[:, 0] < 4) & (xyz[:, 1] < 4)
     labels[lonely] = 2
-    circles = Circles(xyz, 200, 6.0)
-    chosen = choose(circles, labels, 3, 30.0)
-    shares = [np.bincount(labels[circles.members(k)], minlength=3) for k in chosen]
-    assert 1 < len(chosen) < len(circles)
-    assert sum(spread(s) >= 30.0 for s in shares) == 1
+    batches = Batches(xyz, 200, 6.0)
+    chosen = select_batches(batches, labels, 3, 30.0)
+    shares = [np.bincount(labels[batches.members(k)], minlength=3) for k in chosen]
+    assert 1 < len(chosen) < len(batches)
+    assert sum(histogram_deviation(s) >= 30.0 for s in shares) == 1
     assert sum(shares)[2] > 0
-    assert len(choose(circles, labels, 3, 100.0)) == len(circles)
+    assert len(select_batches(batches, labels, 3, 100.0)) == len(batches)
 
 
 def test_ground_held_out_is_whole_blocks_with_all_classes():
@@ -91,9 +91,9 @@ def test_ground_held_out_is_whole_blocks_with_all_classes():
 
 def test_no_batch_holds_points_of_two_clouds():
     clouds = [scene(n, 12.0)[0] for n in (500, 700, 0, 300)]  # all in one place
-    joined, of = side_by_side(clouds, 3.0), np.repeat(np.arange(4), [len(one) for one in clouds])
-    circles = Circles(joined, 100, 3.0)
-    assert all(len(set(of[circles.members(k)])) == 1 for k in range(len(circles)))
+    joined, of = join_clouds(clouds, 3.0), np.repeat(np.arange(4), [len(one) for one in clouds])
+    batches = Batches(joined, 100, 3.0)
+    assert all(len(set(of[batches.members(k)])) == 1 for k in range(len(batches)))
     for k in (0, 1, 3):
         away = joined[of == k] - clouds[k]
         assert (
@@ -104,13 +104,13 @@ def test_no_batch_holds_points_of_two_clouds():
 
 def test_covering_batches_hold_every_wanted_point():
     xyz, _, _ = scene()
-    circles = Circles(xyz, 256, 4.0)
+    batches = Batches(xyz, 256, 4.0)
     wanted = xyz[:, 0] > 15
-    numbers = covering(circles, wanted)
+    numbers = cover(batches, wanted)
     seen = np.zeros(len(xyz), bool)
     for number in numbers:
-        seen[circles.members(number)] = True
-    assert seen[wanted].all() and len(numbers) < len(circles)
+        seen[batches.members(number)] = True
+    assert seen[wanted].all() and len(numbers) < len(batches)
 
 
 def test_class_weights():
@@ -127,7 +127,7 @@ def test_class_weights():
 @settings(max_examples=20, deadline=None)
 def test_augmentation_turns_shakes_and_thins(seed, n):
     xyz = np.random.default_rng(seed).normal(size=(n, 3)) * 10
-    out, kept = augmented(xyz, np.random.default_rng(seed))
+    out, kept = augment(xyz, np.random.default_rng(seed))
     assert len(out) == len(kept) == len(set(kept.tolist()))
     assert len(kept) >= max(min(n, 16), int((1 - THIN) * n) - 1)
     away = 3 * JITTER * 3**0.5 + 1e-9
@@ -143,15 +143,15 @@ def test_augmentation_turns_shakes_and_thins(seed, n):
 
 @needs_torch
 def test_torch_and_numpy_agree():
-    from pdal_stages.alsnet.torch_network import Network, applied_on
+    from pdal_stages.alsnet.torch_network import Network, apply_on_device
 
     net = random_net(("Z", "Intensity"), 4)
     xyz, _, values = scene(256, 7.0)
     inputs = np.column_stack([xyz[:, 2], values["Intensity"] / 100.0]).astype(np.float32)
-    pyramid = build(xyz, inputs, TINY)
+    pyramid = build_pyramid(xyz, inputs, TINY)
     network = Network(TINY, 2, 4).load(net.weights)
-    found = applied_on("cpu", net.weights, TINY, 2, 4)(pyramid)
-    np.testing.assert_allclose(found, net.folded(pyramid), atol=2e-6)
+    found = apply_on_device("cpu", net.weights, TINY, 2, 4)(pyramid)
+    np.testing.assert_allclose(found, net.network(pyramid), atol=2e-6)
     again = network.dump()
     assert list(again) == list(net.weights)
     assert all(np.array_equal(again[name], net.weights[name]) for name in again)
@@ -210,7 +210,7 @@ def test_resumed_training_equals_one_without_a_break(tmp_path):
     class Stop(Exception):
         pass
 
-    save = training._Session._save
+    save = training.NetworkTraining._save
 
     def stop(self, where):
         save(self, where)
@@ -218,7 +218,7 @@ def test_resumed_training_equals_one_without_a_break(tmp_path):
             raise Stop
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training._Session, "_save", stop)
+        patch.setattr(training.NetworkTraining, "_save", stop)
         with pytest.raises(Stop):
             fit(clouds, checkpoint=path, **setting)
     resumed = fit(clouds, checkpoint=path, **setting)

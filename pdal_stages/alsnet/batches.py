@@ -1,8 +1,7 @@
-"""Circular batches [WM19]: the points nearest to grid points, so spaced that every point is in
-several.
+"""Circular batches [WM19 3]: the points nearest to grid points, four for each on average.
 
 The grid is anchored to absolute coordinates and its spacing is fixed when a model is trained, so a
-tile sees the same circles as the whole cloud. What a circle holds follows from the coordinates,
+tile sees the same batches as the whole cloud. What a batch holds follows from the coordinates,
 never from the points' order.
 """
 
@@ -16,46 +15,45 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 
-#: Circles each point is in, on average, in a cloud of even density.
+#: Batches each point is in, on average, in a cloud of even density.
 COVERAGE = 4.0
-#: Farthest point a circle takes, in spacings. A circle of full size in even density has 1.13.
+#: Farthest point a batch takes, in spacings. A batch of full size in even density has 1.13.
 REACH = 1.5
 #: How often a cell may be halved.
 DEEPEST = 24
 
 
 def spacing_for(points: int, per_square_meter: float) -> float:
-    """Spacing in meters at which circles of `points` points cover each point :data:`COVERAGE`
-    times.
+    """Return the spacing in meters at which batches cover each point :data:`COVERAGE` times.
 
-    A circle covers points / density square meters and each grid point stands for spacing^2 of them.
+    A batch covers points / density square meters and each grid point stands for spacing^2 of them.
     """
     return max(round(math.sqrt(points / (COVERAGE * per_square_meter)), 2), 0.05)
 
 
 def halo_m(spacing: float) -> float:
-    """Meters around a tile that its results depend on.
+    """Return the meters around a tile that its results depend on.
 
-    A point's circles have their grid points within ``REACH`` spacings of it and take points as far
+    A point's batches have their grid points within ``REACH`` spacings of it and take points as far
     again; which grid points there are depends on the cell they were halved from, whose center is up
     to half a cell's diagonal away, and on what lies within reach of that.
     """
     return (2.0 * REACH + math.sqrt(0.5)) * spacing
 
 
-class Circles:
+class Batches:
     """The circular batches of a cloud.
 
     A cell of the grid is quartered, and its grid point replaced by four, while it holds more than
-    half a batch, or while its own circle does not hold all of its points: so each point is in at
-    least one circle, always.
+    half a batch, or while its own batch does not hold all of its points: so each point is in at
+    least one batch, always.
 
     Parameters
     ----------
     xyz : (n, 3) float64
         Coordinates in meters.
     points : int
-        Points of a batch; a circle in sparse surroundings has fewer.
+        Points of a batch; a batch in sparse surroundings has fewer.
     spacing : float
         Of the grid, meters.
     inputs : (n, c) array, optional
@@ -66,7 +64,7 @@ class Circles:
     centers : (m, 2) float64
         Grid points, in an order that follows from the coordinates.
     sizes : (m,) int64
-        Points a circle may hold: `points`, but for more than `points` at one and the same place.
+        Points a batch may hold: `points`, but for more than `points` at one and the same place.
     """
 
     def __init__(
@@ -88,10 +86,11 @@ class Circles:
         self.centers, self.sizes = self._place()
 
     def __len__(self) -> int:
+        """Return the number of batches."""
         return len(self.centers)
 
-    def around(self, x: float, y: float, size: int | None = None) -> npt.NDArray[np.int64]:
-        """Rows of the points nearest to a place in plan, at most `size` and none beyond ``reach``.
+    def nearest_points(self, x: float, y: float, size: int | None = None) -> npt.NDArray[np.int64]:
+        """Return the rows of the points nearest to a place in plan, within ``reach``.
 
         In the canonical order. Of points equally far the first in that order are taken.
         """
@@ -108,12 +107,12 @@ class Circles:
         return self._row[at]
 
     def members(self, number: int) -> npt.NDArray[np.int64]:
-        """Rows of the points of a circle, in the canonical order."""
+        """Return the rows of the points of a batch, in the canonical order."""
         x, y = self.centers[number]
-        return self.around(float(x), float(y), int(self.sizes[number]))
+        return self.nearest_points(float(x), float(y), int(self.sizes[number]))
 
-    def needed(self, rows: npt.NDArray[np.int64] | None) -> npt.NDArray[np.int64]:
-        """Numbers of the circles that can hold any of these rows; all for None."""
+    def holding(self, rows: npt.NDArray[np.int64] | None) -> npt.NDArray[np.int64]:
+        """Return the numbers of the batches that can hold any of these rows; all for None."""
         from scipy.spatial import cKDTree
 
         if rows is None or not len(rows) or not len(self):
@@ -124,7 +123,7 @@ class Circles:
         return np.flatnonzero(distance <= self.reach * (1.0 + 1e-9))
 
     def _place(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """Centers and sizes."""
+        """Return the grid points (m, 2) of the batches and the most points (m,) of each."""
         found: list[tuple[float, float, int]] = []
         waiting = [(0, *part) for part in _parts(np.arange(len(self._xy)), self._xy, self.spacing)][
             ::-1
@@ -141,7 +140,7 @@ class Circles:
         return table[:, :2].copy(), table[:, 2].astype(np.int64)
 
     def _fits(self, at: npt.NDArray[np.int64], x: float, y: float, level: int) -> int:
-        """The size of the cell's circle, or 0 where the cell must be quartered."""
+        """Return the size of the cell's batch, or 0 where the cell must be quartered."""
         if level < DEEPEST and len(at) > max(self.points // 2, 1):
             return 0
         far2 = float(((self._xy[at] - (x, y)) ** 2).sum(axis=1).max())
@@ -153,7 +152,7 @@ class Circles:
 
 
 def _parts(at: npt.NDArray[np.int64], xy: npt.NDArray[np.float64], side: float):
-    """The occupied cells of some points: (ix and iy, places), ordered by iy, then ix."""
+    """Return the occupied cells of some points and their places, ordered by row, then column."""
     cell = np.floor(xy[at] / side)
     order = np.lexsort(cell.T)
     cell, at = cell[order], at[order]

@@ -1,4 +1,4 @@
-"""alsNet as a classifier of a model file: made from arrays, applied to whole clouds."""
+"""alsNet as a classifier of a model file: made from arrays, applied to whole clouds [WM19]."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from ..base.errors import ModelError, StageError
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.input_dimensions import add_return_features, take_dimensions
 from ..classifier.interface import ArrayRule, Block, Column, InputPlan, PredictRequest
-from .batches import Circles, halo_m
+from .batches import Batches, halo_m
 from .configuration import Configuration, parse_configuration
-from .network import Folded, Weights, check
-from .sampling_and_grouping import Pyramid, build, scramble
+from .network import NumpyNetwork, Weights, check_weights
+from .sampling_and_grouping import Pyramid, build_pyramid, random_order
+from .training_batches import augment
 
 #: A network whose batch would need more megabytes is not loaded; the published ones need a few
 #: thousand.
@@ -53,7 +54,7 @@ class AlsNet:
     def from_file(
         cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
     ) -> AlsNet:
-        """Made from what a model file says of a pass, everything checked."""
+        """Return the network that a pass of a manifest describes; ModelError for contradictions."""
         names, parameters = entry["feature_names"], entry["parameters"]
         n_features, n_classes = len(names), len(codes)
         wanted, entries = (
@@ -86,15 +87,15 @@ class AlsNet:
             raise ModelError(
                 "a batch of the network would need too much memory", found=f"{needed:,.0f} MB"
             )
-        check(arrays, configuration, n_features, n_classes)
+        check_weights(arrays, configuration, n_features, n_classes)
         return cls(dict(arrays), configuration, tuple(names), mean, scale, spacing, n_classes)
 
     def arrays(self) -> Weights:
-        """What the file stores."""
+        """Return the weights, which a model file stores."""
         return dict(self.weights)
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
-        """What a model file says of it beside its arrays; nothing is fitted but the weights."""
+        """Return what a manifest says of it beside its arrays."""
         return {
             "parameters": {
                 "configuration": self.configuration.to_dict(),
@@ -115,7 +116,7 @@ class AlsNet:
         }
 
     def columns(self, codes: Sequence[int]) -> list[Column]:
-        """The inputs."""
+        """Return the inputs."""
         return [Column(name, name, "dimension", "(dimension)") for name in self.inputs]
 
     @property
@@ -124,9 +125,9 @@ class AlsNet:
         return InputPlan(self.inputs, self.inputs, halo_m(self.spacing))
 
     @cached_property
-    def folded(self) -> Folded:
+    def network(self) -> NumpyNetwork:
         """The network, ready to apply."""
-        return Folded(self.weights, self.configuration)
+        return NumpyNetwork(self.weights, self.configuration)
 
     def predict(self, request: PredictRequest) -> Iterator[Block]:
         """Yield the mean probabilities over all batches a point is in [WM19 3], in one block.
@@ -139,91 +140,111 @@ class AlsNet:
             len(request.xyz),
         )
         if request.count:
-            mean, variance, counts = self._means(request, values)
-            request.report.figures.update(counts)
+            averages = self._average(request, values)
+            request.report.figures["batches_per_point"] = averages.batches_per_point()
+            mean, variance = averages.mean_and_variance()
             rows = np.arange(len(request.xyz)) if request.rows is None else request.rows
             yield Block(rows, mean, variance)
 
     def _apply_on(self, device: str) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
-        """Return what gives a batch's probabilities: NumPy, or PyTorch where a GPU is asked for."""
-        if device == "cpu":
-            return self.folded
-        from .torch_network import applied_on, chosen_device
+        """Return the function that applies the network to a batch.
 
-        if chosen_device(device) == "cpu":
-            return self.folded
-        return applied_on(
+        It runs in NumPy, or in PyTorch where a GPU is asked for.
+        """
+        if device == "cpu":
+            return self.network
+        from .torch_network import apply_on_device, resolve_device
+
+        if resolve_device(device) == "cpu":
+            return self.network
+        return apply_on_device(
             "cuda", self.weights, self.configuration, len(self.inputs), self.n_classes
         )
 
-    def _means(
+    def _average(
         self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], dict[str, Any]]:
-        """Return the mean probabilities over the batches, their variance, and counts.
-
-        The variance (n,) of a class's probability over the batches, mean over the classes, marks
-        errors [WM19 5].
-        """
+    ) -> _Averages:
+        """Return the averages over all batches that hold a wanted point."""
         from threadpoolctl import threadpool_limits
 
-        rows, progress = request.rows, request.progress
-        xyz = request.xyz
-        columns = scaled(xyz, dimensions, self.inputs, self.mean, self.scale)
-        circles = Circles(xyz, self.configuration.points, self.spacing, columns)
-        numbers = circles.needed(rows)
-        m = request.count
-        place = np.full(len(xyz), -1)
-        place[slice(None) if rows is None else rows] = np.arange(m)
-        total, squares = np.zeros((m, self.n_classes)), np.zeros(m)
-        count = np.zeros(m, np.int64)
-        each = self.configuration.memory_mb(len(self.inputs))
-        side_by_side = max(1, min(resolve_threads(request.threads), int(request.memory_mb / each)))
+        rows, xyz = request.rows, request.xyz
+        columns = normalize_inputs(xyz, dimensions, self.inputs, self.mean, self.scale)
+        batches = Batches(xyz, self.configuration.points, self.spacing, columns)
+        averages = _Averages(len(xyz), rows, self.n_classes)
+        each_mb = self.configuration.memory_mb(len(self.inputs))
+        fitting = int(request.memory_mb / each_mb)
+        side_by_side = max(1, min(resolve_threads(request.threads), fitting))
         apply = self._apply_on(request.device)  # once, before there are threads
 
-        def one(number: int):
-            members = circles.members(number)
+        def classify(number: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+            members, center = batches.members(number), batches.centers[number]
             order, pyramid = make_pyramid(
-                xyz, columns, members, circles.centers[number], self.inputs, self.configuration
+                xyz, columns, members, center, self.inputs, self.configuration
             )
             return members[order], apply(pyramid)
 
-        seen = 0
-        # BLAS on one thread: a batch's result then does not depend on how many are computed side by
-        # side.
+        numbers = batches.holding(rows).tolist()
+        # With BLAS on one thread a result does not depend on how many are computed side by side.
         with threadpool_limits(1):
-            for members, p in map_blocks(one, numbers.tolist(), side_by_side, ahead=1):
-                at = place[members]
-                mine = at >= 0
-                at, p = at[mine], p[mine]
-                new = int(np.count_nonzero(count[at] == 0))
-                total[at] += p
-                squares[at] += (p * p).sum(axis=1)
-                count[at] += 1
-                seen += new
-                if progress is not None:
-                    progress.update(new)
-        if not count.all():
-            raise StageError(
-                "a point is in no batch; this is a bug", found=int(np.count_nonzero(count == 0))
-            )
-        counted = {
-            "batches": len(numbers),
-            "batches_per_point": {"mean": round(float(count.mean()), 2), "least": int(count.min())},
-        }
-        mean = total / count[:, None]
-        variance = (squares / count - (mean * mean).sum(axis=1)) / self.n_classes
-        return mean, np.maximum(variance, 0.0), counted
+            for members, p in map_blocks(classify, numbers, side_by_side, ahead=1):
+                new = averages.add(members, p)
+                if request.progress is not None:
+                    request.progress.update(new)
+        request.report.figures["batches"] = len(numbers)
+        return averages
 
 
-def scaled(
+class _Averages:
+    """Sums of probabilities over the batches that each of m wanted points is in."""
+
+    def __init__(self, n: int, rows: npt.NDArray[np.int64] | None, n_classes: int) -> None:
+        m = n if rows is None else len(rows)
+        self._place = np.full(n, -1)
+        self._place[slice(None) if rows is None else rows] = np.arange(m)
+        self._sum, self._squares = np.zeros((m, n_classes)), np.zeros(m)
+        self._count = np.zeros(m, np.int64)
+
+    def add(self, members: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> int:
+        """Add the probabilities (k, classes) of a batch; return how many points are new."""
+        place = self._place[members]
+        wanted = place >= 0
+        place, p = place[wanted], p[wanted]
+        new = int(np.count_nonzero(self._count[place] == 0))
+        self._sum[place] += p
+        self._squares[place] += (p * p).sum(axis=1)
+        self._count[place] += 1
+        return new
+
+    def batches_per_point(self) -> dict[str, float]:
+        """Return the mean and the least number of batches that a point is in."""
+        if not self._count.all():
+            outside = int(np.count_nonzero(self._count == 0))
+            raise StageError("a point is in no batch; this is a bug", found=outside)
+        return {"mean": round(float(self._count.mean()), 2), "least": int(self._count.min())}
+
+    def mean_and_variance(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return mean probabilities (m, classes), and the variance (m,).
+
+        The variance of a class's probability over the batches, mean over the classes, marks errors
+        [WM19 5].
+        """
+        mean = self._sum / self._count[:, None]
+        squares = (mean * mean).sum(axis=1)
+        variance = (self._squares / self._count - squares) / mean.shape[1]
+        return mean, np.maximum(variance, 0.0)
+
+
+def normalize_inputs(
     xyz: npt.NDArray[np.float64],
     dimensions: Mapping[str, npt.ArrayLike],
     inputs: Sequence[str],
     mean: Sequence[float],
     scale: Sequence[float],
 ) -> npt.NDArray[np.float32]:
-    """(n, inputs) float32: (value - mean) / scale of each dimension, 0 where X, Y and Z come
-    later."""
+    """Return the inputs (n, inputs) float32: (value - mean) / scale of each dimension.
+
+    X, Y and Z are 0; they follow from the batch.
+    """
     out = np.zeros((len(xyz), len(inputs)), np.float32)
     for k, name in enumerate(inputs):
         if name not in ("X", "Y", "Z"):
@@ -238,9 +259,9 @@ def make_pyramid(
     center: npt.NDArray[np.float64],
     inputs: Sequence[str],
     configuration: Configuration,
-    change: Any = None,
+    augmentation: np.random.Generator | None = None,
 ) -> tuple[npt.NDArray[np.int64], Pyramid]:
-    """A batch's pyramid, and the order of its points among `members`.
+    """Return the order of a batch's points among `members`, and its pyramid.
 
     Parameters
     ----------
@@ -249,16 +270,16 @@ def make_pyramid(
     center : (2,) float64
         Coordinates are taken from it, heights from the batch's first percentile: near its ground,
         whatever few strays lie below.
-    change : function, optional
-        Augmentation: from coordinates (k, 3) to (coordinates, rows kept).
+    augmentation : Generator, optional
+        Rotates, shakes and thins the batch.
     """
     z = xyz[members, 2]
     low = float(np.partition(z, len(z) // 100)[len(z) // 100])
     local = xyz[members] - np.array([center[0], center[1], low])
     kept = None
-    if change is not None:
-        local, kept = change(local)
-    order = scramble(local)
+    if augmentation is not None:
+        local, kept = augment(local, augmentation)
+    order = random_order(local)
     local = np.ascontiguousarray(local[order])
     if kept is not None:
         order = kept[order]
@@ -266,4 +287,4 @@ def make_pyramid(
     for k, name in enumerate(inputs):
         if name in ("X", "Y", "Z"):
             values[:, k] = local[:, "XYZ".index(name)] / METERS
-    return order, build(local, values, configuration)
+    return order, build_pyramid(local, values, configuration)

@@ -1,5 +1,4 @@
-"""Network configurations and options of training, as data: what a model file stores and an option
-names.
+"""Network configurations and training options as data: in model files and options.
 
 A configuration lists the levels of set abstraction [WM19; Qi et al. 2017, PointNet++]: how many
 centers are sampled, the radius of the ball around each, how many points are taken from it, the
@@ -60,6 +59,7 @@ class Configuration(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check what cannot be declared."""
         super().__post_init__()
         if not isinstance(self.name, str) or not 1 <= len(self.name) <= 60:
             raise OptionError("a configuration's name must be text", found=repr(self.name)[:60])
@@ -69,8 +69,10 @@ class Configuration(Settings):
             raise OptionError(f"a network may have {MAX_LAYERS} layers", found=layers)
 
     def _linear(self, inputs: int) -> Iterator[tuple[str, int, int, int, int]]:
-        """Of every layer but the last, in the order of the computation: name, rows, inputs,
-        outputs, depth below."""
+        """Yield name, rows, inputs, outputs and depth below of every layer but the last.
+
+        They come in the order of the computation.
+        """
         width, rows = [inputs], [self.points]
         for number, level in enumerate(self.levels, 1):
             rows.append(min(level.centers, rows[-1]))
@@ -91,7 +93,7 @@ class Configuration(Settings):
             below = after
 
     def shapes(self, inputs: int, classes: int) -> dict[str, tuple[int, int]]:
-        """Array name to shape, in the order of the computation.
+        """Return the shape of each array by its name, in the order of the computation.
 
         A layer with batch normalization is (out, in + 4): the weights, then per output the scale,
         shift, running mean and running variance. The last, ``scores``, is (classes, in + 1):
@@ -101,8 +103,10 @@ class Configuration(Settings):
         return {**out, "scores": (classes, self.head[-1] + 1)}
 
     def memory_mb(self, inputs: int) -> float:
-        """Megabytes one batch takes at most where the network is applied, counted from the sizes of
-        its arrays."""
+        """Return the megabytes that one batch takes at most where the network is applied.
+
+        Counted from the sizes of its arrays.
+        """
         most = max(
             rows * (before + 2 * after + 3 * below)
             for _, rows, before, after, below in self._linear(inputs)
@@ -114,15 +118,16 @@ class Configuration(Settings):
         return (4.0 * most + self.points * 200.0 + balls) / 2**20
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data; :func:`parse_configuration` reads it."""
+        """Return plain data; :func:`parse_configuration` reads it."""
         return json.loads(json.dumps(asdict(self)))  # lists for tuples
 
 
 def parse_configuration(
     given: str | Mapping[str, Any] | Configuration, points: int | None = None
 ) -> Configuration:
-    """A configuration from its name or from data, or an OptionError; `points` of a batch instead of
-    its own.
+    """Return a configuration by its name or from data; OptionError for others.
+
+    `points` of a batch replace its own.
 
     A mapping has ``points``, ``levels`` (each ``centers``, ``radius``, ``samples``, ``mlp``,
     ``up``) and optionally ``name``, ``head``, ``dropout``.
@@ -158,8 +163,7 @@ def _from_mapping(given: Mapping[str, Any]) -> Configuration:
 
 
 def _only(given: Any, kind: type, what: str, needed: Sequence[str] = ()) -> None:
-    """Refuse what is not a mapping with the names of a dataclass's fields, with all that are
-    needed."""
+    """Raise an OptionError for what is not a mapping of a dataclass's fields."""
     if not isinstance(given, Mapping):
         raise OptionError(f"{what} must be a mapping", found=repr(given)[:60])
     known = [one.name for one in fields(kind)]
@@ -257,6 +261,7 @@ class NetworkOptions(Settings):
     device: str = setting("auto", "string", "Device to train on", choices=("auto", "cpu", "cuda"))
 
     def __post_init__(self) -> None:
+        """Check all options, and parse the configuration."""
         super().__post_init__()
         object.__setattr__(
             self, "configuration", parse_configuration(self.configuration, self.points)
@@ -264,6 +269,6 @@ class NetworkOptions(Settings):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> NetworkOptions:
-        """Options by name; an unknown name is an error."""
+        """Return options by name; OptionError for an unknown name."""
         _only(values, cls, "'alsnet'")
         return cls(**values)

@@ -1,5 +1,7 @@
-"""A network's weights as named arrays: made, checked, and applied with NumPy alone; only training
-needs PyTorch."""
+"""The network: PointNet++ as [WM19] uses it, its weights, and NumPy that applies it.
+
+Only training needs PyTorch.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ Weights = dict[str, npt.NDArray[np.float32]]
 EPSILON = 1e-5
 
 
-def fresh(configuration: Configuration, inputs: int, classes: int, seed: int) -> Weights:
-    """Untrained weights: He et al. 2015 for the linear layers, identity for the normalizations."""
+def initial_weights(configuration: Configuration, inputs: int, classes: int, seed: int) -> Weights:
+    """Return untrained weights: He et al. 2015 for linear layers, identity for normalizations."""
     random = np.random.default_rng([seed, 0xA15])
     out: Weights = {}
     for name, (rows, columns) in configuration.shapes(inputs, classes).items():
@@ -36,11 +38,13 @@ def fresh(configuration: Configuration, inputs: int, classes: int, seed: int) ->
     return out
 
 
-def check(
+def check_weights(
     weights: Mapping[str, npt.NDArray[Any]], configuration: Configuration, inputs: int, classes: int
 ) -> None:
-    """Refuse, as a ModelError, arrays that are missing, unknown, of other shapes, not finite, or of
-    negative variance."""
+    """Raise a ModelError for arrays that do not fit a configuration.
+
+    They are missing, unknown, of other shapes, not finite, or of negative variance.
+    """
     shapes = configuration.shapes(inputs, classes)
     if odd := sorted(set(weights) ^ set(shapes)):
         raise ModelError(
@@ -66,8 +70,10 @@ def forward(
     join: Callable,
     highest: Callable,
 ) -> Any:
-    """What enters the last layer, (n, width): PointNet++ with the levels of a configuration [WM19;
-    Qi et al. 2017].
+    """Return what enters the last layer, (n, width) [WM19 2.6; Qi et al. 2017b].
+
+    Set abstraction samples, groups and describes points level by level; feature propagation
+    interpolates back.
 
     `pyramid` holds arrays of NumPy or tensors of PyTorch; the functions are those of the one or the
     other: a named layer, rows by number, columns side by side, the maximum over the middle axis.
@@ -87,14 +93,18 @@ def forward(
     below = features[-1]
     for number in range(len(levels), 0, -1):
         step = pyramid.steps[number - 1]
-        carried = sum(take(below, step.near[:, k]) * step.weights[:, k : k + 1] for k in range(3))
+        carried = sum(
+            take(below, step.nearest[:, k]) * step.weights[:, k : k + 1] for k in range(3)
+        )
         below = shared(f"fp{number}", join([carried, features[number - 1]]), levels[number - 1].up)
     return shared("head", below, configuration.head)
 
 
-class Folded:
-    """A network for applying: weights that :func:`check` accepts, batch normalization folded into
-    the linear layers."""
+class NumpyNetwork:
+    """A network to apply with NumPy; its weights are those that :func:`check_weights` accepts.
+
+    Batch normalization is folded into the linear layers.
+    """
 
     def __init__(
         self, weights: Mapping[str, npt.NDArray[np.float32]], configuration: Configuration
@@ -120,7 +130,7 @@ class Folded:
         return np.maximum(values, 0.0, out=values)
 
     def __call__(self, pyramid: Pyramid) -> npt.NDArray[np.float64]:
-        """Class probabilities of a batch's points, (n, classes) float64."""
+        """Return the class probabilities of a batch's points, (n, classes) float64."""
         with np.errstate(all="ignore"):  # scores that are not finite are an error in the end
             below = forward(
                 self.configuration,

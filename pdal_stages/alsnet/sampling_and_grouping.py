@@ -1,5 +1,4 @@
-"""The geometry of a batch, level by level: who is sampled, who is in which ball, who passes
-features back up.
+"""Sampling and grouping [Qi et al. 2017b]: the geometry of a batch, level by level.
 
 It follows from the coordinates alone, so it is computed once, and the network only gathers and
 multiplies.
@@ -22,11 +21,12 @@ from .configuration import Configuration
 BUCKET = 64
 
 
-def farthest_points(
+def farthest_point_sampling(
     xyz: npt.NDArray[np.float64], count: int, start: int = 0
 ) -> npt.NDArray[np.int64]:
-    """Farthest point sampling, exact: each of `count` points is the one farthest from those chosen
-    before, from `start` on.
+    """Return `count` points, each the one farthest from those chosen before it.
+
+    Exact; the first one is `start`.
 
     Indices come in the order they were chosen, each once (points that coincide included). Points
     are kept in buckets, in the order of a tree; one whose box is farther from the new point than
@@ -89,8 +89,9 @@ def _farthest(p, order, count, first):
 def ball_query(
     xyz: npt.NDArray[np.float64], centers: npt.NDArray[np.int64], radius: float, samples: int
 ) -> npt.NDArray[np.int32]:
-    """(m, samples) int32 rows of the first `samples` points, by index, within `radius` (included)
-    of each center (m,).
+    """Return rows (m, samples) int32 of points within `radius` (included) of each center (m,).
+
+    Of more points the first ones by index are taken.
 
     A center is within its own ball, so none is empty. A ball with fewer points repeats its first
     one, which a maximum over the ball does not notice (as PointNet++ does).
@@ -103,11 +104,12 @@ def ball_query(
     return out
 
 
-def three_nearest(
+def interpolation_weights(
     xyz: npt.NDArray[np.float64], coarse: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """Rows (n, 3) of the three nearest coarse points of each point, and weights (n, 3) by inverse
-    squared distance.
+    """Return the three nearest coarse points (n, 3) of each point, and their weights (n, 3).
+
+    Weights fall with the squared distance.
 
     They sum to 1. Where there are fewer than three coarse points the rest weigh nothing. [WM19]
     says inverse distance, but its authors' program, which gave the published figures, takes the
@@ -125,12 +127,12 @@ def three_nearest(
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """From one level to the next coarser one, and back."""
+    """Set abstraction from one level to the next coarser one, and feature propagation back."""
 
     groups: npt.NDArray[np.int32]  #: (m, samples) points of each ball, as rows of the finer level
     #: (m, samples, 3) their coordinates from the ball's center, divided by the radius
     offsets: npt.NDArray[np.float32]
-    near: npt.NDArray[
+    nearest: npt.NDArray[
         np.int32
     ]  #: (n, 3) for each point of the finer level, three rows of the coarser one
     weights: npt.NDArray[np.float32]  #: (n, 3) of those; they sum to 1
@@ -144,9 +146,8 @@ class Pyramid:
     steps: tuple[Step, ...]  #: from fine to coarse
 
 
-def scramble(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """An order that looks random and follows from the coordinates, whatever order the points come
-    in.
+def random_order(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Return an order that looks random and follows from the coordinates alone.
 
     A ball takes its first points by index: in this order that is a fair sample of it.
     """
@@ -154,33 +155,33 @@ def scramble(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     return np.lexsort((xyz[:, 2], xyz[:, 1], xyz[:, 0], mixed))
 
 
-def build(
+def build_pyramid(
     xyz: npt.NDArray[np.float64], inputs: npt.NDArray[np.float32], configuration: Configuration
 ) -> Pyramid:
-    """The pyramid of a batch.
+    """Return the pyramid of a batch.
 
     Parameters
     ----------
     xyz : (n, 3) float64
-        Coordinates from the batch's center, in the order of :func:`scramble`.
+        Coordinates from the batch's center, in the order of :func:`random_order`.
     inputs : (n, c) float32
     configuration : Configuration
     """
     start = int(np.argmin((xyz[:, :2] ** 2).sum(axis=1)))
     steps = []
     for level in configuration.levels:
-        centers = farthest_points(xyz, min(level.centers, len(xyz)), start)
+        centers = farthest_point_sampling(xyz, min(level.centers, len(xyz)), start)
         groups = ball_query(xyz, centers, level.radius, level.samples)
         offsets = (xyz[groups] - xyz[centers][:, None, :]) / level.radius
         coarse = xyz[centers]
-        near, weights = three_nearest(xyz, coarse)
+        near, weights = interpolation_weights(xyz, coarse)
         steps.append(Step(groups, offsets.astype(np.float32), near, weights))
         xyz, start = coarse, 0
     return Pyramid(inputs, tuple(steps))
 
 
-def stack(pyramids: Sequence[Pyramid]) -> Pyramid:
-    """Several batches as one that never mixes them: rows follow each other."""
+def join_pyramids(pyramids: Sequence[Pyramid]) -> Pyramid:
+    """Join batches into one that never mixes them: rows follow each other."""
     if len(pyramids) == 1:
         return pyramids[0]
     steps = []
@@ -193,7 +194,7 @@ def stack(pyramids: Sequence[Pyramid]) -> Pyramid:
             Step(
                 np.concatenate([part.groups + k for part, k in zip(parts, above, strict=True)]),
                 np.concatenate([part.offsets for part in parts]),
-                np.concatenate([part.near + k for part, k in zip(parts, below, strict=True)]),
+                np.concatenate([part.nearest + k for part, k in zip(parts, below, strict=True)]),
                 np.concatenate([part.weights for part in parts]),
             )
         )

@@ -25,8 +25,7 @@ MOMENTUM = 0.05
 
 
 class Network(nn.Module):
-    """The layers of a configuration, each linear, normalized and cut at 0, by the names of their
-    arrays."""
+    """The layers of a configuration by the names of their arrays: linear, normalized, ReLU."""
 
     def __init__(self, configuration: Configuration, inputs: int, classes: int) -> None:
         super().__init__()
@@ -42,7 +41,7 @@ class Network(nn.Module):
         self.dropout = nn.Dropout(configuration.dropout)
 
     def forward(self, pyramid: Pyramid):
-        """Scores before the softmax, (n, classes), of a pyramid of tensors."""
+        """Return scores before the softmax, (n, classes), of a pyramid of tensors."""
         below = forward(
             self.configuration,
             pyramid,
@@ -54,7 +53,7 @@ class Network(nn.Module):
         return self.layers["scores"](self.dropout(below))
 
     def _parts(self):
-        """Of every array its name and the tensors side by side in it."""
+        """Yield the name of every array and the tensors side by side in it."""
         for name, layer in self.layers.items():
             if name == "scores":
                 yield name, (layer.weight, layer.bias[:, None])
@@ -64,7 +63,7 @@ class Network(nn.Module):
                 yield name, (linear.weight, *(part[:, None] for part in more))
 
     def load(self, weights: Mapping[str, npt.NDArray[np.float32]]) -> Network:
-        """Take over checked arrays."""
+        """Take over checked arrays; return itself."""
         with torch.no_grad():
             for name, parts in self._parts():
                 array = torch.from_numpy(np.array(weights[name], dtype=np.float32))
@@ -75,19 +74,20 @@ class Network(nn.Module):
         return self
 
     def dump(self) -> Weights:
-        """The weights as arrays, in the order of ``Configuration.shapes``."""
+        """Return the weights as arrays, in the order of ``Configuration.shapes``."""
         return {
             name: torch.cat(parts, dim=1).detach().cpu().numpy() for name, parts in self._parts()
         }
 
 
-def applied_on(
+def apply_on_device(
     device: str, weights: Weights, configuration: Configuration, inputs: int, classes: int
 ) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
-    """Return what gives the class probabilities (n, classes) of a batch, computed on a device of
-    PyTorch.
+    """Return a function that gives the class probabilities (n, classes) of a batch.
 
-    They equal those of ``weights.Folded`` up to rounding.
+    It runs on a device of PyTorch.
+
+    They equal those of ``weights.NumpyNetwork`` up to rounding.
     """
     network = Network(configuration, inputs, classes).load(weights).to(device).eval()
 
@@ -99,9 +99,11 @@ def applied_on(
     return probabilities
 
 
-def chosen_device(device: str) -> str:
-    """Return ``cuda`` or ``cpu`` for a device option; DependencyError for cuda where there is
-    none."""
+def resolve_device(device: str) -> str:
+    """Return ``cuda`` or ``cpu`` for a device option.
+
+    DependencyError for cuda where there is none.
+    """
     cuda = torch.cuda.is_available()
     if device == "cuda" and not cuda:
         raise DependencyError(
@@ -112,13 +114,13 @@ def chosen_device(device: str) -> str:
 
 
 def tensors(pyramid: Pyramid, device: str = "cpu") -> Pyramid:
-    """A pyramid of tensors."""
+    """Return the pyramid with tensors for arrays."""
 
     def move(array):
         return torch.from_numpy(np.ascontiguousarray(array)).to(device)
 
     steps = (
-        Step(*(move(getattr(s, name)) for name in ("groups", "offsets", "near", "weights")))
+        Step(*(move(getattr(s, name)) for name in ("groups", "offsets", "nearest", "weights")))
         for s in pyramid.steps
     )
     return Pyramid(move(pyramid.inputs), tuple(steps))

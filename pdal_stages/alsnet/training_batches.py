@@ -1,5 +1,4 @@
-"""Which batches are trained on and how they are changed, and which ground is held out. No PyTorch
-here."""
+"""Batches that are trained on, their augmentation, and ground held out. No PyTorch here."""
 
 from __future__ import annotations
 
@@ -11,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..classifier.sampling import Folds
-from .batches import REACH, Circles
+from .batches import REACH, Batches
 
 
-def side_by_side(
+def join_clouds(
     clouds: Sequence[npt.NDArray[np.float64]], spacing: float
 ) -> npt.NDArray[np.float64]:
-    """All clouds as one, moved along x by whole spacings until no batch can hold points of two."""
+    """Join clouds, moved along x by whole spacings so that no batch holds points of two."""
     out: list[npt.NDArray[np.float64]] = []
     right = None
     for xyz in clouds:
@@ -29,9 +28,10 @@ def side_by_side(
     return np.concatenate(out)
 
 
-def spread(histogram: npt.NDArray[Any]) -> float:
-    """Standard deviation of a batch's class shares, per cent: large where one class is nearly all
-    [WM19].
+def histogram_deviation(histogram: npt.NDArray[Any]) -> float:
+    """Return the standard deviation of a batch's class shares, in per cent [WM19 4.1].
+
+    It is large where one class is nearly all.
 
     Infinite for a batch without labels.
     """
@@ -39,17 +39,17 @@ def spread(histogram: npt.NDArray[Any]) -> float:
     return float(np.std(histogram / total) * 100.0) if total else float("inf")
 
 
-def choose(
-    circles: Circles, labels: npt.NDArray[Any], n_classes: int, threshold: float
+def select_batches(
+    batches: Batches, labels: npt.NDArray[Any], n_classes: int, threshold: float
 ) -> list[int]:
-    """Batches whose classes are mixed; see ``NetworkOptions.histogram_threshold``.
+    """Return the numbers of batches with a variety of classes [WM19 4.1].
 
     Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels
     (n,) are class positions; -1 is not looked at.
     """
-    mine = (labels[circles.members(number)] for number in range(len(circles)))
-    histograms = [np.bincount(part[part >= 0], minlength=n_classes) for part in mine]
-    spreads = [spread(histogram) for histogram in histograms]
+    parts = (labels[batches.members(number)] for number in range(len(batches)))
+    histograms = [np.bincount(part[part >= 0], minlength=n_classes) for part in parts]
+    spreads = [histogram_deviation(histogram) for histogram in histograms]
     chosen = {number for number, value in enumerate(spreads) if value < threshold}
     for position in range(n_classes):
         having = [number for number, histogram in enumerate(histograms) if histogram[position]]
@@ -61,7 +61,7 @@ def choose(
 def hold_out(
     xyz: npt.NDArray[np.float64], labels: npt.NDArray[Any], share: float, block_size: float
 ) -> npt.NDArray[np.bool_]:
-    """Which labeled points (not -1) lie in the blocks held out for validation."""
+    """Return which labeled points (not -1) lie in the blocks held out for validation."""
     out, use = np.zeros(len(xyz), bool), np.flatnonzero(labels >= 0)
     if share == 0.0:
         return out
@@ -72,14 +72,14 @@ def hold_out(
     return out
 
 
-def covering(circles: Circles, wanted: npt.NDArray[np.bool_]) -> list[int]:
-    """Circles that hold every wanted point at least once, those with most of them first."""
+def cover(batches: Batches, wanted: npt.NDArray[np.bool_]) -> list[int]:
+    """Return batches that hold every wanted point at least once, those with most of them first."""
     left, out = wanted.copy(), []
-    numbers = circles.needed(np.flatnonzero(wanted)).tolist()
+    numbers = batches.holding(np.flatnonzero(wanted)).tolist()
     for number in sorted(
-        numbers, key=lambda number: -np.count_nonzero(wanted[circles.members(number)])
+        numbers, key=lambda number: -np.count_nonzero(wanted[batches.members(number)])
     ):
-        members = circles.members(number)
+        members = batches.members(number)
         if left[members].any():
             left[members] = False
             out.append(number)
@@ -87,7 +87,7 @@ def covering(circles: Circles, wanted: npt.NDArray[np.bool_]) -> list[int]:
 
 
 def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]:
-    """Weight of each class in the loss; their mean over the points is 1."""
+    """Return the weight of each class in the loss; their mean over the points is 1."""
     share = count / count.sum()
     if kind == "none":
         return np.ones(len(count))
@@ -95,17 +95,23 @@ def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]
     return weight / (weight * share).sum()
 
 
-#: Augmentation: most that a batch's center moves, in spacings; standard deviation of noise on
-#: coordinates, meters, cut at three times that; most points a batch loses, and fewest that are
-#: left.
-SHIFT, JITTER, THIN, LEAST = 0.5, 0.01, 0.4, 16
+#: Augmentation: most that a batch's center moves along x and y, in spacings.
+SHIFT = 0.5
+#: Augmentation: standard deviation of noise on coordinates, meters; it is cut at three times that.
+JITTER = 0.01
+#: Augmentation: largest share of points that a batch loses.
+THIN = 0.4
+#: Augmentation: fewest points that are left, where there are so many.
+LEAST = 16
 
 
-def augmented(
+def augment(
     xyz: npt.NDArray[np.float64], random: np.random.Generator
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """A batch turned about z, shaken and thinned: from coordinates (n, 3) around its center to (m,
-    3), and the rows kept."""
+    """Rotate a batch about z, shake and thin it.
+
+    Return coordinates (m, 3) and the rows kept, of coordinates (n, 3) around its center.
+    """
     share = 1.0 - random.uniform(0.0, THIN)
     kept = np.sort(
         random.permutation(len(xyz))[: max(min(LEAST, len(xyz)), round(share * len(xyz)))]
