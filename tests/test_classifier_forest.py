@@ -8,7 +8,8 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.classifier.random_forest import MAX_DEPTH, Forest, grow_forest
+from pdal_stages.classifier.grow_forest import Growth, grow_forest
+from pdal_stages.classifier.random_forest import MAX_DEPTH, Forest
 
 
 def data(n=600, features=17, classes=4, seed=0):
@@ -206,7 +207,9 @@ def test_growing_does_not_depend_on_threads_and_counts_weights():
     weight = np.ones(300, np.int64)
     weight[:50], weight[290:] = 3, 0
     setting = {"seed": 4, "min_samples_leaf": 2, "max_samples": 0.5}
-    one, other = (grow_forest(x, y, weight, 7, threads=threads, **setting) for threads in (1, 3))
+    one, other = (
+        grow_forest(x, y, weight, 7, Growth(threads=threads, **setting)) for threads in (1, 3)
+    )
     for name, array in one[0].arrays().items():
         assert np.array_equal(array, other[0].arrays()[name])
     assert np.array_equal(one[1], other[1]) and one[1].sum() == pytest.approx(1)
@@ -217,4 +220,4 @@ def test_growing_does_not_depend_on_threads_and_counts_weights():
 @pytest.mark.parametrize("asked", ["auto", "sqrt", 700, 0.1])
 def test_any_number_of_features_may_be_tried(asked):
     x, y = data(60)
-    grow_forest(x, y, np.ones(60, np.int64), 1, max_features=asked, seed=0)
+    grow_forest(x, y, np.ones(60, np.int64), 1, Growth(0, max_features=asked))

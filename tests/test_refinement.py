@@ -333,7 +333,7 @@ def test_two_passes_equal_the_passes_by_hand(base):
 def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monkeypatch):
     from test_classifier_context import reference
 
-    kept, inner = [], train_forest._ForestTraining._around
+    kept, inner = [], train_forest.ForestTraining._context_of_samples
 
     def keep(self, number, held_out=(), folds=None):
         found = inner(self, number, held_out, folds)
@@ -341,7 +341,7 @@ def test_the_second_is_trained_on_ground_that_the_first_has_not_seen(base, monke
             kept.append((self, folds, held_out, found))
         return found
 
-    monkeypatch.setattr(train_forest._ForestTraining, "_around", keep)
+    monkeypatch.setattr(train_forest.ForestTraining, "_context_of_samples", keep)
     model = on_top(base, passes=2, voxel=0, n=300)
     ((passes, folds, (forests,), context),) = kept
     (cloud,) = passes.clouds

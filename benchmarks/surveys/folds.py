@@ -23,9 +23,10 @@ from pdal_stages import Model, TrainingCloud
 from pdal_stages.classifier.context_features import HEIGHT, Context, count_shares
 from pdal_stages.classifier.feature_forest import FeatureForest
 from pdal_stages.classifier.fitted_features import CloudFeatures, Features
+from pdal_stages.classifier.grow_forest import Growth, grow_forest
 from pdal_stages.classifier.interface import PredictRequest
 from pdal_stages.classifier.load_model import load_model
-from pdal_stages.classifier.random_forest import Forest, grow_forest
+from pdal_stages.classifier.random_forest import Forest
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import FOLD_TREES, feature_plan
 from pdal_stages.classifier.training_clouds import label_classes
@@ -96,10 +97,10 @@ class GroupsLeftOut:
         self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int
     ) -> Forest:
         names = ("seed", "min_samples_leaf", "max_samples", "max_features")
-        setting = {name: getattr(OPTIONS, name) for name in names}
+        growth = Growth(**{name: getattr(OPTIONS, name) for name in names})
         values = np.asfortranarray(values[kept])
         label, weight = self.samples.label[kept], self.samples.weight[kept]
-        return grow_forest(values, label, weight, trees, **setting)[0]
+        return grow_forest(values, label, weight, trees, growth)[0]
 
     def _vote(self, group: str, values: npt.NDArray[np.float32], before: Votes) -> Votes:
         """Return a pass's votes for the clouds that are trained on, by forests that have seen neither the group nor the

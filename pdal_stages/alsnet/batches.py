@@ -101,9 +101,9 @@ class Batches:
         at, d2 = at[d2 <= self.reach**2], d2[d2 <= self.reach**2]
         if len(at) > size:
             limit = np.partition(d2, size - 1)[size - 1]
-            mine = d2 < limit
-            mine[np.flatnonzero(d2 == limit)[: size - np.count_nonzero(mine)]] = True
-            at = at[mine]
+            nearest = d2 < limit
+            nearest[np.flatnonzero(d2 == limit)[: size - np.count_nonzero(nearest)]] = True
+            at = at[nearest]
         return self._row[at]
 
     def members(self, number: int) -> npt.NDArray[np.int64]:
@@ -124,7 +124,7 @@ class Batches:
 
     def _place(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
         """Return the grid points (m, 2) of the batches and the most points (m,) of each."""
-        found: list[tuple[float, float, int]] = []
+        placed: list[tuple[float, float, int]] = []
         waiting = [(0, *part) for part in _parts(np.arange(len(self._xy)), self._xy, self.spacing)][
             ::-1
         ]
@@ -133,10 +133,10 @@ class Batches:
             side = self.spacing / 2.0**level
             x, y = (cell + 0.5) * side
             if size := self._fits(at, x, y, level):
-                found.append((x, y, size))
+                placed.append((x, y, size))
             else:
                 waiting += [(level + 1, *part) for part in _parts(at, self._xy, side / 2.0)][::-1]
-        table = np.array(found, dtype=np.float64).reshape(-1, 3)
+        table = np.array(placed, dtype=np.float64).reshape(-1, 3)
         return table[:, :2].copy(), table[:, 2].astype(np.int64)
 
     def _fits(self, at: npt.NDArray[np.int64], x: float, y: float, level: int) -> int:
@@ -145,10 +145,10 @@ class Batches:
             return 0
         far2 = float(((self._xy[at] - (x, y)) ** 2).sum(axis=1).max())
         radius = math.sqrt(far2) * (1.0 + 1e-9)
-        within = int(self._tree.query_ball_point((x, y), radius, return_length=True))
-        if within <= self.points:
+        count = int(self._tree.query_ball_point((x, y), radius, return_length=True))
+        if count <= self.points:
             return self.points
-        return 0 if level < DEEPEST else within
+        return 0 if level < DEEPEST else count
 
 
 def _parts(at: npt.NDArray[np.int64], xy: npt.NDArray[np.float64], side: float):

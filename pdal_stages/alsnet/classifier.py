@@ -57,31 +57,23 @@ class AlsNet:
         """Return the network that a pass of a manifest describes; ModelError for contradictions."""
         names, parameters = entry["feature_names"], entry["parameters"]
         n_features, n_classes = len(names), len(codes)
-        wanted, entries = (
-            {"configuration", "spacing", "inputs", "weights"},
-            parameters.get("inputs"),
-        )
-        listed = isinstance(entries, list) and all(isinstance(one, Mapping) for one in entries)
-        if set(parameters) != wanted or not listed:
+        inputs = parameters.get("inputs")
+        listed = isinstance(inputs, list) and all(isinstance(each, Mapping) for each in inputs)
+        if set(parameters) != {"configuration", "spacing", "inputs", "weights"} or not listed:
             raise ModelError(
                 "the network's parameters are not right", found=sorted(map(str, parameters))[:6]
             )
         configuration = parse_configuration(parameters["configuration"])
         spacing = checks.number("the network's spacing", parameters["spacing"], 1e-3, 1e6)
-        if (
-            [one.get("name") for one in entries] != names
-            or names != entry["dimensions"]
-            or entry["context"]
-        ):
+        input_names = [each.get("name") for each in inputs]
+        if input_names != names or names != entry["dimensions"] or entry["context"]:
             raise ModelError(
                 "the network's inputs are not the model's dimensions", found=repr(names)[:80]
             )
-        mean = tuple(
-            checks.number("an input's mean", one.get("mean"), -1e12, 1e12) for one in entries
-        )
-        scale = tuple(
-            checks.number("an input's scale", one.get("scale"), 1e-12, 1e12) for one in entries
-        )
+        means = [each.get("mean") for each in inputs]
+        scales = [each.get("scale") for each in inputs]
+        mean = tuple(checks.number("an input's mean", value, -1e12, 1e12) for value in means)
+        scale = tuple(checks.number("an input's scale", value, 1e-12, 1e12) for value in scales)
         needed = configuration.memory_mb(n_features)
         if needed > MOST_MB:
             raise ModelError(

@@ -123,7 +123,7 @@ class Configuration(Settings):
 
 
 def parse_configuration(
-    given: str | Mapping[str, Any] | Configuration, points: int | None = None
+    source: str | Mapping[str, Any] | Configuration, points: int | None = None
 ) -> Configuration:
     """Return a configuration by its name or from data; OptionError for others.
 
@@ -132,49 +132,49 @@ def parse_configuration(
     A mapping has ``points``, ``levels`` (each ``centers``, ``radius``, ``samples``, ``mlp``,
     ``up``) and optionally ``name``, ``head``, ``dropout``.
     """
-    if isinstance(given, str):
-        if given not in CONFIGURATIONS:
+    if isinstance(source, str):
+        if source not in CONFIGURATIONS:
             raise OptionError(
                 "the network configuration is not known",
-                found=repr(given)[:60],
-                cure=f"{suggest(given, CONFIGURATIONS)}Choose one of {', '.join(CONFIGURATIONS)}",
+                found=repr(source)[:60],
+                cure=f"{suggest(source, CONFIGURATIONS)}Choose one of {', '.join(CONFIGURATIONS)}",
             )
-        made = CONFIGURATIONS[given]
-    elif isinstance(given, Configuration):
-        made = given
-    elif isinstance(given, Mapping):
-        made = _from_mapping(given)
+        configuration = CONFIGURATIONS[source]
+    elif isinstance(source, Configuration):
+        configuration = source
+    elif isinstance(source, Mapping):
+        configuration = _from_mapping(source)
     else:
         raise OptionError(
-            "a network configuration must be a name or a mapping", found=repr(given)[:60]
+            "a network configuration must be a name or a mapping", found=repr(source)[:60]
         )
-    return made if points is None else replace(made, points=points)
+    return configuration if points is None else replace(configuration, points=points)
 
 
-def _from_mapping(given: Mapping[str, Any]) -> Configuration:
-    _only(given, Configuration, "a network configuration", ("points", "levels"))
-    if not isinstance(given["levels"], list | tuple):
-        raise OptionError("'levels' must be a list", found=repr(given["levels"])[:60])
+def _from_mapping(source: Mapping[str, Any]) -> Configuration:
+    _only(source, Configuration, "a network configuration", ("points", "levels"))
+    if not isinstance(source["levels"], list | tuple):
+        raise OptionError("'levels' must be a list", found=repr(source["levels"])[:60])
     levels = []
-    for level in given["levels"][:9]:
-        _only(level, Level, "a level", [one.name for one in fields(Level)])
+    for level in source["levels"][:9]:
+        _only(level, Level, "a level", [each.name for each in fields(Level)])
         levels.append(Level(**level))
-    return Configuration(**{"name": "own", **given, "levels": tuple(levels)})
+    return Configuration(**{"name": "own", **source, "levels": tuple(levels)})
 
 
-def _only(given: Any, kind: type, what: str, needed: Sequence[str] = ()) -> None:
+def _only(source: Any, kind: type, what: str, needed: Sequence[str] = ()) -> None:
     """Raise an OptionError for what is not a mapping of a dataclass's fields."""
-    if not isinstance(given, Mapping):
-        raise OptionError(f"{what} must be a mapping", found=repr(given)[:60])
-    known = [one.name for one in fields(kind)]
-    for name in given:
+    if not isinstance(source, Mapping):
+        raise OptionError(f"{what} must be a mapping", found=repr(source)[:60])
+    known = [each.name for each in fields(kind)]
+    for name in source:
         if name not in known:
             raise OptionError(
                 f"{what} has no '{str(name)[:40]}'",
                 cure=f"{suggest(str(name), known)}It may have: {', '.join(known)}",
             )
     for name in needed:
-        if name not in given:
+        if name not in source:
             raise OptionError(f"{what} needs '{name}'")
 
 

@@ -64,13 +64,13 @@ def _farthest(p, order, count, first):
         out[k] = order[now]
         far[now] = -1.0  # never chosen again, even where points coincide
         x, y, z = p[now, 0], p[now, 1], p[now, 2]
-        own = now // BUCKET
+        bucket = now // BUCKET
         top, at = -2.0, 0
         for b in range(buckets):
             dx = max(low[b, 0] - x, x - high[b, 0], 0.0)
             dy = max(low[b, 1] - y, y - high[b, 1], 0.0)
             dz = max(low[b, 2] - z, z - high[b, 2], 0.0)
-            if b == own or dx * dx + dy * dy + dz * dz < best[b]:
+            if b == bucket or dx * dx + dy * dy + dz * dz < best[b]:
                 value, where = -2.0, 0
                 for i in range(b * BUCKET, min(n, (b + 1) * BUCKET)):
                     dx, dy, dz = p[i, 0] - x, p[i, 1] - y, p[i, 2] - z
@@ -185,8 +185,8 @@ def join_pyramids(pyramids: Sequence[Pyramid]) -> Pyramid:
     if len(pyramids) == 1:
         return pyramids[0]
     steps = []
-    fine = [len(one.inputs) for one in pyramids]
-    for parts in zip(*(one.steps for one in pyramids), strict=True):
+    fine = [len(pyramid.inputs) for pyramid in pyramids]
+    for parts in zip(*(pyramid.steps for pyramid in pyramids), strict=True):
         coarse = [len(part.groups) for part in parts]
         above = np.concatenate(([0], np.cumsum(fine)[:-1])).astype(np.int32)
         below = np.concatenate(([0], np.cumsum(coarse)[:-1])).astype(np.int32)
@@ -199,4 +199,4 @@ def join_pyramids(pyramids: Sequence[Pyramid]) -> Pyramid:
             )
         )
         fine = coarse
-    return Pyramid(np.concatenate([one.inputs for one in pyramids]), tuple(steps))
+    return Pyramid(np.concatenate([pyramid.inputs for pyramid in pyramids]), tuple(steps))

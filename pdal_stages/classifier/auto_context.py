@@ -1,9 +1,11 @@
-"""Auto-context [TB10]: each pass reads, beside its features, the probabilities of the pass before around a point.
+"""Auto-context [TB10]: each pass reads the probabilities of the pass before around a point.
 
-The cloud is worked on in bands from south to north. A pass works on a band as soon as the pass before has done that band
-and the next one, so the features of a few bands are held, and those of a band serve all passes that read the same ones.
+The cloud is worked on in bands from south to north. A pass works on a band as soon as the pass
+before has done that band and the next one, so the features of a few bands are held, and those of a
+band serve all passes that read the same ones.
 
-[TB10] Tu and Bai 2010, Auto-context and its application to high-level vision tasks and 3D brain image segmentation.
+[TB10] Tu and Bai 2010, Auto-context and its application to high-level vision tasks and 3D brain
+image segmentation.
 """
 
 from __future__ import annotations
@@ -30,13 +32,13 @@ BAND = 75_000
 
 
 def plan_of(passes: Sequence[Any]) -> FeaturePlan | InputPlan:
-    """What all passes look at; the halo is the passes' own, one after the other."""
-    plans = [one.plan for one in passes]
+    """Return the inputs of all passes; each later pass adds its reach to the halo."""
+    plans = [each.plan for each in passes]
     if len(plans) == 1:
         return plans[0]
     halo_m = plans[0].halo_m
-    for one in passes[1:]:
-        halo_m = max(one.plan.halo_m, halo_m + one.context.reach)
+    for later in passes[1:]:
+        halo_m = max(later.plan.halo_m, halo_m + later.context.reach)
     return InputPlan(
         tuple(dict.fromkeys(name for plan in plans for name in plan.names)),
         tuple(dict.fromkeys(name for plan in plans for name in plan.dimensions)),
@@ -49,20 +51,22 @@ class FoldForests:
     """Forests that read the same, each grown without one fold, as one pass over one cloud."""
 
     forests: Sequence[FeatureForest]
-    fold: npt.NDArray[np.int16]  #: (n,) of every point of the cloud: the forest that judges it
+    fold: npt.NDArray[np.int16]  #: (n,) by point of the cloud: which forest classifies it
 
     @property
     def features(self) -> Any:
+        """What all forests read."""
         return self.forests[0].features
 
     @property
     def context(self) -> Context | None:
+        """What all forests read of the pass before."""
         return self.forests[0].context
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float64]:
-        """Of each point from the forest that has not seen its fold."""
+        """Return probabilities (b, classes) by the forests that have not seen the points' folds."""
         each, fold = {}, self.fold[rows]
         for number in np.unique(fold).tolist():
             each[number] = self.forests[number].probabilities(values[fold == number])
@@ -73,7 +77,7 @@ class FoldForests:
 
 
 class WeightedPass(NamedTuple):
-    """A pass, and what its probabilities are weighted by."""
+    """A pass, and the factors of its probabilities."""
 
     #: a FeatureClassifier, or as the first a CloudClassifier
     classifier: Any
@@ -95,7 +99,7 @@ def classify(passes: Sequence[WeightedPass], request: PredictRequest) -> Iterato
 def sample_context(
     passes: Sequence[WeightedPass], request: PredictRequest, context: Context
 ) -> npt.NDArray[np.float32]:
-    """Return the context (m, columns) that a further pass would read at the m rows wanted, which ascend."""
+    """Return the context (m, columns) that a further pass would read at the m rows wanted."""
     assert request.rows is not None
     width = len(context.names(passes[-1].codes))
     out = np.empty((len(request.rows), width), np.float32)
@@ -104,10 +108,10 @@ def sample_context(
     return out
 
 
-def _predict(one: WeightedPass, request: PredictRequest) -> Iterator[Block]:
+def _predict(first: WeightedPass, request: PredictRequest) -> Iterator[Block]:
     """Yield the weighted probabilities of a first pass that reads points instead of features."""
-    for block in one.classifier.predict(request):
-        yield block._replace(probabilities=weigh(block.probabilities, one.factors))
+    for block in first.classifier.predict(request):
+        yield block._replace(probabilities=weigh(block.probabilities, first.factors))
 
 
 class PassRun:
@@ -116,10 +120,12 @@ class PassRun:
     Parameters
     ----------
     passes : sequence of WeightedPass
-        The first may read points instead of features; all others read the context of the one before.
+        The first may read points instead of features; all others read the context of the one
+        before.
     request : PredictRequest
     context : Context, optional
-        With it the run gives the columns of this context, after the last pass, instead of probabilities.
+        With it the run gives the columns of this context, after the last pass, instead of
+        probabilities.
     """
 
     def __init__(
@@ -129,26 +135,29 @@ class PassRun:
         context: Context | None = None,
     ) -> None:
         self._passes, self._request = passes, request
-        read = [one.classifier.features for one in passes]
+        read = [each.classifier.features for each in passes]
         #: What each step reads of the pass before; the last step may be the context alone.
-        self._contexts = [None, *(one.classifier.context for one in passes[1:])]
+        self._contexts = [None, *(each.classifier.context for each in passes[1:])]
         if context is not None:
             self._contexts.append(context)
             read.append(None)
         self._last = len(read) - 1
         wanted = [request.rows]  # of each step
-        for one in self._contexts[:0:-1]:
-            wanted.insert(0, around(request.xyz, wanted[0], one))
+        for later in self._contexts[:0:-1]:
+            wanted.insert(0, around(request.xyz, wanted[0], later))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
-        width = max((one.strip for one in self._contexts[1:]), default=0.0) or 8.0
+        width = max((each.strip for each in self._contexts[1:]), default=0.0) or 8.0
         self._strips = Strips(request.xyz, wanted[0], width)
         n = len(self._strips)
         #: (n, classes) of each step but the last, in the order of the strips
-        self._shares = [np.zeros((n, len(one.codes)), np.uint16) for one in passes[: self._last]]
+        self._shares = [np.zeros((n, len(each.codes)), np.uint16) for each in passes[: self._last]]
         self._features = _share_sources(read, request)
 
     def blocks(self) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any]]]:
-        """Yield (rows in the request's cloud, probabilities or columns of the context) for all rows wanted."""
+        """Yield the rows wanted with probabilities, or columns of the context.
+
+        Rows are those of the request's cloud.
+        """
         if not self._request.count:
             return
         bands = self._strips.bands()
@@ -192,9 +201,9 @@ class PassRun:
         work = self._on_band(step, band)
         threads = self._request.threads
         if features in held:
-            for some, result in map_blocks(work.classify, held[features], threads):
-                if len(some):
-                    yield some, result
+            for kept, result in map_blocks(work.classify, held[features], threads):
+                if len(kept):
+                    yield kept, result
         elif features is not None and len(rows):
             held[features] = []
             run = features.run(rows, memory_share=0.5)
@@ -208,7 +217,10 @@ class PassRun:
             yield rows, work.result(rows, None)
 
     def _on_band(self, step: int, band: Band) -> _StepOnBand:
-        """Return what a step does with the blocks of a band, by the shares of the band and the strips beside it."""
+        """Return what a step does with the blocks of a band.
+
+        It reads the shares of the band and of the strips beside it.
+        """
         columns = None
         if context := self._contexts[step]:
             rows, request = self._strips.rows(band[1]), self._request
@@ -221,15 +233,18 @@ class PassRun:
                 self._passes[step - 1].codes,
                 None if height is None else np.asarray(height)[rows],
             )
-        one = self._passes[step] if step < len(self._passes) else None
+        weighted = self._passes[step] if step < len(self._passes) else None
         return _StepOnBand(
-            one, step < self._last, columns, self._strips, band[1].start, self._wanted[step]
+            weighted, step < self._last, columns, self._strips, band[1].start, self._wanted[step]
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _StepOnBand:
-    """What one step does with the blocks of one band; :meth:`compute` and :meth:`classify` are called in worker threads."""
+    """One step on the blocks of one band.
+
+    :meth:`compute` and :meth:`classify` are called in worker threads.
+    """
 
     weighted_pass: WeightedPass | None  #: None where the columns of the context are the result
     hands_on: bool  #: whether the result is shares for the next pass
@@ -243,7 +258,10 @@ class _StepOnBand:
     keep: bool = False  #: whether a later step needs the features
 
     def compute(self, part: tuple[int, int]) -> tuple[FeatureBlock, npt.NDArray[Any]]:
-        """Return a block of features, empty where no later step needs them, and what the step makes of it."""
+        """Return a block of features, and the result of the step.
+
+        Its values are dropped where no later step needs them.
+        """
         assert self.run is not None
         block = self.run.compute(part)
         result = self.result(block.rows, block.values)
@@ -262,7 +280,10 @@ class _StepOnBand:
     def result(
         self, rows: npt.NDArray[np.int64], values: npt.NDArray[np.float32] | None
     ) -> npt.NDArray[Any]:
-        """Return shares (b, classes) for the next pass, probabilities, or columns, from features (b, f) and context."""
+        """Return shares (b, classes), probabilities, or columns of the context.
+
+        They follow from features (b, f) and context.
+        """
         parts = [] if values is None else [values]
         if self.context is not None:
             parts.append(self.context.columns(self.strips.places(rows) - self.first_place))
@@ -277,7 +298,7 @@ class _StepOnBand:
 def _share_sources(
     read: Sequence[Features | None], request: PredictRequest
 ) -> list[CloudFeatures | None]:
-    """Return what computes the features of each step; steps that read the same features share it."""
+    """Return what computes the features of each step; equal features are computed once."""
     sources: dict[str, CloudFeatures] = {}
     out: list[CloudFeatures | None] = []
     for features in read:
@@ -296,7 +317,9 @@ Band = tuple[slice, slice]
 
 
 class Strips:
-    """Points in the order of strips of ground, each `width` meters from south to north; `rows` are looked at, None for all.
+    """Points in the order of strips of ground, each `width` meters, from south to north.
+
+    Only `rows` are looked at; None for all.
 
     Strips begin at multiples of the width.
     """
@@ -304,6 +327,7 @@ class Strips:
     def __init__(
         self, xyz: npt.NDArray[np.float64], rows: npt.NDArray[np.int64] | None, width: float
     ) -> None:
+        """Sort the rows by strip."""
         number = cell_numbers(xyz[:, 1] if rows is None else xyz[rows, 1], width)
         self._order: npt.NDArray[np.int64] | None = None
         if (
@@ -317,10 +341,11 @@ class Strips:
         self._start = np.append(np.flatnonzero(begins_run(number)), len(number))
 
     def __len__(self) -> int:
+        """Return the number of points that are looked at."""
         return int(self._start[-1])
 
     def bands(self) -> list[Band]:
-        """Strips that are worked on together."""
+        """Return strips that are worked on together."""
         start, last, out, first = self._start, len(self._start) - 1, [], 0
         while first < last:
             end = max(first + 1, int(np.searchsorted(start, start[first] + BAND, side="right")) - 1)
@@ -330,11 +355,11 @@ class Strips:
         return out
 
     def rows(self, part: slice) -> npt.NDArray[np.int64]:
-        """The points at some places."""
+        """Return the rows of the points at some places."""
         return np.arange(part.start, part.stop) if self._order is None else self._order[part]
 
     def places(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Where points lie in this order."""
+        """Return the places of some rows in the order of the strips."""
         return rows if self._order is None else self._place[rows].astype(np.int64)
 
 

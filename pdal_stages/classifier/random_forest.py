@@ -1,14 +1,14 @@
 """A random forest as plain arrays: grown by scikit-learn, checked, and applied.
 
-Trees are stored level by level (root, its children, theirs, ...). The children of the k-th split node of
-a tree (k from 0) are then its nodes 2k+1 and 2k+2, so no child pointers are needed. See docs/model-file.md.
+Trees are stored level by level (root, its children, theirs, ...). The children of the k-th split
+node of a tree (k from 0) are then its nodes 2k+1 and 2k+2, so no child pointers are needed. See
+docs/model-file.md.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,8 +16,6 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.jit import njit
-from ..base.progress import Progress
-from ..base.threads import map_blocks
 from .interface import ArrayRule
 
 #: Levels below the root a tree may have.
@@ -26,7 +24,8 @@ MAX_DEPTH = 10_000
 LANES = 8
 #: Rows that walk one tree before the next one's turn: their values stay in a core's cache.
 GROUP = 2048
-#: A node as it is walked. A leaf is its own left child under a threshold that is not a number, which nothing exceeds.
+#: A node as it is walked. A leaf is its own left child under a threshold that is not a number,
+#: which nothing exceeds.
 _NODE = np.dtype(
     [("threshold", np.float32), ("feature", np.uint32), ("left", np.uint32), ("leaf", np.uint32)]
 )
@@ -43,7 +42,8 @@ class Forest:
     feature: npt.NDArray[Any]  #: (nodes,) int16 or int32: which a split node compares, -1 in a leaf
     #: (nodes,) a row goes to the left child where its value <= threshold; 0 in a leaf
     threshold: npt.NDArray[np.float32]
-    #: (leaves, classes) training samples of each class in each leaf, leaves in the order of their nodes
+    #: (leaves, classes) training samples of each class in each leaf, leaves in the order of their
+    #: nodes
     leaf_counts: npt.NDArray[np.uint32]
     n_features: int
     depths: npt.NDArray[np.int32] = field(init=False)
@@ -56,6 +56,7 @@ class Forest:
     }
 
     def __post_init__(self) -> None:
+        """Check the arrays, and lay out the nodes as they are walked."""
         sizes, count = self.tree_sizes, len(self.feature)
         shapes = ", ".join(f"{name} {getattr(self, name).shape}" for name in self.rules)
         if (
@@ -89,18 +90,20 @@ class Forest:
 
     @property
     def n_classes(self) -> int:
+        """Number of classes."""
         return self.leaf_counts.shape[1]
 
     @property
     def n_trees(self) -> int:
+        """Number of trees."""
         return len(self.tree_sizes)
 
     @classmethod
     def from_sklearn(cls, trees: Sequence[Any], n_features: int) -> Forest:
         """Convert fitted scikit-learn trees.
 
-        `trees` are DecisionTreeClassifiers or their ``tree_``, trained on float32 features with whole-number sample
-        weights (bootstrap counts) and one output.
+        `trees` are DecisionTreeClassifiers or their ``tree_``, trained on float32 features with
+        whole-number sample weights (bootstrap counts) and one output.
         """
         parts = [_level_order(getattr(tree, "tree_", tree)) for tree in trees]
         kind = np.int16 if n_features <= np.iinfo(np.int16).max else np.int32
@@ -116,7 +119,7 @@ class Forest:
     def from_arrays(
         cls, arrays: Mapping[str, npt.NDArray[Any]], n_features: int, n_classes: int
     ) -> Forest:
-        """A forest from a model file's arrays; everything about them is checked."""
+        """Return the forest of a model file's arrays; everything about them is checked."""
         if arrays["leaf_counts"].shape[1] != n_classes:
             raise ModelError(
                 "the leaf table and the list of classes differ",
@@ -126,11 +129,11 @@ class Forest:
         return cls(**{name: np.array(arrays[name]) for name in cls.rules}, n_features=n_features)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays a model file stores."""
+        """Return the arrays that a model file stores."""
         return {name: getattr(self, name) for name in self.rules}
 
     def parameters(self) -> dict[str, Any]:
-        """What a model file says about the forest beside its arrays."""
+        """Return what a manifest says about the forest beside its arrays."""
         return {
             "trees": self.n_trees,
             "nodes": len(self.feature),
@@ -139,7 +142,7 @@ class Forest:
         }
 
     def predict_proba(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Class probabilities (n, classes) of rows of features (n, features); equal to scikit-learn's, bit for bit."""
+        """Return class probabilities (n, classes) of rows (n, features), as scikit-learn does."""
         values = np.ascontiguousarray(values, dtype=np.float32)
         if values.ndim != 2 or values.shape[1] != self.n_features:
             raise ModelError(
@@ -153,7 +156,7 @@ class Forest:
 
 @njit
 def walk(values, sizes, nodes, shares, out):
-    """Add each tree's class frequencies to `out`, (n, classes), for rows of `values`, (n, features)."""
+    """Add the class frequencies of all trees to `out` (n, classes), for rows (n, features)."""
     at = np.zeros(LANES, np.uint32)
     for first in range(0, len(values), GROUP):
         last = min(len(values), first + GROUP)
@@ -179,107 +182,15 @@ def walk(values, sizes, nodes, shares, out):
                         out[row + lane, c] += shares[leaf, c]
 
 
-def grow_forest(
-    values: npt.NDArray[np.float32],
-    label: npt.NDArray[Any],
-    weight: npt.NDArray[np.int64],
-    trees: int | Sequence[int],
-    *,
-    seed: int,
-    min_samples_leaf: int = 1,
-    max_samples: float = 1.0,
-    max_features: str | int | float = "auto",
-    max_depth: str | int | None = None,
-    vote: str = "mean",
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> tuple[Forest, npt.NDArray[np.float64]]:
-    """Grow a random forest, each tree on its own bootstrap sample.
-
-    Parameters
-    ----------
-    values : (n, features) float32
-        Finite; in Fortran order trees grow faster.
-    label : (n,) int
-        Class positions; every class occurs, if only with weight 0.
-    weight : (n,) int
-        Times a row counts; rows of weight 0 take no part.
-    trees : int or sequence of int
-        Number of trees; of several numbers the one with the highest out-of-bag accuracy [B16 4.2].
-    min_samples_leaf, max_samples, max_features, max_depth, vote
-        See ``TrainingOptions``.
-
-    Returns
-    -------
-    Forest, (features,) float64
-        The forest, and the features' importances, which sum to 1, or to 0.
-    """
-    from sklearn.tree import DecisionTreeClassifier
-
-    ends, features = np.cumsum(weight), values.shape[1]
-    draws = max(1, round(max_samples * int(ends[-1])))
-    if max_features == "auto":
-        max_features = max(1, math.isqrt(features), features // 10)
-    elif isinstance(max_features, int | np.integer):
-        max_features = min(int(max_features), features)
-    if max_depth == "sqrt":
-        max_depth = max(1, math.isqrt(features))
-    counts = [trees] if isinstance(trees, int) else sorted(trees)
-
-    def grow_tree(number: int) -> tuple[Any, npt.NDArray[np.bool_]]:
-        random = np.random.default_rng([seed, number])
-        drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
-        bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
-        state = int(random.integers(0, 2**31 - 1))
-        tree = DecisionTreeClassifier(
-            max_features=max_features,
-            max_depth=max_depth,
-            min_samples_leaf=min_samples_leaf,
-            random_state=state,
-        )
-        tree.fit(values, label, sample_weight=bag, check_input=False)
-        return tree, (bag == 0) & (weight > 0)
-
-    grown: list[Any] = []
-    accuracy: dict[int, float] = {}
-    shares = np.zeros((len(label) if len(counts) > 1 else 0, int(label.max()) + 1))
-    for tree, out_of_bag in map_blocks(grow_tree, range(counts[-1]), threads):
-        grown.append(tree)
-        if len(shares):
-            shares[out_of_bag] += tree.predict_proba(values[out_of_bag])
-            if len(grown) in counts:
-                judged = weight * shares.any(axis=1)
-                right = shares.argmax(axis=1) == label
-                accuracy[len(grown)] = float(right @ judged) / max(1, int(judged.sum()))
-        if progress is not None:
-            progress.update(1)
-    if accuracy:
-        grown = grown[: max(accuracy, key=lambda count: (accuracy[count], -count))]
-    importances = np.sum([tree.feature_importances_ for tree in grown], axis=0)
-    forest = Forest.from_sklearn([tree.tree_ for tree in grown], features)
-    if vote == "majority":
-        forest = replace(forest, leaf_counts=_winners(forest.leaf_counts))
-    return forest, importances / (importances.sum() or 1.0)
-
-
-def _winners(leaf_counts: npt.NDArray[np.uint32]) -> npt.NDArray[np.uint32]:
-    """Give all samples of each leaf (leaves, classes) to its most frequent class.
-
-    A tree then casts one vote, and the mean over the trees is the share of votes.
-    """
-    out = np.zeros_like(leaf_counts)
-    rows = np.arange(len(out))
-    out[rows, leaf_counts.argmax(axis=1)] = leaf_counts.sum(axis=1)
-    return out
-
-
 def _laid_out(
     sizes, feature, threshold, n_features: int
 ) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.int32]]:
-    """(each node's left child within its tree, of a leaf itself; each tree's depth); a ModelError where it is no tree.
+    """Return the left child of each node within its tree, and the depth of each tree.
 
-    Trees are stored level by level, so the children of a tree's k-th split node are its nodes 2k+1 and 2k+2: no child
-    pointers are stored, and no file can hold a cycle or a shared child.
+    Of a leaf it is itself. ModelError where the nodes are not trees.
+
+    Trees are stored level by level, so the children of a tree's k-th split node are its nodes 2k+1
+    and 2k+2: no child pointers are stored, and no file can hold a cycle or a shared child.
     """
     end = np.cumsum(sizes, dtype=np.int64)
     start = end - sizes
@@ -313,9 +224,10 @@ def _laid_out(
 
 
 def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """(feature, threshold, leaf counts) of a scikit-learn tree, level by level."""
+    """Return feature, threshold and leaf counts of a scikit-learn tree, level by level."""
     shares = tree.value[:, 0, :]
-    # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are whole.
+    # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are
+    # whole.
     exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]
     counts = np.rint(exact)
     if tree.n_outputs != 1 or np.abs(counts - exact).max(initial=0) > 1e-3 or counts.max() >= 2**32:
@@ -336,6 +248,6 @@ def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.N
 
 
 def float32_at_most(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """The largest float32 <= each float64: comparing a float32 with either gives the same answer."""
+    """Return the largest float32 <= each float64: a float32 compares alike with either."""
     near = values.astype(np.float32)
     return np.where(near > values, np.nextafter(near, np.float32(-np.inf)), near)

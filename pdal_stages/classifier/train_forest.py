@@ -1,4 +1,4 @@
-"""Training a forest: sample, compute features for the samples only, grow, score on ground held out."""
+"""Training a forest: samples, their features, growing, and a score on ground held out."""
 
 from __future__ import annotations
 
@@ -24,79 +24,66 @@ from .calibration import Calibration
 from .context_features import OWN, Context
 from .feature_forest import FeatureForest
 from .fitted_features import CloudFeatures, Features
+from .grow_forest import Growth, grow_forest
 from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
 from .interface import PredictRequest, weigh
 from .model import Model
-from .random_forest import Forest, grow_forest
+from .random_forest import Forest
 from .refinement import Blend, describe_refinement, trust
-from .sampling import BLOCK, Folds, draw_samples, figures, split
+from .sampling import BLOCK, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 
+#: Folds of the cross-validation by default.
+DEFAULT_FOLDS = 5
 #: Trees of a forest that judges a fold, as a share of the final one's.
 FOLD_TREES = 0.25
 #: Parts of the training ground held out in turn to train the passes after the first.
 PASS_FOLDS = 5
-#: In the counts: samples of tiles whose nearest neighbors lie beyond the halo of their features.
+#: Key of the count of samples of tiles whose nearest neighbors lie beyond the halo of their
+#: features.
 SHORT = "short_of_neighbors"
 
 optional_inputs = {**{name: (name,) for name in OPTIONAL_DIMENSIONS}, "returns": SOURCES}
 
 
 def outputs(options: TrainingOptions) -> list[Output]:
-    """The model alone."""
+    """Return no file: the model is the only one."""
     return []
 
 
-def own_options(given: Any) -> None:
-    """A forest has none beside ``TrainingOptions``."""
+def own_options(options: Any) -> None:
+    """Return None: a forest has no options beside ``TrainingOptions``."""
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
-    """Dimensions used as features, by the forest or by the model it is built on."""
-    own = feature_plan(options).dimensions
-    return (
-        own if options.base is None else tuple(dict.fromkeys([*own, *options.base.plan.dimensions]))
-    )
+    """Return dimensions used as features, by the forest or the model it is built on."""
+    dimensions = feature_plan(options).dimensions
+    if options.base is None:
+        return dimensions
+    return tuple(dict.fromkeys([*dimensions, *options.base.plan.dimensions]))
 
 
 def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
-    """See :func:`pdal_stages.classifier.train`."""
-    return _ForestTraining(clouds, options, progress).model()
+    """Train a forest, see :func:`pdal_stages.classifier.train`."""
+    return ForestTraining(clouds, options, progress).model()
 
 
-class _ForestTraining:
+class ForestTraining:
     """Samples of labeled clouds and what is computed of them."""
 
     def __init__(
         self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool
     ) -> None:
+        """Draw samples, and compute their features."""
         self.clouds, self.options, self.base = clouds, options, options.base
         self.progress = partial(Progress, enabled=progress)
-        if options.groups and required_dimensions((options.groups,)) != (options.groups,):
-            raise OptionError(
-                "'groups' must name a dimension other than coordinates and what is made of them",
-                found=options.groups,
-            )
-        for cloud in clouds if options.groups else ():  # before any work: it may be missing
-            take_dimensions(
-                (options.groups,), cloud.dimensions, len(cloud), np.zeros(0, np.int64), cloud.name
-            )
+        if options.groups:  # before any work: it may be missing
+            _check_groups(clouds, options.groups)
         self.labeled = label_classes(clouds, options, progress)
         self.codes = self.labeled.classes.codes
         self.surveys = [cloud.survey for cloud in clouds]
-        shares = [f"{cloud.survey} {cloud.copy}" for cloud in clouds]
-        total = sum(map(len, clouds)) * (1 + len(self.codes))  # which are read for each class
-        with self.progress(total, "drawing samples") as bar:
-            self.samples = draw_samples(
-                self.labeled,
-                len(self.codes),
-                options.count,
-                options.seed,
-                shares,
-                random_order=options.sampling == "random",
-                progress=bar,
-            )
+        self.samples = self._draw_samples()
         weight = self.samples.weight
         drawn = np.bincount(self.samples.label, weight, len(self.codes))
         frequent = np.array(self.samples.available) / drawn
@@ -104,18 +91,12 @@ class _ForestTraining:
         self.stands_for = weight * frequent[self.samples.label]
         factors = frequent**options.prior_weight
         self.factors = factors / factors.max() if options.prior_weight else None
-        self.short = (
-            0  # samples of tiles whose nearest neighbors lie beyond the halo of their features
-        )
-        plan = feature_plan(options)
-        used = [clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
-        bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
-        if options.copt_threshold is not None:
-            threshold = options.copt_threshold
-        self.features = Features(plan, bins, threshold, options.seed)
-        self.own = self._features_of_samples()
+        #: samples of tiles whose nearest neighbors lie beyond the halo of their features
+        self.short = 0
+        self.features = self._fit_features()
+        self.values = self._features_of_samples()
         if options.scaling == "percentiles":
-            limit_to_percentiles(self.own, plan)
+            limit_to_percentiles(self.values, self.features.plan)
         context = Context(tuple(options.context))
         if options.passes > 1 or self.base is not None:
             codes = self.codes if self.base is None else self.base.codes.tolist()
@@ -123,28 +104,58 @@ class _ForestTraining:
         self.reads: list[Context | None] = [None, *[context] * (options.passes - 1)]
         self.blends = self._blends()
         #: What the first pass reads of the samples.
-        self.first = self.own
-        if self.base is not None:  # which has not seen their labels, so no ground need be held out
+        self.first = self.values
+        if self.base is not None:  # it has not seen the labels, so no ground need be held out
             self.reads[0] = context if options.passes == 1 else Context((OWN,))
-            self.first = _beside(self.own, self._around(0))
+            self.first = _join_columns(self.values, self._context_of_samples(0))
         self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
-        share = options.max_samples
-        if share is None:
-            each = int(weight.sum()) / len(self.codes)
-            share = min(1.0, min(max(each / 3, LEAST_PER_TREE), PER_TREE) / each)
-        self.setting: dict[str, Any] = {
-            "seed": options.seed,
-            "min_samples_leaf": options.min_samples_leaf,
-            "max_samples": share,
-            "max_features": options.max_features,
-            "max_depth": options.max_depth,
-            "vote": options.vote,
-            "threads": options.threads,
-        }
+        self.growth = self._growth()
         self.fold_trees = max(1, math.ceil(options.trees * FOLD_TREES))
 
+    def _draw_samples(self) -> Samples:
+        """Draw as many samples of each class."""
+        options = self.options
+        groups = [f"{cloud.survey} {cloud.copy}" for cloud in self.clouds]
+        # All points are read once, and once more for each class.
+        total = sum(map(len, self.clouds)) * (1 + len(self.codes))
+        with self.progress(total, "drawing samples") as bar:
+            return draw_samples(
+                self.labeled,
+                len(self.codes),
+                options.count,
+                options.seed,
+                groups,
+                random_order=options.sampling == "random",
+                progress=bar,
+            )
+
+    def _fit_features(self) -> Features:
+        """Fit what the features need to the clouds that have samples."""
+        options, plan = self.options, feature_plan(self.options)
+        used = [self.clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
+        bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
+        if options.copt_threshold is not None:
+            threshold = options.copt_threshold
+        return Features(plan, bins, threshold, options.seed)
+
+    def _growth(self) -> Growth:
+        """Return how trees are grown; by default each draws a third of the samples, in bounds."""
+        options, share = self.options, self.options.max_samples
+        if share is None:
+            per_class = int(self.samples.weight.sum()) / len(self.codes)
+            share = min(max(per_class / 3, LEAST_PER_TREE), PER_TREE) / per_class
+        return Growth(
+            options.seed,
+            options.min_samples_leaf,
+            min(1.0, share),
+            options.max_features,
+            options.max_depth,
+            options.vote,
+            options.threads,
+        )
+
     def _features_of_samples(self) -> npt.NDArray[np.float32]:
-        """(samples, features), filled cloud by cloud."""
+        """Compute the features (samples, features) cloud by cloud."""
         o, samples, names = self.options, self.samples, self.features.plan.names
         if (needed := 4 * len(samples) * len(names)) > free_memory():
             raise OptionError(
@@ -171,26 +182,23 @@ class _ForestTraining:
         return values
 
     def _blends(self) -> Sequence[Blend | None]:
-        """What each pass on top of a base makes of the one before."""
+        """Return how each pass on top of a base changes the pass before."""
         o = self.options
         out: list[Blend] = []
         if self.base is None:
             return [None] * o.passes
-        before, trusted = (
-            self.base.codes.tolist(),
-            trust(int(np.bincount(self.samples.label).min())),
-        )
+        before = self.base.codes.tolist()
+        trusted = trust(int(np.bincount(self.samples.label).min()))
         for _ in range(o.passes):
             out.append(Blend(tuple(before), tuple(self.codes), trusted, o.target))
             before = out[-1].codes
-        if (
-            o.passes > 1 and self.factors is not None
-        ):  # a few labels say nothing of how frequent a class is
+        # With one pass labels are few, and tell nothing of how frequent a class is.
+        if o.passes > 1 and self.factors is not None:
             out[-1] = replace(out[-1], factors=tuple(self.factors.tolist()))
         return out
 
     def model(self) -> Model:
-        """Score, grow, and put together."""
+        """Score, grow all passes, and return the model."""
         o, base = self.options, self.base
         validation, notes = self._validate()
         forests, importances = self._passes()
@@ -203,7 +211,7 @@ class _ForestTraining:
             "count": o.count,
             "seed": o.seed,
             "samples": len(self.samples),
-            "max_samples": self.setting["max_samples"],
+            "max_samples": self.growth.max_samples,
             "max_features": o.max_features,
             "min_samples_leaf": o.min_samples_leaf,
             "max_depth": o.max_depth,
@@ -232,7 +240,7 @@ class _ForestTraining:
         )
 
     def _codes_after(self, number: int) -> Sequence[int]:
-        """The classes of a pass."""
+        """Return the classes of a pass."""
         blend = self.blends[number]
         return self.codes if blend is None else blend.codes
 
@@ -243,7 +251,8 @@ class _ForestTraining:
         trees: int | Sequence[int],
         bar: Progress,
     ) -> tuple[Forest, npt.NDArray[np.float64]]:
-        return grow_forest(values, self.samples.label, weight, trees, progress=bar, **self.setting)
+        """Grow a forest on the samples, and return its importances."""
+        return grow_forest(values, self.samples.label, weight, trees, self.growth, bar)
 
     def _without_each(
         self,
@@ -253,7 +262,10 @@ class _ForestTraining:
         gap: float = 0.0,
         needed: int = 2,
     ) -> Iterator[tuple[npt.NDArray[np.int64], Forest]]:
-        """For each fold the samples held out, and a forest grown on those that are farther from them than `gap` meters.
+        """Yield for each fold the samples held out, and a forest grown without them.
+
+        Samples within `gap` meters of the fold are left out as well. OptionError where fewer than
+        `needed` classes are left.
 
         OptionError where so few samples are left that fewer classes have any than are `needed`.
         """
@@ -264,34 +276,33 @@ class _ForestTraining:
                 there = np.bincount(label[train], minlength=len(self.codes)) > 0
                 if np.count_nonzero(there) < needed:
                     raise OptionError(
-                        f"without fold {number + 1} and its gap of {gap:g} m a class has no samples left",
+                        f"without fold {number + 1} and its gap of {gap:g} m a class has no "
+                        "samples left",
                         found=f"class {self.codes[int(np.argmin(there))]}",
                         cure="Give more training data, or set passes to 1",
                     )
                 yield rows, self._grow(values, weight * train, self.fold_trees, bar)[0]
 
-    # ---- score ---------------------------------------------------------------------------------------------
-
     def _validate(self) -> tuple[dict[str, Any] | None, dict[str, str]]:
-        """The cross-validation for the manifest, over groups or surveys where there are several, else over blocks; and
-        why there is none, where one was wanted."""
+        """Return the cross-validation for the manifest, and why there is none.
+
+        It holds out groups or surveys where there are several, else blocks of ground.
+        """
         o, samples, codes = self.options, self.samples, self.codes
         if o.folds == 0:
             return None, {}
-        folds, gap = (
-            o.folds or 5,
-            max((one.reach or 0.0 for one in self.features.plan.neighborhoods), default=0.0),
-        )
+        folds = o.folds or DEFAULT_FOLDS
+        reaches = (each.reach or 0.0 for each in self.features.plan.neighborhoods)
+        gap = max(reaches, default=0.0)
         group = samples.take(self._groups)
         names, index = np.unique(group, return_inverse=True)
-        asked = {"groups": o.groups} if o.groups else {}
+        by_groups = {"groups": o.groups} if o.groups else {}
         for by in (["groups" if o.groups else "surveys"] if len(names) > 1 else []) + ["blocks"]:
             self.calibration = Calibration(
                 about=f"{by} held out, forests of {self.fold_trees} trees"
             )
-            here = (
-                0.0 if by == "surveys" else gap
-            )  # which do not see each other, whatever their coordinates
+            # Surveys do not see each other, whatever their coordinates.
+            here = 0.0 if by == "surveys" else gap
             try:
                 if by == "blocks":
                     blocks = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK)
@@ -303,54 +314,58 @@ class _ForestTraining:
                 for rows, forest in each:
                     p = forest.predict_proba(self.first[rows])
                     np.add.at(matrix, (samples.label[rows], p.argmax(axis=1)), samples.weight[rows])
-                    self._count_sure(rows, p)
+                    self._calibrate(rows, p)
             except OptionError as error:  # too little ground, or a class in one place
                 reason = f"{error.what}: {error.found}"
                 if by == "groups":
-                    asked["instead"] = reason
+                    by_groups["instead"] = reason
                 continue
             score = {"trees": self.fold_trees, **figures(matrix, codes)}
             more = {"folds": int(fold.max()) + 1, "block_size": BLOCK, "gap": here, "chosen": score}
-            return {"by": by, **asked, **more}, {}
+            return {"by": by, **by_groups, **more}, {}
         return None, {"unscored": self._unscored(reason, gap)}
 
     def _groups(self, number: int) -> npt.NDArray[Any]:
-        """What a cloud's points are held out with: their `groups`, or all of them with the survey."""
+        """Return the group (n,) that each of a cloud's points is held out with."""
         cloud, name = self.clouds[number], self.options.groups
         if not name:
             return np.broadcast_to(np.array(cloud.survey), len(cloud))
         return take_dimensions((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
 
-    def _count_sure(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
-        """Count in how far samples that were held out were right where they were sure, as the points lie."""
+    def _calibrate(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
+        """Count right and wrong samples that were held out, by reliability."""
         blend = self.blends[0]
         if blend is None:
             p = weigh(p, self.factors)
         elif self.options.target is not None:
-            return  # what the others truly are is not known
+            return  # the true classes of the others are not known
         else:
-            p = replace(blend, factors=None)(self._said_by_base(rows), p)
-        given = np.asarray(self._codes_after(0))[p.argmax(axis=1)]
+            p = replace(blend, factors=None)(self._base_probabilities(rows), p)
+        predicted = np.asarray(self._codes_after(0))[p.argmax(axis=1)]
         true = np.asarray(self.codes)[self.samples.label[rows]]
-        self.calibration.add(given, true, p.max(axis=1), self.stands_for[rows])
+        self.calibration.add(predicted, true, p.max(axis=1), self.stands_for[rows])
 
     def _unscored(self, reason: str, gap: float) -> str:
-        """Why there is no score, and which class to label next, and where not: that of the fewest blocks of ground."""
+        """Return why there is no score, and which class to label next, and where.
+
+        It is the class on the fewest blocks of ground.
+        """
         cell = np.floor(self.xy / BLOCK)
-        mine = [self.samples.label == place for place in range(len(self.codes))]
-        least = int(np.argmin([len(np.unique(cell[one], axis=0)) for one in mine]))
-        x, y = (self.xy[mine[least]].min(axis=0) + self.xy[mine[least]].max(axis=0)) / 2
+        of_class = [self.samples.label == place for place in range(len(self.codes))]
+        least = int(np.argmin([len(np.unique(cell[rows], axis=0)) for rows in of_class]))
+        xy = self.xy[of_class[least]]
+        x, y = (xy.min(axis=0) + xy.max(axis=0)) / 2
         return (
-            f"there is no score on ground held out: {reason}. Label next, at least {BLOCK + gap:.0f} m away: "
-            f"{self.codes[least]} {self.labeled.classes.names[least]}, which lies around {x:.0f}, {y:.0f}"
+            f"there is no score on ground held out: {reason}. Label next, at least "
+            f"{BLOCK + gap:.0f} m away: "
+            f"{self.codes[least]} {self.labeled.classes.names[least]}, which lies around {x:.0f}, "
+            f"{y:.0f}"
         )
 
-    # ---- passes --------------------------------------------------------------------------------------------
-
     def _passes(self) -> tuple[list[FeatureForest], list[list[float]]]:
-        """One forest after the other, each reading what the one before says of ground it has not seen."""
+        """Grow one forest after the other; each reads the one before on ground it has not seen."""
         o, samples = self.options, self.samples
-        made, importances = [], []
+        forests, importances = [], []
         held_out: list[list[FeatureForest]] = []
         values, folds = self.first, None
         if o.passes > 1:
@@ -362,82 +377,101 @@ class _ForestTraining:
             )
         for number in range(o.passes):
             if number:
-                # Ground beside a fold is not left out as for the score: the forests miss the fold's samples already,
-                # and the next pass should see probabilities as good as those it will see when the model is used.
+                # Ground beside a fold is not left out as for the score: the forests miss the fold's
+                # samples already, and the next pass should see probabilities as good as those it
+                # will see when the model is used.
                 each = self._without_each(values, fold, f"pass {number} without each fold")
                 held_out.append([self._read_by(number - 1, forest) for _, forest in each])
-                values = _beside(self.own, self._around(number, held_out, folds))
+                values = _join_columns(
+                    self.values, self._context_of_samples(number, held_out, folds)
+                )
             grid: Sequence[int] = o.trees_grid or (o.trees,)
             with self.progress(grid[-1], f"growing pass {number + 1}", "trees") as bar:
                 forest, shares = self._grow(values, samples.weight, grid, bar)
-            made.append(self._read_by(number, forest))
+            forests.append(self._read_by(number, forest))
             importances.append(shares.tolist())
-        return made, importances
+        return forests, importances
 
     def _read_by(self, number: int, forest: Forest) -> FeatureForest:
-        """A forest with what a pass reads."""
+        """Return a forest with what a pass reads."""
         return FeatureForest(self.features, forest, self.reads[number], self.blends[number])
 
-    def _around(
+    def _context_of_samples(
         self,
         number: int,
         held_out: Sequence[Sequence[FeatureForest]] = (),
         folds: Folds | None = None,
     ) -> npt.NDArray[np.float32]:
-        """(samples, columns): what a pass reads of those before, a base's and forests that have not seen the samples."""
+        """Return the context (samples, columns) that a pass reads of those before.
+
+        These are the passes of a base, and forests that have not seen the samples.
+        """
         o, context = self.options, self.reads[number]
         assert context is not None
         base = [] if self.base is None else self.base.weighted_passes
         codes = self._codes_after(number - 1) if number else base[-1].codes
         out = np.empty((len(self.samples), len(context.names(codes))), np.float32)
         with self.progress(
-            len(out), f"context for pass {number + 1}" if number else "what the base says"
+            len(out), f"context for pass {number + 1}" if number else "context by the base"
         ) as bar:
             for place, cloud in enumerate(self.clouds):
                 at, rows = self.samples.of_cloud(place)
                 if not len(at):
                     continue
-                mine = []
+                later: list[WeightedPass] = []
                 if folds is not None:
                     fold = folds.points(cloud.xyz, self.surveys[place])
-                    each = (FoldForests(forests, fold) for forests in held_out)
-                    mine = [WeightedPass(one, self._codes_after(k)) for k, one in enumerate(each)]
+                    later = [
+                        WeightedPass(FoldForests(forests, fold), self._codes_after(k))
+                        for k, forests in enumerate(held_out)
+                    ]
                 request = PredictRequest(
                     cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar
                 )
-                out[at] = sample_context([*base, *mine], request, context)
+                out[at] = sample_context([*base, *later], request, context)
         return out
 
-    # ---- on top of a base ----------------------------------------------------------------------------------
-
-    def _said_by_base(self, rows: Any = slice(None)) -> npt.NDArray[np.float64]:
-        """(m, classes) the base's probabilities of samples themselves."""
+    def _base_probabilities(self, rows: Any = slice(None)) -> npt.NDArray[np.float64]:
+        """Return the probabilities (m, classes) of the base at samples."""
         context = self.reads[0]
         assert context is not None
-        return context.own(self.first[rows, self.own.shape[1] :], len(self.base.classes))
+        return context.own(self.first[rows, self.values.shape[1] :], len(self.base.classes))
 
     def _held_by_base(self) -> dict[str, Any]:
-        """Labeled classes new to the base: [different samples, of these what it calls a class that the labels lack].
+        """Return by new class the samples, and those that the base calls a class without labels.
 
         Such points stay what the base calls them.
         """
         if self.base is None or self.options.target is not None:
             return {}
-        said, out = self.base.codes[self._said_by_base().argmax(axis=1)], {}
+        by_base, out = self.base.codes[self._base_probabilities().argmax(axis=1)], {}
         for place, code in enumerate(self.codes):
-            mine = self.samples.label == place
-            held = int(np.count_nonzero(~np.isin(said[mine], self.codes)))
+            rows = self.samples.label == place
+            held = int(np.count_nonzero(~np.isin(by_base[rows], self.codes)))
             if code not in self.base.codes and held:
-                out[str(code)] = [int(np.count_nonzero(mine)), held]
+                out[str(code)] = [int(np.count_nonzero(rows)), held]
         return {"held_by_base": out} if out else {}
+
+
+def _check_groups(clouds: Sequence[TrainingCloud], dimension: str) -> None:
+    """Raise an error where the dimension of groups is computed or missing."""
+    if required_dimensions((dimension,)) != (dimension,):
+        raise OptionError(
+            "'groups' must name a dimension other than coordinates and what is made of them",
+            found=dimension,
+        )
+    no_rows = np.zeros(0, np.int64)
+    for cloud in clouds:
+        take_dimensions((dimension,), cloud.dimensions, len(cloud), no_rows, cloud.name)
 
 
 def limit_to_percentiles(values: npt.NDArray[np.float32], plan: FeaturePlan) -> None:
     """Limit features (n, features) of samples to their 1st and 99th percentile, in place.
 
-    The lower limit is 0 where the minimum is 0; shape distributions are not limited [B16 3.3, W18 3.2]. A linear map
-    to [0, 1] would change nothing for trees but the place of rounding. Thresholds lie between the limits, so a value
-    beyond one takes the same branch as the limit itself, and points to classify need none of this.
+    The lower limit is 0 where the minimum is 0; shape distributions are not limited [B16 3.3, W18
+    3.2]. A linear map to [0, 1] would change nothing for trees but the place of rounding.
+    Thresholds lie between the limits, so a value beyond one takes the same branch as the limit
+    itself, and points to classify need none of this.
     """
     bins = {part.at[name] for part in plan.layout for name in part.at if name in SHAPE_FEATURES}
     measures = [column for column in range(len(plan.names)) if column not in bins]
@@ -446,7 +480,8 @@ def limit_to_percentiles(values: npt.NDArray[np.float32], plan: FeaturePlan) -> 
     values[:, measures] = np.clip(values[:, measures], low, high)
 
 
-def _beside(
+def _join_columns(
     values: npt.NDArray[np.float32], more: npt.NDArray[np.float32]
 ) -> npt.NDArray[np.float32]:
+    """Return both side by side, in Fortran order."""
     return np.asfortranarray(np.concatenate([values, more], axis=1))
