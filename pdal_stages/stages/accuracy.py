@@ -1,6 +1,4 @@
-"""``filters.accuracy``: compare a class dimension with a reference, report figures [B16 4.3, W18
-4.3].
-"""
+"""``filters.accuracy``: compare a class dimension with a reference [B16 4.3, W18 4.3]."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ from .options import option
 from .points import Points
 from .selection import Selection
 
-#: Parts of what HIGH stands for where vegetation is one class.
+#: Classes that count as HIGH where vegetation is one class.
 LOWER = (LOW, MEDIUM)
 
 
@@ -50,7 +48,10 @@ class AccuracyStage(Stage):
     type = "filters.accuracy"
     summary = "Compare a class dimension with a reference dimension; report as table, JSON and HTML"
     source = "[B16] section 4.3, [W18] section 4.3"
-    instead_of_tiles = "Write the files first, then compare them: pdal-stages accuracy FILE --reference-dimension Reference"
+    instead_of_tiles = (
+        "Write the files first, then compare them: "
+        "pdal-stages accuracy FILE --reference-dimension Reference"
+    )
     where_help = "Only points inside are compared"
     needs_points = "compare"
     dimension: str = option("string", "Classification", "The classes to judge")
@@ -108,8 +109,8 @@ class AccuracyStage(Stage):
 
     def outputs(self) -> list[Output]:
         """Return the files that are written."""
-        found = [(self.json, "json", JSON), (self.html, "html", HTML)]
-        return [Output(path, what, kind) for path, what, kind in found if path]
+        files = [(self.json, "json", JSON), (self.html, "html", HTML)]
+        return [Output(path, what, kind) for path, what, kind in files if path]
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
@@ -121,9 +122,7 @@ class AccuracyStage(Stage):
         return {}
 
     def compare(self, parts: Sequence[tuple[str, Points]], report: Report) -> None:
-        """Compare the points of several files by one rule: a table of each, and one of all
-        together.
-        """
+        """Compare the points of several files: a table of each, and one of all together."""
         sides = [self._sides(points) for _, points in parts]
         rule = self._rule(sides, report)
         each = [
@@ -140,13 +139,13 @@ class AccuracyStage(Stage):
             if len(each) > 1:
                 print(plain(by_file([name for name, _ in parts], each)), file=out)
             print(plain(accuracy.table()), file=out)
-        with whole_files(*(one.path for one in self.outputs())) as files:
+        with whole_files(*(output.path for output in self.outputs())) as files:
             if self.json:
                 written = accuracy.to_dict()
                 if len(each) > 1:
                     written["files"] = [
-                        {"name": name, **summary(one)}
-                        for (name, _), one in zip(parts, each, strict=True)
+                        {"name": name, **summary(measures)}
+                        for (name, _), measures in zip(parts, each, strict=True)
                     ]
                 files[0].write_bytes((json.dumps(written, indent=1) + "\n").encode())
             if self.html:
@@ -162,7 +161,7 @@ class AccuracyStage(Stage):
         )
 
     def _sides(self, points: Points) -> Sides:
-        """What is compared of some points."""
+        """Return the classes of both sides, of the points that are compared."""
         chosen = Selection.parse(["withheld"], "ignore") if self.ignore is None else self.ignore
         inside = points.usable(replace(chosen, codes=()))  # codes are of the reference
         confidence: dict[str, Any] = {
@@ -176,9 +175,7 @@ class AccuracyStage(Stage):
         return Sides(reference, predicted, confidence, inside)
 
     def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
-        """`classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`: see the stage's
-        page.
-        """
+        """Return `classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`."""
         ignore = None if self.ignore is None else list(self.ignore.codes)
         rule: dict[str, Any] = {
             "classes": self.classes or None,
@@ -204,14 +201,14 @@ class AccuracyStage(Stage):
         if self.merge is not None or self.classes:
             return rule
         # Vegetation is one class where only one was predicted.
-        true = {code for one in sides for code in np.unique(one.reference).tolist()}
-        given = {code for one in sides for code in np.unique(one.predicted).tolist()}
+        true = {code for side in sides for code in np.unique(side.reference).tolist()}
+        predicted = {code for side in sides for code in np.unique(side.predicted).tolist()}
         target = Merge.parse(rule["merge"]).target_of
         parts = [code for code in LOWER if code in true and target[code] == code]
         if (
             parts
-            and HIGH in (given if known is None else known)
-            and not {*LOWER} & {*(known or ()), *given}
+            and HIGH in (predicted if known is None else known)
+            and not {*LOWER} & {*(known or ()), *predicted}
             and target[HIGH] == HIGH
         ):
             rule["merge"] = {**(rule["merge"] or {}), HIGH: sorted({HIGH, *LOWER})}
@@ -247,8 +244,8 @@ class AccuracyStage(Stage):
         ):
             importances = model.importances("column")  # networks have none
         shown = [
-            Place(name, points.xyz[one.inside], one.reference, one.predicted)
-            for (name, points), one in zip(parts, sides, strict=True)
+            Place(name, points.xyz[side.inside], side.reference, side.predicted)
+            for (name, points), side in zip(parts, sides, strict=True)
         ]
         write_accuracy_report(
             path,
@@ -261,8 +258,9 @@ class AccuracyStage(Stage):
 
 
 def _one_code_system(trained: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a model's labels and codes mean the same; not where label 5 became 6, and 8 became
-    5.
+    """Return whether labels and codes of a model mean the same.
+
+    They do not where label 5 became code 6, and label 8 code 5.
     """
     class_of = {label: c["code"] for c in trained for label in c["labels"]}
     return all(class_of.get(c["code"], c["code"]) == c["code"] for c in trained)

@@ -18,7 +18,7 @@ from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.load_model import loaded_model
 from ..classifier.model import Model
 from ..classifier.model_file import find
-from ..classifier.prediction import UNCLASSIFIED
+from ..classifier.prediction import UNCLASSIFIED, Prediction
 from .base import Stage
 from .context import WHOLE_CLOUD, StageContext
 from .options import code_option, ignore_option, keep_option, option
@@ -27,12 +27,16 @@ from .preprocessing import OF_PDAL, as_json, same, with_given_ground
 from .registry import stage_type
 from .selection import Selection
 
+#: Dimension of the height above ground.
 HEIGHT = "HeightAboveGround"
-#: Where points have no Ground, they lie this near to given ground or do not become ground, meters:
-#: the default threshold of filters.hag_morphological.
-_TOLERANCE = 0.5
-#: Parts of the unit that compact outputs are rounded to: probabilities and the like, and heights.
-_PARTS, _PARTS_OF_HEIGHT = 64, 32
+#: Distance from given ground, in meters, up to which points without the dimension Ground may become
+#: ground: the default threshold of filters.hag_morphological.
+_TOLERANCE_M = 0.5
+#: Steps per 1 to which compact outputs round probabilities and the like. A power of two: the last
+#: bytes of the floats are then zero and compress to nothing.
+_STEPS = 64
+#: The same for heights, steps per unit of z.
+_HEIGHT_STEPS = 32
 
 
 class ApplyModel(Stage):
@@ -156,26 +160,24 @@ class ApplyModel(Stage):
 
     @cached_property
     def model(self) -> Model:
-        """The loaded model."""
+        """Return the loaded model."""
         return loaded_model(self.model_file)
 
     @cached_property
     def limits(self) -> ReliabilityLimits | None:
-        """From which reliability on points keep their class, with `keep_sure`."""
+        """Return the reliability from which on points keep their class, with `keep_sure`."""
         if self.keep_sure is None:
             return None
         return read_calibration(self.model.info, find(self.model_file)).limits(self.keep_sure)
 
     @property
     def preparation(self) -> list[dict[str, Any]]:
-        """The stages that made what the model was trained on; empty where the model does not
-        say.
-        """
+        """Return the preprocessing that the model file holds; empty where it holds none."""
         return self.model.info.get("preparation") or []
 
     @property
     def hint(self) -> str | None:
-        """Where what the model reads comes from, if its file says."""
+        """Return where the dimensions of the model come from, if its file tells."""
         if self.preparation:
             return f"Put before this stage: {as_json(self.preparation)}"
         by_hand = self.model.info.get("by_hand")
@@ -187,7 +189,7 @@ class ApplyModel(Stage):
 
     @property
     def measured_by_pdal(self) -> bool:
-        """Whether heights come from PDAL's stages, which measure from points of class 2."""
+        """Return whether heights come from PDAL's stages, which measure from class 2."""
         types = {stage["type"] for stage in self.upstream}
         return bool(types) and types <= {*OF_PDAL}
 
@@ -197,27 +199,28 @@ class ApplyModel(Stage):
             return None
         if self.given_ground and same(self.upstream, with_given_ground(self.preparation)):
             return None
-        made = ", ".join(self.made_from_ground)
+        names = ", ".join(self.made_from_ground)
         return (
             f"{self.type}: the model was trained on other heights than this pipeline makes. "
             f"Trained on: {as_json(self.preparation)}. Here: "
-            f"{as_json(self.upstream)}{f', and from points of class 2 {made}' if made else ''}. "
+            f"{as_json(self.upstream)}{f', and from points of class 2 {names}' if names else ''}. "
             "Expect lower accuracy, or use the former"
         )
 
     @property
     def made_from_ground(self) -> list[str]:
-        """Dimensions that the model needs beside heights, and that are computed from class 2 as
-        PDAL made the heights.
+        """Return the dimensions that this stage computes itself from points of class 2.
+
+        The model needs them beside the heights, which PDAL's stages measured from class 2.
         """
         if not self.measured_by_pdal or len(self.preparation) != 1 or not self._of_ground.creates():
             return []
-        made = self._of_ground.creates().keys() - {HEIGHT}
-        return [name for name in self.model.required_dimensions if name in made]
+        created = self._of_ground.creates().keys() - {HEIGHT}
+        return [name for name in self.model.required_dimensions if name in created]
 
     @cached_property
     def _of_ground(self) -> Any:
-        """The model's own stage of heights, for ground that is given."""
+        """Return the stage of the model's preprocessing, for ground of class 2."""
         (stage,) = with_given_ground(self.preparation)
         kind = stage_type(stage.pop("type"))
         units = {name: getattr(self, name) for name in ("horizontal_unit", "vertical_unit")}
@@ -225,27 +228,19 @@ class ApplyModel(Stage):
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
-        made = self.made_from_ground
-        return list(
-            dict.fromkeys(
-                [
-                    *(one for one in self.model.required_dimensions if one not in made),
-                    *([HEIGHT] if self.vegetation_heights or self.given_ground else []),
-                ]
-            )
-        )
+        computed = self.made_from_ground
+        names = [name for name in self.model.required_dimensions if name not in computed]
+        if self.vegetation_heights or self.given_ground:
+            names.append(HEIGHT)
+        return list(dict.fromkeys(names))
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""
         more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
         if self.probabilities:
             more += [f"Probability_{code}" for code, _ in self.model.classes]
-        marks = {self.mark: "uint8_t"} if self.mark else {}
-        return {
-            "Classification": "uint8_t",
-            **dict.fromkeys(["Reliability", *more], "float"),
-            **marks,
-        }
+        created = {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
+        return created | ({self.mark: "uint8_t"} if self.mark else {})
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
@@ -258,7 +253,7 @@ class ApplyModel(Stage):
 
     @property
     def _rejected(self) -> int | None:
-        """The class of rejected points, where they do not keep theirs."""
+        """Return the class of rejected points; None where they keep theirs."""
         unsure = UNCLASSIFIED if self.keep_sure is not None else None
         return unsure if self.rejected_code is None else self.rejected_code
 
@@ -281,7 +276,7 @@ class ApplyModel(Stage):
         slope = median_slope(points.xyz, points.dimension(HEIGHT)) if HEIGHT in points.arrays else 0
         points.keep_only([*dimensions, *self.creates(), HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
-            found = self.model.predict(
+            prediction = self.model.predict(
                 points.take_xyz(),
                 dimensions,
                 None if wanted.all() else wanted,
@@ -300,47 +295,43 @@ class ApplyModel(Stage):
                 progress=progress,
             )
         rejected = np.zeros(points.count, np.bool_)
-        rejected[found.unsure] = True
+        rejected[prediction.unsure] = True
+        codes = prediction.classification
         if self.vegetation_heights:
-            high = wanted & ~rejected
-            by_height(found.classification, high, points.dimension(HEIGHT), self.vegetation_heights)
-            found.report.figures["classes"] = class_counts(found.classification[wanted])
+            by_height(codes, wanted & ~rejected, points.dimension(HEIGHT), self.vegetation_heights)
+            prediction.report.figures["classes"] = class_counts(codes[wanted])
         if HEIGHT in points.arrays:
-            leaves = wanted & np.isin(found.classification, (LOW, MEDIUM, HIGH_VEGETATION))
+            leaves = wanted & np.isin(codes, (LOW, MEDIUM, HIGH_VEGETATION))
             leaf_heights = points.dimension(HEIGHT)[leaves]
             doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical)
             points.report.warnings += [doubt] if doubt else []
-        values: dict[str, NDArray] = {
-            "Classification": found.classification,
-            "Reliability": found.reliability,
-        }
-        if found.margin is not None:
-            values["Margin"] = found.margin
-        if found.variance is not None:
-            values["Variance"] = found.variance
-        if found.probabilities is not None:
-            columns = zip(self.model.codes, found.probabilities.T, strict=True)
-            values |= {f"Probability_{code}": column for code, column in columns}
-        if self.compact:
-            values |= {
-                name: _rounded(value, _PARTS)
-                for name, value in values.items()
-                if name != "Classification"
-            }
-            if HEIGHT in points.arrays:
-                height = points.arrays[HEIGHT]
-                values[HEIGHT] = np.where(inside, _rounded(height, _PARTS_OF_HEIGHT), height)
-        if points.mask is not None:  # what was there before stays outside `where`
-            for name in values:
-                if name != "Classification":
-                    values[name] = np.where(points.mask, values[name], points.arrays[name])
+        values = self._columns(points, prediction)
         if self.mark:
             values[self.mark] = inside
-        values["Classification"] = points.with_codes(values["Classification"])
+        values["Classification"] = points.with_codes(codes)
         if self.reject_below is not None or self.limits is not None:
             points.tally("rejected", rejected)
-        points.report.merge(found.report)
+        points.report.merge(prediction.report)
         points.tally("outside_where", ~inside)
+        return values
+
+    def _columns(self, points: Points, prediction: Prediction) -> dict[str, NDArray]:
+        """Return all dimensions but the class; points outside `where` keep what they had."""
+        values: dict[str, NDArray] = {"Reliability": prediction.reliability}
+        if prediction.margin is not None:
+            values["Margin"] = prediction.margin
+        if prediction.variance is not None:
+            values["Variance"] = prediction.variance
+        if prediction.probabilities is not None:
+            columns = zip(self.model.codes, prediction.probabilities.T, strict=True)
+            values |= {f"Probability_{code}": column for code, column in columns}
+        if self.compact:
+            values = {name: _round(column, _STEPS) for name, column in values.items()}
+            if HEIGHT in points.arrays:
+                values[HEIGHT] = _round(points.arrays[HEIGHT], _HEIGHT_STEPS)
+        if points.mask is not None:
+            for name, column in values.items():
+                values[name] = np.where(points.mask, column, points.arrays[name])
         return values
 
     def _add_from_ground(self, points: Points, names: list[str]) -> None:
@@ -349,18 +340,16 @@ class ApplyModel(Stage):
         created = {name: np.zeros(points.count, np.float32) for name in stage.creates()}
         arrays = {**points.arrays, **created}
         seen = stage.points(arrays, wkt=points.wkt, legacy_flags=points.legacy_flags)
-        made = stage.run(seen, WHOLE_CLOUD)
-        points.arrays = {**points.arrays, **{name: made[name] for name in names}}
+        results = stage.run(seen, WHOLE_CLOUD)
+        points.arrays = {**points.arrays, **{name: results[name] for name in names}}
 
     def _may_be_ground(self, points: Points) -> NDArray[np.bool_]:
         """Return which points (n,) are near enough to the ground that is given."""
         if "Ground" in points.arrays:
             return np.asarray(points.arrays["Ground"]) > 0
-        return np.abs(points.dimension(HEIGHT)) <= _TOLERANCE
+        return np.abs(points.dimension(HEIGHT)) <= _TOLERANCE_M
 
 
-def _rounded(values: NDArray, parts: int) -> NDArray:
-    """To these parts: a power of two, so that the last bytes of the floats are zero and compress to
-    nothing.
-    """
-    return np.round(values * parts) / parts
+def _round(values: NDArray, steps: int) -> NDArray:
+    """Round values (n,) to multiples of 1 / `steps`."""
+    return np.round(values * steps) / steps

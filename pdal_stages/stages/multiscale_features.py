@@ -117,14 +117,13 @@ class MultiscaleFeatures(Stage):
         for name in self.columns:
             if len(name.encode()) > _NAME_BYTES:
                 raise OptionError(
-                    f"the dimension name '{name}' is longer than the {_NAME_BYTES} bytes LAS allows",
+                    f"the dimension name '{name}' is longer than the {_NAME_BYTES} bytes that LAS "
+                    "allows",
                     cure="Use shorter neighborhood tokens",
                 )
 
     def _thresholds(self) -> tuple[ShapeBins | None, float | None]:
-        """Return the thresholds of shape distributions and the curvature threshold, None where the
-        points decide.
-        """
+        """Return the thresholds of histograms and of curvature; None where points decide."""
         bins, threshold = _read_bins(self.bins)
         return bins, threshold if self.copt_threshold is None else self.copt_threshold
 
@@ -151,22 +150,22 @@ class MultiscaleFeatures(Stage):
         xyz = points.xyz[there] if ignored.any() else points.xyz
         queries = None if points.mask is None else np.flatnonzero(points.mask[there])
         total = len(there) if queries is None else len(queries)
-        own = {name: points.dimension(name)[there] for name in plan.dimensions}
-        representatives = represent(xyz, self.voxel, own.values(), queries)
+        inputs = {name: points.dimension(name)[there] for name in plan.dimensions}
+        representatives = represent(xyz, self.voxel, inputs.values(), queries)
         if representatives is not None:
             xyz, queries = xyz[representatives.rows], representatives.wanted
-            own = {name: values[representatives.rows] for name, values in own.items()}
+            inputs = {name: values[representatives.rows] for name, values in inputs.items()}
         engine = FeatureEngine(
             xyz, plan, bins=bins, copt_threshold=threshold, seed=self.seed, threads=self.threads
         )
         if queries is not None:
-            own = {name: values[queries] for name, values in own.items()}
+            inputs = {name: values[queries] for name, values in inputs.items()}
         columns = [plan.names.index(name) for name in names]
         out = {name: np.array(points.arrays[name]) for name in self.creates()}
         with Progress(total, self.type) as progress:
             for rows, values in engine.blocks(
                 queries,
-                dimensions=own,
+                dimensions=inputs,
                 threads=self.threads,
                 memory_mb=self.memory,
                 progress=progress if representatives is None else None,
@@ -180,24 +179,19 @@ class MultiscaleFeatures(Stage):
                     out[name][rows] = values[:, column]
         if self.bins and not Path(self.bins).exists() and len(engine):
             _write_bins(self.bins, engine.fit())
-        points.report.figures.update(
-            {
-                "neighborhoods": len(plan.neighborhoods),
-                "features": len(names),
-                **({"copt_threshold": engine.copt_threshold} if plan.copt else {}),
-                **(
-                    {}
-                    if representatives is None
-                    else {"representatives": len(representatives.rows)}
-                ),
-                **engine.report.figures,
-            }
-        )
+        figures = points.report.figures
+        figures |= {"neighborhoods": len(plan.neighborhoods), "features": len(names)}
+        if plan.copt:
+            figures["copt_threshold"] = engine.copt_threshold
+        if representatives is not None:
+            figures["representatives"] = len(representatives.rows)
+        figures |= engine.report.figures
         points.report.merge(engine.report)
         return out
 
 
 def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
+    """Read the thresholds of histograms and of curvature; None where the file has none."""
     if path is None or not Path(path).exists():
         return None, None
     try:
@@ -212,6 +206,7 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
 
 
 def _not_thresholds(path: str, found: str) -> OptionError:
+    """Return the error on a file that does not hold what is needed."""
     return OptionError(
         f"option 'bins': '{path}' does not hold the thresholds that this stage writes",
         found=found,
@@ -220,6 +215,7 @@ def _not_thresholds(path: str, found: str) -> OptionError:
 
 
 def _write_bins(path: str, engine: FeatureEngine) -> None:
+    """Write the thresholds that an engine fitted."""
     content = {
         "format": "pdal_stages thresholds 1",
         "bins": engine.bins.to_dict() if engine.bins is not None else None,

@@ -1,9 +1,9 @@
-"""The stages before a classifier that made what it reads: kept in the model file, run by
-`classify`, compared elsewhere.
+"""Preprocessing of a model: the stages before the classifier that created what it reads.
 
-A model file may come from anybody. So a preparation holds only stages and options that are listed
-(:attr:`Stage.in_models`, :data:`PDAL_OPTIONS`): numbers in bounds, classes, conditions, never a
-path. Else it is refused when the file is loaded, and not stored by training.
+A model file holds them, `classify` runs them, and pipelines are compared with them. As a model file
+may come from anybody, only listed stages and options are allowed (:attr:`Stage.in_models`,
+:data:`PDAL_OPTIONS`): numbers within bounds, classes, conditions, never a path. Others are refused
+when a file is loaded, and training does not store them.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from .context import WHOLE_CLOUD
 from .options import Option, split_list
 from .registry import stage_type, stage_types
 
-#: The stage that makes the dimensions a model is trained on by default.
+#: The preprocessing of the dimensions that a model is trained on by default.
 PREPARATION: tuple[dict[str, Any], ...] = (
     {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
 )
 #: The stage that finds ground, or takes what is given.
 GROUND_FILTER = "filters.hag_morphological"
-#: PDAL's stages that heights come from; of ours, :meth:`Stage.creates` says what they make.
+#: PDAL's stages that heights come from; for ours, :meth:`Stage.creates` tells.
 OF_PDAL = (
     "filters.smrf",
     "filters.pmf",
@@ -37,9 +37,10 @@ OF_PDAL = (
     "filters.hag_delaunay",
     "filters.hag_dem",
 )
-#: Those that measure from points of class 2, and what must stand before them: PDAL 2.2 crashes
-#: where there are none.
-NEEDS_GROUND, MAKES_GROUND = ("filters.hag_nn", "filters.hag_delaunay"), "filters.smrf"
+#: PDAL's stages that measure from points of class 2; PDAL 2.2 crashes where there are none.
+NEEDS_GROUND = ("filters.hag_nn", "filters.hag_delaunay")
+#: PDAL's stage that a model must carry before those.
+MAKES_GROUND = "filters.smrf"
 _COUNT = Option("integer", None, "", 1, 1000, name="count")
 _EXTRAPOLATION = Option("boolean", None, "", name="allow_extrapolation")
 #: PDAL's stages that a model may carry, and their options. They read no file, move no point and
@@ -61,9 +62,9 @@ PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
     ),
     "filters.hag_delaunay": (_COUNT, _EXTRAPOLATION),
 }
-#: Options that say where in a pipeline a stage stands, how it is run, or in what units the points
-#: at hand are; not what it makes.
-_ASIDE = (
+#: Options on a stage's place in a pipeline, on how it is run and on the units of the points at
+#: hand; they do not change what it computes.
+_NOT_STORED = (
     "tag",
     "inputs",
     "user_data",
@@ -72,29 +73,31 @@ _ASIDE = (
     "horizontal_unit",
     "vertical_unit",
 )
-#: How the names of heights above openings begin; the width follows.
+#: Prefix of the names of heights above openings; the width follows.
 _OPENING = "HeightAboveOpening_"
-#: Most stages of a preparation, and characters of one as JSON.
-_MOST, _LONGEST = 8, 1000
+#: Maximum number of stages; a longer list is no preprocessing but an attack on the reader's time.
+_MAX_STAGES = 8
+#: Maximum number of characters of a stage's options as JSON.
+_MAX_CHARACTERS = 1000
 
 
 def entry(stage: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage as a preparation holds it."""
-    return {key: value for key, value in stage.items() if key not in _ASIDE}
+    """Return a stage as preprocessing holds it."""
+    return {key: value for key, value in stage.items() if key not in _NOT_STORED}
 
 
 def as_json(preparation: Iterable[Mapping[str, Any]]) -> str:
-    """The stages as they are written in a pipeline."""
+    """Return the stages as they are written in a pipeline."""
     return ", ".join(json.dumps(dict(stage)) for stage in preparation)
 
 
-def same(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether two preparations are the same stages with the same options."""
-    return json.dumps(_spelled(one), sort_keys=True) == json.dumps(_spelled(other), sort_keys=True)
+def same(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether two lists are the same stages with the same options."""
+    return _normalize(first) == _normalize(second)
 
 
-def _spelled(stages: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """In one spelling, where a model could carry them."""
+def _normalize(stages: Sequence[Mapping[str, Any]]) -> list[Any]:
+    """Return the stages in one spelling where a model could carry them, else as they are."""
     try:
         return check(stages)
     except ModelError:
@@ -102,15 +105,13 @@ def _spelled(stages: Sequence[Mapping[str, Any]]) -> list[Any]:
 
 
 def algorithm_versions(preparation: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Return type -> version of the algorithm in this release, for stages of ours; PDAL's have
-    none.
-    """
+    """Return type -> version of the algorithm in this release; PDAL's stages have none."""
     types = [str(stage["type"]) for stage in preparation]
     return {kind: stage_type(kind).algorithm_version for kind in types if kind in stage_types()}
 
 
 def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """A preparation that a model may carry, in one spelling.
+    """Return the preprocessing in one spelling, if a model may carry it.
 
     Raises
     ------
@@ -119,47 +120,49 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         the stage.
     """
     try:
-        if len(preparation) > _MOST:
-            raise ModelError(f"a preparation has at most {_MOST} stages", found=len(preparation))
-        made = [_checked(stage) for stage in preparation]
-        for number, stage in enumerate(made):
-            before = [one["type"] for one in made[:number]]
-            if stage["type"] in NEEDS_GROUND and MAKES_GROUND not in before:
-                raise ModelError(
-                    f"a model cannot carry {stage['type']} without {MAKES_GROUND} before it"
-                )
-        return made
+        if len(preparation) > _MAX_STAGES:
+            raise ModelError(
+                f"a preparation has at most {_MAX_STAGES} stages", found=len(preparation)
+            )
+        stages = [_check_stage(stage) for stage in preparation]
+        types = [stage["type"] for stage in stages]
+        for number, kind in enumerate(types):
+            if kind in NEEDS_GROUND and MAKES_GROUND not in types[:number]:
+                raise ModelError(f"a model cannot carry {kind} without {MAKES_GROUND} before it")
+        return stages
     except ModelError as error:
         error.cure = "Training writes no such file: ask where it comes from"
         raise
 
 
-def _checked(stage: Mapping[str, Any]) -> dict[str, Any]:
+def _check_stage(stage: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a stage in one spelling, if a model may carry it."""
     kind = str(stage["type"])
     ours = stage_types().get(kind)
-    options = {one.name: one for one in PDAL_OPTIONS.get(kind, ())}
+    allowed: Iterable[Option] = PDAL_OPTIONS.get(kind, ())
     if ours is not None:
-        options = {one.name: one for one in ours.all_options() if one.name in ours.in_models}
+        allowed = [option for option in ours.all_options() if option.name in ours.in_models]
+    options = {option.name: option for option in allowed}
     if not options:
         raise ModelError(f"a model cannot carry the stage {kind[:80]!r}")
-    given = {name: value for name, value in stage.items() if name != "type"}
-    if unknown := [name for name in given if name not in options]:
+    values = {name: value for name, value in stage.items() if name != "type"}
+    if unknown := [name for name in values if name not in options]:
         raise ModelError(f"a model cannot carry option {unknown[0][:80]!r} of {kind}")
-    if len(json.dumps(given, default=str)) > _LONGEST:
+    if len(json.dumps(values, default=str)) > _MAX_CHARACTERS:
         raise ModelError(
-            f"a model cannot carry options of more than {_LONGEST} characters", found=kind
+            f"a model cannot carry options of more than {_MAX_CHARACTERS} characters", found=kind
         )
     try:
-        made = {name: _value(options[name], value) for name, value in given.items()}
+        values = {name: _value(options[name], value) for name, value in values.items()}
         if ours is not None:
-            ours(made)
+            ours(values)
     except StageError as error:
         raise ModelError(f"a model cannot carry this {kind}", found=str(error)[:200]) from None
-    return {"type": kind, **made}
+    return {"type": kind, **values}
 
 
 def _value(option: Option, value: Any) -> Any:
-    """An option's value in the spelling of JSON."""
+    """Return an option's value in the spelling of JSON."""
     parsed = option.parse(value)
     if option.kind == "selection":
         items = (
@@ -169,24 +172,27 @@ def _value(option: Option, value: Any) -> Any:
             if isinstance(value, list)
             else [value]
         )
-        return [str(one).strip() for one in items]
+        return [str(item).strip() for item in items]
     if option.kind == "numbers":
-        return [_number(one) for one in parsed]
+        return [_number(number) for number in parsed]
     return _number(parsed) if option.kind == "number" else parsed
 
 
 def _number(value: float) -> int | float:
+    """Return a whole number as int: 5.0 and 5 are spelled alike."""
     return int(value) if value == int(value) else value
 
 
 def with_given_ground(preparation: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a preparation in which ground is given, and Ground says which points are near it."""
-    given = {"ground": True, "given_ground": True}
-    return [{**one, **given} if one["type"] == GROUND_FILTER else dict(one) for one in preparation]
+    """Return preprocessing in which class 2 is the ground, and Ground tells what is near it."""
+    options = {"ground": True, "given_ground": True}
+    return [
+        {**stage, **(options if stage["type"] == GROUND_FILTER else {})} for stage in preparation
+    ]
 
 
 def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
-    """The stage that makes these dimensions, as far as they are heights."""
+    """Return the stage that creates these dimensions, as far as they are heights."""
     wanted = list(names)
     widths = [
         name.removeprefix(_OPENING).replace("_", ".")
@@ -209,11 +215,25 @@ def made_of_coordinates(
     threads: int | None = None,
     classes: npt.NDArray[np.uint8] | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
-    """The dimensions that a preparation's only stage makes of coordinates in meters; none where it
-    is not one of ours.
+    """Compute the dimensions that a model reads from coordinates, without PDAL.
 
-    `usable` (n,) are points that may form the ground; the others only receive heights. `classes`
-    (n,) are needed where ground is given.
+    Parameters
+    ----------
+    preparation : sequence of mapping
+        The model's preprocessing.
+    xyz : (n, 3) array of float
+        Coordinates in meters.
+    usable : (n,) array of bool, optional
+        Points that may form the ground; the others only receive heights.
+    threads : int, optional
+        Threads to use; by default every available core.
+    classes : (n,) array of uint8, optional
+        Class codes, needed where class 2 is the ground.
+
+    Returns
+    -------
+    dict
+        Dimension -> (n,) array; empty where preprocessing is not exactly one stage of ours.
     """
     if (
         len(preparation) != 1
@@ -227,10 +247,10 @@ def made_of_coordinates(
     )
     if stage.reads() and classes is None:
         return {}
-    there = {name: np.zeros(len(xyz), number_type(kind)) for name, kind in stage.creates().items()}
+    empty = {name: np.zeros(len(xyz), number_type(kind)) for name, kind in stage.creates().items()}
     withheld = np.zeros(len(xyz), np.uint8) if usable is None else (~usable).view(np.uint8)
-    columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **there}
+    columns = {**dict(zip("XYZ", xyz.T, strict=True)), "Withheld": withheld, **empty}
     if classes is not None:
         columns["Classification"] = classes
-    made = stage.run(stage.points(columns), WHOLE_CLOUD)
-    return {name: values.astype(there[name].dtype, copy=False) for name, values in made.items()}
+    results = stage.run(stage.points(columns), WHOLE_CLOUD)
+    return {name: values.astype(empty[name].dtype, copy=False) for name, values in results.items()}

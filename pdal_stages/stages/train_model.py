@@ -1,6 +1,4 @@
-"""``writers.classifiermodel``: train a classifier on labeled points, write one model file [B16,
-W18].
-"""
+"""``writers.classifiermodel``: train a classifier on labeled points [B16, W18]."""
 
 from __future__ import annotations
 
@@ -54,9 +52,7 @@ AUTO = "auto"
 
 
 def trained(name: str, /, **other: Any) -> Any:
-    """An option of training, as it is declared there; `other` is what is different here, as for
-    :class:`Option`.
-    """
+    """Declare an option as training declares it; `other` are fields of Option that differ."""
     field = _TRAINING[name]
     declared = {key: value for key, value in field.metadata.items() if key != "check"}
     return option(**{"default": field.default, **declared, **other})
@@ -146,17 +142,19 @@ class TrainModel(Stage):
         maximum=None,
     )
 
-    def __init__(self, given: Mapping[str, Any], place: str | None = None) -> None:
-        given = with_recipe(given)
-        classes = given.get("classes")
+    def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
+        raw_options = with_recipe(raw_options)
+        classes = raw_options.get("classes")
         if isinstance(classes, str) and not classes.lstrip().startswith("{"):
             classes = [code.strip() for code in classes.split(",") if code.strip()]
         if isinstance(classes, list):  # of codes: as good as a mapping
-            given["classes"] = {str(code): _number(code) for code in classes}
+            raw_options["classes"] = {str(code): _number(code) for code in classes}
         for name in ("max_features", "max_depth"):
-            if isinstance(given.get(name), int | float) and not isinstance(given[name], bool):
-                given[name] = str(given[name])
-        super().__init__(given, place)
+            if isinstance(raw_options.get(name), int | float) and not isinstance(
+                raw_options[name], bool
+            ):
+                raw_options[name] = str(raw_options[name])
+        super().__init__(raw_options, place)
 
     @classmethod
     def from_pipeline(
@@ -186,11 +184,12 @@ class TrainModel(Stage):
 
     @property
     def _upstream_types(self) -> list[str]:
+        """Return the types of the stages upstream."""
         return [str(stage["type"]) for stage in self.upstream]
 
     @cached_property
     def training(self) -> TrainingOptions:
-        """The trainer's options."""
+        """Return the options of training."""
         values = {name: value for name, value in self.options.items() if name in _TRAINING}
         for name in ("max_features", "max_depth"):
             values[name] = _number(values[name])
@@ -206,21 +205,21 @@ class TrainModel(Stage):
 
     @property
     def automatic(self) -> bool:
-        """Whether the dimensions follow from what the points have."""
+        """Return whether the dimensions follow from what the points have."""
         return list(self.dimensions) == [AUTO]
 
     @property
     def wished(self) -> tuple[str, ...]:
-        """Dimensions worth making for the training, whether asked for or not."""
+        """Return the dimensions that preprocessing should create for the training."""
         names = required_dimensions(self.training.inputs)
         return (*names, *self._trainer.optional_inputs) if self.automatic else names
 
     def training_on(self, points: Points) -> TrainingOptions:
-        """The trainer's options, with the dimensions that the points have."""
+        """Return the options of training, with the dimensions that the points have."""
         if not self.automatic:
             return self.training
         more = self._trainer.optional_inputs
-        there = [name for name, needs in more.items() if all(one in points.arrays for one in needs)]
+        there = [name for name, sources in more.items() if set(sources) <= points.arrays.keys()]
         return replace(self.training, dimensions=(*DEFAULT_DIMENSIONS, *there))
 
     def check(self) -> None:
@@ -241,8 +240,8 @@ class TrainModel(Stage):
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
-        own = [name for name in (self.survey, self.groups) if name]
-        return [self.label, *own, *required_dimensions(self.training.inputs)]
+        numbers = filter(None, (self.survey, self.groups))
+        return [self.label, *numbers, *required_dimensions(self.training.inputs)]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Train on the points and write the model."""
@@ -253,15 +252,17 @@ class TrainModel(Stage):
 
     @property
     def named(self) -> str:
-        """The files, for the model file."""
+        """Return the names of the input files, as the model file holds them."""
         names = [Path(name).name for name in self.files]
         return ", ".join([*names[:_NAMED], *["..."] * (len(names) > _NAMED)]) or "the points"
 
     def cloud_of(
         self, points: Points, training: TrainingOptions, marks: Mapping[str, NDArray] | None = None
     ) -> TrainingCloud:
-        """The points as a cloud to train on, all of one survey; with `marks` as more dimensions,
-        from which follows later what samples are drawn from.
+        """Return the points as a cloud to train on.
+
+        With `marks` these are dimensions, too, and samples are selected later; without, the mask of
+        the cloud selects them.
         """
         needed = required_dimensions((*training.inputs, *filter(None, [self.groups])))
         dimensions = {name: points.dimension(name) for name in needed}
@@ -277,13 +278,12 @@ class TrainModel(Stage):
             name=self.named,
             mask=self._mask(points) if marks is None else points.mask,
         )
-        gone = points.ignored(
-            replace(self.ignore, codes=())
-        )  # the labels among them are left to the trainer
+        # Class codes are left to the trainer: they may be labels.
+        gone = points.ignored(replace(self.ignore, codes=()))
         return cloud.part(np.flatnonzero(~gone)) if gone.any() else cloud
 
     def finish(self, model: Model, report: Report) -> None:
-        """Write the model, and report what is to be known of it."""
+        """Write the model and report its scores and limits."""
         by_hand = self.check_upstream() is not None
         preprocessing = [] if by_hand else check(self.upstream)
         if self.base is None:
@@ -299,6 +299,10 @@ class TrainModel(Stage):
         if by_hand:
             model.info["by_hand"] = self._upstream_types
         model.save(self.filename)
+        self._report(model, report)
+
+    def _report(self, model: Model, report: Report) -> None:
+        """Report the scores of a model, and samples that it cannot learn from."""
         shown = {key: model.info[key] for key in _SHOWN if key in model.info}
         report.figures |= {"model": self.filename, **shown}
         threshold = getattr(model.passes[0].features, "copt_threshold", None)
@@ -328,54 +332,47 @@ class TrainModel(Stage):
             report.notes.append(report.figures["score"])
 
     def choice(self, parts: Iterable[Mapping[str, Any]]) -> CheckedChoice:
-        """What chooses points to draw samples from, where some were checked by a person: by
-        :meth:`CheckedPoints.counts`.
-        """
+        """Return the selection of samples among checked points, from counts of all parts."""
         known = None if self.base is None else loaded_model(self.base).codes.tolist()
         return CheckedChoice(known, self.seed, parts)
 
     def checked_points(self, points: Points) -> tuple[CheckedPoints, dict[str, Any]]:
-        """Which points a person checked, and of which others the base is sure; their counts."""
+        """Return points that a person checked or the base is sure of, and their counts."""
         arrays, codes = points.arrays, points.codes_of(self.label)
-        checked = (
-            np.asarray(arrays[CHECKED]) > 0
-            if CHECKED in arrays
-            else np.zeros(points.count, np.bool_)
-        )
-        sure = np.zeros(points.count, np.bool_)
+        checked = sure = np.zeros(points.count, np.bool_)
+        if CHECKED in arrays:
+            checked = np.asarray(arrays[CHECKED]) > 0
         if self.base and "Reliability" in arrays:
             sure = np.asarray(arrays["Reliability"]) >= SURE
-        looked = CheckedPoints(checked & points.inside, sure & points.inside & ~checked, codes)
-        return looked, looked.counts(int(np.count_nonzero(checked)))
+        part = CheckedPoints(checked & points.inside, sure & points.inside & ~checked, codes)
+        return part, part.counts(int(np.count_nonzero(checked)))
 
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
-        """The points that samples are drawn from: those inside `where`, and where any was checked
-        by a person, of these the checked ones alone.
-        """
+        """Return which points (n,) samples are drawn from; None for all."""
         if CHECKED not in points.arrays or not self.checked_only:
             return points.mask
-        looked, counts = self.checked_points(points)
+        part, counts = self.checked_points(points)
         choice = self.choice([counts])
         if not choice:
             return points.mask
         choice.report_to(points.report)
-        return choice.mask(looked, points.xyz)
+        return choice.mask(part, points.xyz)
 
     def surveys(self, cloud: TrainingCloud) -> list[tuple[float, TrainingCloud]]:
-        """The cloud as it is, or one for each value of the dimension `survey`, after that value."""
-        if not self.survey:
+        """Return a pair for each value of the dimension `survey`: the value, and its cloud."""
+        name = self.survey
+        if not name:
             return [(0.0, cloud)]
-        value = take_dimensions((self.survey,), cloud.dimensions, len(cloud), where=cloud.name)[
-            self.survey
-        ]
-        parts = [(float(one), cloud.part(np.flatnonzero(value == one))) for one in np.unique(value)]
+        column = take_dimensions((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
+        parts = {float(value): np.flatnonzero(column == value) for value in np.unique(column)}
         return [
-            (one, replace(part, name=f"{self.survey} {one:g}", survey="")) for one, part in parts
+            (value, replace(cloud.part(rows), name=f"{name} {value:g}", survey=""))
+            for value, rows in parts.items()
         ]
 
 
 def _number(text: Any) -> Any:
-    """``0.1`` as a share, ``24`` as a number of features or a class, all else as it is."""
+    """Return text as a whole number or a share, ``24`` or ``0.1``, and all else as it is."""
     for kind in (int, float):
         try:
             return kind(text)
