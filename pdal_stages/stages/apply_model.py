@@ -18,10 +18,10 @@ from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.load_model import loaded_model
 from ..classifier.model import Model
 from ..classifier.model_file import find
-from ..classifier.prediction import UNCLASSIFIED, Prediction
+from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
 from .base import Stage
 from .context import WHOLE_CLOUD, StageContext
-from .options import code_option, ignore_option, keep_option, option
+from .options import declared_option, ignore_option, keep_option, option
 from .points import Points, class_counts
 from .preprocessing import OF_PDAL, as_json, same, with_given_ground
 from .registry import stage_type
@@ -73,24 +73,9 @@ class ApplyModel(Stage):
         "Also write Variance: how much the probabilities vary over a network's batches (networks "
         "only)",
     )
-    device: str = option(
-        "string",
-        "cpu",
-        "Where a network is applied: with NumPy, which gives the same bits everywhere, or with "
-        "PyTorch on a GPU",
-        choices=("cpu", "cuda", "auto"),
-    )
-    reject_below: float | None = option(
-        "number",
-        None,
-        "Points with a lower Reliability are rejected: they do not get the winning class, and are "
-        "counted",
-        minimum=0,
-        maximum=1,
-    )
-    rejected_code: int | None = code_option(
-        None, "Class code for rejected points; by default they keep the class they had"
-    )
+    device: str = declared_option(PredictionOptions, "device")
+    reject_below: float | None = declared_option(PredictionOptions, "reject_below")
+    rejected_code: int | None = declared_option(PredictionOptions, "rejected_code")
     keep_sure: float | None = option(
         "number",
         None,

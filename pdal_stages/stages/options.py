@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
 
@@ -197,6 +197,16 @@ def option(kind: str, default: Any, help: str, **more: Any) -> Any:
     type of the parsed value, all else is as for :class:`Option`.
     """
     return Option(kind, default, help, **more)
+
+
+def declared_option(settings: type, name: str, /, **other: Any) -> Any:
+    """Declare an option as a dataclass of settings declares its field.
+
+    `other` are fields of :class:`Option` that differ.
+    """
+    (field,) = (field for field in fields(settings) if field.name == name)
+    declared = {key: value for key, value in field.metadata.items() if key != "check"}
+    return option(**{"default": field.default, **declared, **other})
 
 
 def code_option(default: int | None, help: str) -> Any:

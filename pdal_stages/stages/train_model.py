@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from ..classifier.training_options import TrainingOptions
 from .base import Stage, files_read
 from .checked_points import SURE, CheckedChoice, CheckedPoints
 from .context import StageContext
-from .options import option
+from .options import declared_option, option
 from .points import Points
 from .preprocessing import check
 from .selection import UNWANTED, Selection
@@ -51,11 +51,7 @@ _NAMED = 20
 AUTO = "auto"
 
 
-def trained(name: str, /, **other: Any) -> Any:
-    """Declare an option as training declares it; `other` are fields of Option that differ."""
-    field = _TRAINING[name]
-    declared = {key: value for key, value in field.metadata.items() if key != "check"}
-    return option(**{"default": field.default, **declared, **other})
+trained = partial(declared_option, TrainingOptions)
 
 
 class TrainModel(Stage):
