@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier import auto_context
 from pdal_stages.classifier.auto_context import PassRun, WeightedPass
-from pdal_stages.classifier.context_features import OWN, WHOLE, Context, around, count_shares
+from pdal_stages.classifier.context_features import OWN, WHOLE, Context, count_shares, rows_needed
 from pdal_stages.classifier.interface import Block, PredictRequest
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
@@ -80,7 +80,7 @@ def test_band_by_band_is_the_same(seed, kind, size):
     random = np.random.default_rng(seed)
     context = Context(("own", "box0.5", "columnvotes2", "column4"))
     wanted = None if seed % 3 == 0 else np.flatnonzero(random.random(300) < 0.3)
-    coming = around(xyz, wanted, context)
+    coming = rows_needed(xyz, wanted, context)
     order = random.permutation(300 if coming is None else coming)
     blocks = [Block(part, shares[part] / WHOLE) for part in np.array_split(order, 5)]
     request = PredictRequest(xyz, {}, wanted, 2)
@@ -103,7 +103,7 @@ def test_what_is_around_is_all_that_matters(seed, kind):
     context = Context(("box1", "column2"))
     rows = np.random.default_rng(seed).permutation(400)[:5]
     rows.sort()
-    near = around(xyz, rows, context)
+    near = rows_needed(xyz, rows, context)
     near = np.arange(400) if near is None else near
     expected = reference(xyz, shares, rows, context)
     assert np.array_equal(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.classifier.context_features import Context, around
+from pdal_stages.classifier.context_features import Context, rows_needed
 from pdal_stages.classifier.segments import COLUMNS, RULES, describe_segments
 
 GROUND, TREE, HOUSE = range(3)
@@ -73,7 +73,7 @@ def test_a_tile_with_its_halo_has_the_same_bits(seed):
     low = xyz[:, :2].min(axis=0) + random.uniform(0, 80, 2)
     rows = np.flatnonzero(((xyz[:, :2] >= low) & (xyz[:, :2] < low + 20)).all(axis=1))
     expected = columns_of(xyz, shares, height)[rows]
-    near = around(xyz, rows, context)
+    near = rows_needed(xyz, rows, context)
     away = np.maximum(low - xyz[:, :2], xyz[:, :2] - low - 20).max(axis=1)
     for part in (near, np.flatnonzero(away <= context.reach)):
         assert len(part) < len(xyz)
@@ -99,4 +99,6 @@ def test_columns_lie_where_their_names_say():
     assert np.array_equal(
         columns[:, names.index("SegmentArea_segments6")], columns_of(xyz, shares, height)[:, 0]
     )
-    assert np.allclose(context.own(columns, 3), shares / shares.sum(axis=1, keepdims=True))
+    assert np.allclose(
+        context.own_probabilities(columns, 3), shares / shares.sum(axis=1, keepdims=True)
+    )

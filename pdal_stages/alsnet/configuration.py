@@ -205,7 +205,12 @@ CONFIGURATIONS = {
                 (128, 6.0, 16, (128, 128, 256), (128, 128)),
             ),
         ),
-        ("tiny", 2048, (32,), ((256, 1.5, 8, (16, 16, 32), (32, 32)), (64, 4.0, 8, (32, 32, 64), (32, 32)))),
+        (
+            "tiny", 2048, (32,), (
+                (256, 1.5, 8, (16, 16, 32), (32, 32)),
+                (64, 4.0, 8, (32, 32, 64), (32, 32)),
+            ),
+        ),
     )
 }  # fmt: skip
 
@@ -218,7 +223,7 @@ def _file(what: str, value: Any) -> str:
 
 @dataclass(frozen=True)
 class NetworkOptions(Settings):
-    """How a network is trained; docs/alsnet.md says more of each."""
+    """Options of training a network; docs/alsnet.md says more of each."""
 
     configuration: Any = "small"  #: the name of one of :data:`CONFIGURATIONS`, or one of your own
     points: int | None = None  #: of a batch, instead of the configuration's

@@ -61,7 +61,10 @@ def inputs(options: TrainingOptions) -> tuple[str, ...]:
 
 
 def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
-    """Train a network, see :func:`pdal_stages.classifier.train`. A batch sees only its own cloud."""
+    """Train a network, see :func:`pdal_stages.classifier.train`.
+
+    A batch sees only its own cloud.
+    """
     from .torch_network import torch  # before any work: its error tells what to install
 
     training = NetworkTraining(clouds, options)

@@ -141,7 +141,7 @@ def _concatenate_inputs(
 def _mean_and_scale(
     values: dict[str, npt.NDArray[np.float64]], inputs: Sequence[str], rows: npt.NDArray[np.bool_]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the mean and the standard deviation of inputs at some rows; 0 and 1 for coordinates."""
+    """Return mean and standard deviation of inputs at some rows; 0 and 1 for coordinates."""
     columns = [values.get(name, np.zeros(len(rows)))[rows] for name in inputs]
     mean = tuple(float(column.mean()) for column in columns)
     deviation = [float(column.std()) for column in columns]

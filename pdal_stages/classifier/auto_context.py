@@ -22,7 +22,7 @@ from ..base.grid import begins_run, cell_numbers
 from ..base.threads import map_blocks
 from ..features import FeaturePlan
 from ..features.engine import FeatureBlock, Run
-from .context_features import HEIGHT, CellContext, Context, around, count_shares
+from .context_features import HEIGHT, CellContext, Context, count_shares, rows_needed
 from .feature_forest import FeatureForest
 from .fitted_features import CloudFeatures, Features
 from .interface import Block, InputPlan, PredictRequest, weigh
@@ -55,12 +55,12 @@ class FoldForests:
 
     @property
     def features(self) -> Any:
-        """What all forests read."""
+        """Features that all forests read."""
         return self.forests[0].features
 
     @property
     def context(self) -> Context | None:
-        """What all forests read of the pass before."""
+        """Context that all forests read of the pass before."""
         return self.forests[0].context
 
     def probabilities(
@@ -144,7 +144,7 @@ class PassRun:
         self._last = len(read) - 1
         wanted = [request.rows]  # of each step
         for later in self._contexts[:0:-1]:
-            wanted.insert(0, around(request.xyz, wanted[0], later))
+            wanted.insert(0, rows_needed(request.xyz, wanted[0], later))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
         width = max((each.strip for each in self._contexts[1:]), default=0.0) or 8.0
         self._strips = Strips(request.xyz, wanted[0], width)

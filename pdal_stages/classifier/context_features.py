@@ -1,9 +1,10 @@
-"""Context: what the pass before said of a point's surroundings, as features of the next pass.
+"""Context of a pass: probabilities of the pass before around a point, as features.
 
-Space is cut into cells of an absolute grid. The probabilities of the pass before, counted in 65535ths, are added as
-whole numbers over a point's own cell and the cells around it and divided by the number of points there. So a value
-has the same bits for any order of points, number of threads, and in any tile that holds those cells; and a point
-costs as much in a dense cloud as in a sparse one.
+Space is cut into cells of an absolute grid. The probabilities of the pass before, counted in
+65535ths, are added as whole numbers over a point's own cell and the cells around it and divided by
+the number of points there. So a value has the same bits for any order of points, number of threads,
+and in any tile that holds those cells; and a point costs as much in a dense cloud as in a sparse
+one.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from ..features.cell_means import WHOLE, cell_means
 from ..features.neighborhoods import SIDES
 from .segments import COLUMNS, RULES, SegmentContext, describe_segments
 
-#: Word of a token, which the side of a cell in meters follows: axes of the cells (3 x 3 x 3 around the point's, or 3 x 3
-#: columns of any height), and whether it reads the share of votes for each class in place of mean probabilities.
+#: Word of a token, before the side of a cell in meters: axes of the cells (3 x 3 x 3 around the
+#: point's, or 3 x 3 columns of any height), and whether it reads shares of votes for each class in
+#: place of mean probabilities.
 CELLS = {"box": (3, False), "column": (2, False), "boxvotes": (3, True), "columnvotes": (2, True)}
 
 #: The token of the point's own probabilities.
@@ -40,25 +42,29 @@ GROUND = 2
 
 @dataclass(frozen=True)
 class Context:
-    """Which features of the surroundings a pass reads; OptionError for a token that is not one."""
+    """Features of the surroundings that a pass reads.
+
+    OptionError for an unknown token.
+    """
 
     tokens: tuple[
         str, ...
     ]  #: ``own``, a word of :data:`CELLS` and a side (``box1``, ``columnvotes8``), or ``segments6``
 
     def __post_init__(self) -> None:
+        """Raise an OptionError for an unknown token."""
         self.scales  # noqa: B018  refused when it is made
 
     @classmethod
     def parse(cls, tokens: str | Iterable[str]) -> Context:
-        """From a list of tokens, or text with commas between them."""
+        """Return the context of a list of tokens, or of text with commas between them."""
         parts = tokens.split(",") if isinstance(tokens, str) else list(tokens)
         return cls(tuple(dict.fromkeys(str(part).strip() for part in parts if str(part).strip())))
 
     @cached_property
     def scales(self) -> dict[str, tuple[float, int, bool]]:
-        """Of the tokens that have cells: side, and what :data:`CELLS` says."""
-        found = {}
+        """Side of the cells, axes, and whether votes are read, by token that has cells."""
+        scales = {}
         for token in self.tokens:
             match = re.fullmatch(rf"({'|'.join(CELLS)})(\d+(?:\.\d+)?)", token)
             if (
@@ -69,12 +75,14 @@ class Context:
                 raise OptionError(
                     "a token of 'context' is not known",
                     found=repr(token)[:60],
-                    cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in meters that is a power of two "
-                    f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8; or {SEGMENTS} and the code of a class",
+                    cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in meters that is a power "
+                    "of two "
+                    f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8; or {SEGMENTS} and the "
+                    "code of a class",
                 )
             if match:
-                found[token] = (float(match[2]), *CELLS[match[1]])
-        return found
+                scales[token] = (float(match[2]), *CELLS[match[1]])
+        return scales
 
     @cached_property
     def segment_codes(self) -> dict[str, int]:
@@ -84,7 +92,7 @@ class Context:
 
     @property
     def strip(self) -> float:
-        """Width of strips in meters such that what a point reads lies in its own and the two beside it.
+        """Width in meters of strips: a point reads its own and the two beside it.
 
         0 where it reads nothing around.
         """
@@ -127,7 +135,8 @@ class Context:
         Parameters
         ----------
         xyz : (n, 3) float64
-            Meters. Cells of points whose columns will be wanted must be complete, and so must those around them.
+            Meters. Cells of points whose columns will be wanted must be complete, and so must those
+            around them.
         shares : (n, classes) uint16
             Of each point; see :func:`count_shares`.
         codes : sequence of int
@@ -156,15 +165,18 @@ class Context:
                 raise ModelError(
                     f"the context '{token}' needs class {code} and the dimension {HEIGHT}",
                     found=f"classes {list(codes)}; dimensions {', '.join(dimensions)}"[:200],
-                    cure=f"Name {HEIGHT} among the dimensions, or leave '{token}' out of the context",
+                    cure=f"Name {HEIGHT} among the dimensions, or leave '{token}' out of the "
+                    "context",
                 )
 
-    def own(self, columns: npt.NDArray[np.float32], classes: int) -> npt.NDArray[np.float64]:
-        """(n, classes) of these columns: the point's own probabilities."""
+    def own_probabilities(
+        self, columns: npt.NDArray[np.float32], classes: int
+    ) -> npt.NDArray[np.float64]:
+        """Return the point's own probabilities (n, classes) among these columns."""
         before = Context(self.tokens[: self.tokens.index(OWN)])
         first = len(before.names(range(classes)))
-        said = columns[:, first : first + classes].astype(np.float64)
-        return said / np.maximum(said.sum(axis=1, keepdims=True), 1e-9)
+        p = columns[:, first : first + classes].astype(np.float64)
+        return p / np.maximum(p.sum(axis=1, keepdims=True), 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +185,8 @@ class CellContext:
 
     tokens: tuple[str, ...]
     shares: npt.NDArray[np.uint16]  #: (n, classes) of the points themselves
-    #: of the tokens that have cells: (n,) the cell of each point, (cells, classes) the means around each cell
+    #: of the tokens that have cells: (n,) the cell of each point, (cells, classes) the means around
+    #: each cell
     cells: Mapping[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]]
     segments: Mapping[str, SegmentContext]  #: of the tokens of segments
 
@@ -197,14 +210,14 @@ def _cell_means(job: tuple[Any, ...]) -> tuple[npt.NDArray[Any], npt.NDArray[Any
 
 
 def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
-    """Probabilities (n, classes) in 65535ths."""
+    """Return probabilities (n, classes) in 65535ths."""
     return np.rint(np.asarray(probabilities) * WHOLE).astype(np.uint16)
 
 
-def around(
+def rows_needed(
     xyz: npt.NDArray[np.float64], rows: npt.NDArray[np.int64] | None, context: Context
 ) -> npt.NDArray[np.int64] | None:
-    """Points whose probabilities the context of some points can depend on, ascending; None for all.
+    """Return the rows, ascending, that the context of some rows depends on; None for all.
 
     These are whole cells: what of a cell is asked for is all of it.
     """
@@ -213,5 +226,5 @@ def around(
     keys, offsets = compact_keys(xyz[:, :2], context.strip)
     wanted = np.unique(keys[rows])
     near = np.unique(np.add.outer(np.add.outer(wanted, offsets), np.array([-1, 0, 1])))
-    found = np.flatnonzero(places_among(near, keys)[1])
-    return None if len(found) == len(xyz) else found
+    needed = np.flatnonzero(places_among(near, keys)[1])
+    return None if len(needed) == len(xyz) else needed

@@ -111,4 +111,4 @@ class FeatureForest:
         if self.blend is None or self.context is None:
             return by_forest
         read = values[:, len(self.plan.names) :]
-        return self.blend(self.context.own(read, len(self.blend.before)), by_forest)
+        return self.blend(self.context.own_probabilities(read, len(self.blend.before)), by_forest)

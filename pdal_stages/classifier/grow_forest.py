@@ -17,7 +17,7 @@ from .random_forest import Forest
 
 @dataclass(frozen=True)
 class Growth:
-    """How trees are grown; see ``TrainingOptions``."""
+    """Options of growing trees; see ``TrainingOptions``."""
 
     seed: int
     min_samples_leaf: int = 1
@@ -44,7 +44,10 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """What all trees are grown on; :meth:`grow_tree` is called in worker threads."""
+    """Samples that all trees are grown on.
+
+    :meth:`grow_tree` is called in worker threads.
+    """
 
     values: npt.NDArray[np.float32]
     label: npt.NDArray[Any]

@@ -15,7 +15,7 @@ from ..features.point_grid import CellGrid
 
 
 class ArrayRule(NamedTuple):
-    """What a kind expects of one of its arrays."""
+    """Type and axes of an array in a model file."""
 
     dtypes: tuple[str, ...]  #: allowed types, as NumPy writes them: ``<f4``
     ndim: int  #: number of axes
@@ -23,7 +23,7 @@ class ArrayRule(NamedTuple):
 
 @dataclass(frozen=True)
 class InputPlan:
-    """What a classifier looks at, where a :class:`FeaturePlan` does not say it."""
+    """Inputs of a classifier that has no :class:`FeaturePlan`."""
 
     names: tuple[str, ...]  #: its inputs, in order
     dimensions: tuple[str, ...]  #: which of them are dimensions of the points
@@ -76,15 +76,15 @@ class PassClassifier(Protocol):
 
     @property
     def plan(self) -> FeaturePlan | InputPlan:
-        """What it reads of the points."""
+        """Inputs that it reads of the points."""
 
     @property
     def features(self) -> Any:
-        """The features that it reads; None for a kind that reads the points themselves."""
+        """Features that it reads; None for a kind that reads the points themselves."""
 
     @property
     def context(self) -> Any:
-        """What it reads of the pass before; None where it reads nothing of it."""
+        """Context that it reads of the pass before; None for none."""
 
     @classmethod
     def from_file(

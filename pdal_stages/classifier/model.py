@@ -111,7 +111,7 @@ class Model:
 
     @property
     def gives_variance(self) -> bool:
-        """Whether the model is a network alone, which sees each point in several batches."""
+        """True for a network alone, which sees each point in several batches."""
         return len(self.passes) == 1 and self.passes[0].features is None
 
     @property

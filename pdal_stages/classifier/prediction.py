@@ -29,25 +29,41 @@ UNCLASSIFIED = 1
 
 @dataclass(frozen=True)
 class PredictionOptions(Settings):
-    """How a cloud is classified."""
+    """Options of classifying a cloud."""
 
     threads: int | None = None
     memory_mb: float = setting(256.0, "number", "Memory for blocks of points", 1, None, unit="MB")
-    probabilities: bool = False  #: whether to return them
-    margin: bool = False
-    variance: bool = False  #: of the probabilities over a network's batches
+    probabilities: bool = setting(
+        False, "boolean", "Also write the probability of each class, as Probability_<code>"
+    )
+    margin: bool = setting(
+        False, "boolean", "Also write Margin: the winning probability minus the second highest"
+    )
+    variance: bool = setting(
+        False,
+        "boolean",
+        "Also write Variance: how much the probabilities vary over a network's batches (networks "
+        "only)",
+    )
     device: str = setting(
         "cpu",
         "string",
-        "Where a network is applied: cpu (NumPy, the same bits everywhere), cuda, or auto",
+        "Where a network is applied: with NumPy, which gives the same bits everywhere, or with "
+        "PyTorch on a GPU",
         choices=("cpu", "cuda", "auto"),
     )
-    #: points less reliable do not get the winning class, and are counted
     reject_below: float | None = setting(
-        None, "number", "Points with a lower Reliability are rejected", 0, 1
+        None,
+        "number",
+        "Points with a lower Reliability are rejected: they do not get the winning class, and are "
+        "counted",
+        *(0, 1),
     )
     rejected_code: int | None = setting(
-        None, "integer", "Class code for rejected points; by default they keep theirs", 0, 255
+        None,
+        "integer",
+        "Class code for rejected points; by default they keep the class they had",
+        *(0, 255),
     )
     #: as `reject_below`, by class; the larger one counts
     limits: ReliabilityLimits | None = None
@@ -73,7 +89,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class PointRoles:
-    """What each point of a cloud is to a prediction."""
+    """Roles of the points of a cloud: to classify, only neighbors, or ignored."""
 
     wanted: npt.NDArray[np.bool_]  #: (n,) points to classify
     present: (
@@ -205,7 +221,7 @@ class WorkingCloud:
 
     @property
     def stands_for_others(self) -> bool:
-        """Whether a point in work may stand for other points of the cloud, or for none."""
+        """True where a point in work may stand for several points, or for none."""
         return self._representatives is not None
 
     def take(

@@ -23,7 +23,7 @@ _SMALLEST = 1e-300
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """How the probabilities of the pass before and those of a forest become one."""
+    """Rule that joins the probabilities of the pass before and of a forest."""
 
     before: tuple[int, ...]  #: classes of the pass before
     labeled: tuple[int, ...]  #: classes of the forest, in the order of its columns

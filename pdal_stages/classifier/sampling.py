@@ -54,6 +54,7 @@ class Samples:
     available: tuple[int, ...]  #: points each class has in all clouds
 
     def __len__(self) -> int:
+        """Return the number of samples."""
         return len(self.row)
 
     def of_cloud(self, number: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
@@ -191,7 +192,10 @@ def share_out(available: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.in
 def spread(
     n: int, count: int, random: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return `count` of `n` places in a row, equally far apart from a random one on, and weights."""
+    """Return places of `count` of `n` in a row, equally far apart, and their weights.
+
+    The first is at random.
+    """
     share, rest = divmod(count, n)
     picks = np.floor((np.arange(rest) + random.random()) * (n / max(rest, 1))).astype(np.int64)
     picks = np.minimum(picks, n - 1)
@@ -232,7 +236,8 @@ class Folds:
 
     count: int
     surveys: dict[str, int]  #: fold of each, where whole surveys are folds
-    #: of blocks in meters, which are anchored to absolute coordinates: overlapping clouds share them
+    #: of blocks in meters, which are anchored to absolute coordinates: overlapping clouds share
+    #: them
     side: float = BLOCK
     #: (m,) number of each block that has samples, ascending; other blocks are dealt by their number
     blocks: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))

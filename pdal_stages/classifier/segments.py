@@ -93,7 +93,7 @@ class Segments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SegmentContext:
-    """What the n points of a cloud read of segments."""
+    """Segments of a class, as the n points of a cloud read them."""
 
     z: npt.NDArray[np.float64]  #: (n,) elevation of the points, meters
     cell: npt.NDArray[np.int64]  #: (n,) number of each point's cell
@@ -202,7 +202,7 @@ def _join_cells(cells: VoteCells) -> Segments:
         joined = is_won[other] & (np.abs(cells.z[first] - cells.z[other]) < RULES.max_step)
         drop = np.clip(cells.z[first] - cells.lowest[other], -RULES.max_drop, RULES.max_drop)
         for number, offset in enumerate(_BLOCKS):
-            # The window of the block at this offset from the first cell's: where in it is the other?
+            # The window of the block at this offset from the first cell's: the other's place in it.
             columns, rows = block[:, first] - block[:, other] + np.array(offset)[:, None]
             inside = (np.abs(columns) <= 1) & (np.abs(rows) <= 1)
             node = number * count + place[first]

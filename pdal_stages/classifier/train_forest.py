@@ -159,7 +159,8 @@ class ForestTraining:
         o, samples, names = self.options, self.samples, self.features.plan.names
         if (needed := 4 * len(samples) * len(names)) > free_memory():
             raise OptionError(
-                f"{len(samples):,} samples of {len(names)} features do not fit into the free memory",
+                f"{len(samples):,} samples of {len(names)} features do not fit into the free "
+                "memory",
                 found=f"{needed / 2**30:.1f} GiB needed",
                 cure="Lower 'count', or use fewer neighborhoods or features",
             )
@@ -435,7 +436,9 @@ class ForestTraining:
         """Return the probabilities (m, classes) of the base at samples."""
         context = self.reads[0]
         assert context is not None
-        return context.own(self.first[rows, self.values.shape[1] :], len(self.base.classes))
+        return context.own_probabilities(
+            self.first[rows, self.values.shape[1] :], len(self.base.classes)
+        )
 
     def _held_by_base(self) -> dict[str, Any]:
         """Return by new class the samples, and those that the base calls a class without labels.

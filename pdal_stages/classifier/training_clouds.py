@@ -49,10 +49,12 @@ class TrainingCloud:
     inside: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
+        """Make the coordinates float64, and name the survey."""
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
         object.__setattr__(self, "survey", self.survey or self.name)
 
     def __len__(self) -> int:
+        """Return the number of points."""
         return len(self.xyz)
 
     @property
@@ -227,15 +229,18 @@ class Labeled:
     classes: ClassMap
 
     def __len__(self) -> int:
+        """Return the number of clouds."""
         return len(self.clouds)
 
     def __getitem__(self, number: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]:
+        """Return coordinates (n, 3) and class positions (n,) of a cloud."""
         cloud = self.clouds[number]
         position = self.classes.index(cloud.codes)
         position[~cloud.usable] = -1
         return cloud.xyz, position
 
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
+        """Iterate over the clouds."""
         return (self[number] for number in range(len(self)))
 
     def describe(

@@ -96,7 +96,7 @@ def _check_max_depth(what: str, value: Any) -> Any:
 
 @dataclass(frozen=True)
 class TrainingOptions(Settings):
-    """How a model is trained."""
+    """Options of training a model."""
 
     neighborhoods: Any = setting(
         ("s5", "k10", "k20", "k50"),
@@ -385,7 +385,7 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
 
 def _documented() -> str:
     """Return the docstring of the options, from their declarations."""
-    lines = ["How a model is trained.", "", "Attributes", "----------"]
+    lines = ["Options of training a model.", "", "Attributes", "----------"]
     for option in fields(TrainingOptions):
         unit = f", {option.metadata['unit']}" if option.metadata.get("unit") else ""
         text = textwrap.fill(f"{option.metadata['help']}.", 96)

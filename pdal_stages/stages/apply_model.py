@@ -61,18 +61,9 @@ class ApplyModel(Stage):
         required=True,
         name="model",
     )
-    probabilities: bool = option(
-        "boolean", False, "Also write the probability of each class, as Probability_<code>"
-    )
-    margin: bool = option(
-        "boolean", False, "Also write Margin: the winning probability minus the second highest"
-    )
-    variance: bool = option(
-        "boolean",
-        False,
-        "Also write Variance: how much the probabilities vary over a network's batches (networks "
-        "only)",
-    )
+    probabilities: bool = declared_option(PredictionOptions, "probabilities")
+    margin: bool = declared_option(PredictionOptions, "margin")
+    variance: bool = declared_option(PredictionOptions, "variance")
     device: str = declared_option(PredictionOptions, "device")
     reject_below: float | None = declared_option(PredictionOptions, "reject_below")
     rejected_code: int | None = declared_option(PredictionOptions, "rejected_code")
