@@ -91,7 +91,7 @@ def test_changes_are_found_in_any_order(town, tmp_path, how, run):
 
 def test_all_around_a_change_was_seen(town, tmp_path):
     corner, _ = changed_copy(town, tmp_path / "after.laz")
-    write_corrections(str(town), str(tmp_path / "o.laz"), str(tmp_path / "after.laz"), around=2.0)
+    write_corrections(str(town), str(tmp_path / "o.laz"), str(tmp_path / "after.laz"), radius=2.0)
     las = laspy.read(tmp_path / "o.laz")
     assert np.array_equal(np.asarray(las["Checked"]) > 0, is_near(np.asarray(las.xyz), corner, 2.0))
     # A second time adds to the first.

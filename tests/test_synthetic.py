@@ -18,15 +18,8 @@ from pdal_stages.classifier.load_model import load_model
 from pdal_stages.stages.registry import stage_type, stage_types
 from pdal_stages.synthetic import Town, make_town, write_town
 from pdal_stages.synthetic.demo import pipelines
-from pdal_stages.synthetic.solids import (
-    BUILDING,
-    COUNT,
-    FIRST,
-    VEGETATION,
-    Site,
-    build_scene,
-    first_hit,
-)
+from pdal_stages.synthetic.ray_casting import COUNT, FIRST, build_scene, first_hit
+from pdal_stages.synthetic.solids import BUILDING, Finish, Footprint, Site, leaves
 from pdal_stages.synthetic.townplan import plan_town
 
 COLUMNS = [f.name for f in dataclasses.fields(Town) if f.name != "options"]
@@ -138,17 +131,17 @@ def test_beams_pass_canopies_and_meet_walls(town):
 
 def inside(scene, n, p):
     """Which of the places p (m, 3) lie inside thing n."""
-    first, count = scene.things[n, [FIRST, COUNT]].astype(int)
+    first, count = scene.solids[n, [FIRST, COUNT]].astype(int)
     if count:
         planes = scene.planes[first : first + count]
         return (p @ planes[:, :3].T <= planes[:, 3]).all(axis=1)
-    low, high = scene.things[n, :3], scene.things[n, 3:6]
+    low, high = scene.solids[n, :3], scene.solids[n, 3:6]
     return (((2 * p - low - high) / (high - low)) ** 2).sum(axis=1) <= 1
 
 
 def scene_of(site: Site):
     low = np.array([site.u0, site.v0])
-    return build_scene([(np.array(site.things), np.array(site.planes))], low - 40, low + 80)
+    return build_scene([(np.array(site.solids), np.array(site.planes))], low - 40, low + 80)
 
 
 def test_first_hit_equals_marching_through_all_things():
@@ -157,31 +150,21 @@ def test_first_hit_equals_marching_through_all_things():
         a, b, z = *rng.uniform(0, 30, 2), rng.uniform(0, 10)
         half, up = rng.uniform(0.3, 4), rng.uniform(0.5, 6)
         cuts = [(0, 1.0, z + 4), (0.5, 0, z + 3)] if rng.random() < 0.5 else ()
-        site.box(
-            a,
-            b,
-            rng.uniform(0, 6),
-            half,
-            rng.uniform(0.3, 2),
-            z,
-            z + up,
-            BUILDING,
-            "tile",
-            cuts=cuts,
-        )
-        site.ball(*rng.uniform(0, 30, 2), rng.uniform(2, 12), *rng.uniform(0.5, 3, 3), 0.0)
+        base = Footprint(a, b, rng.uniform(0, 6), half, rng.uniform(0.3, 2))
+        site.box(base, z, z + up, Finish(BUILDING, "tile", "tile"), cuts)
+        site.ball((*rng.uniform(0, 30, 2), rng.uniform(2, 12)), rng.uniform(0.5, 3, 3), 0.0)
         site.bar(rng.uniform(0, 15, 3), rng.uniform(5, 20, 3), 0.15, 14, "metal")
     scene, met = scene_of(site), 0
-    tested = np.full(len(scene.things), -1)
+    tested = np.full(len(scene.solids), -1)
     for beam in range(40):
         way, tilt = rng.uniform(0, 2 * math.pi), rng.uniform(0, math.tan(math.radians(35)))
         d = np.array([tilt * math.cos(way), tilt * math.sin(way), -1.0])
         d /= np.linalg.norm(d)
         o = np.array([site.u0 + rng.uniform(0, 30), site.v0 + rng.uniform(0, 30), 0.0]) - d * 60.0
         t = np.arange(20.0, 60.0, 0.004)
-        hits = [inside(scene, n, o + t[:, None] * d) for n in range(len(scene.things))]
+        hits = [inside(scene, n, o + t[:, None] * d) for n in range(len(scene.solids))]
         slow = min((t[hit.argmax()] for hit in hits if hit.any()), default=60.0)
-        fast, index, _ = first_hit(scene, *o, *d, 60.0, tested, beam, rng)
+        fast, index, _ = first_hit(scene, (*o, *d), 60.0, tested, beam, rng)
         assert fast == pytest.approx(slow, abs=0.006)
         met += index >= 0
     assert 12 < met < 40
@@ -190,12 +173,12 @@ def test_first_hit_equals_marching_through_all_things():
 @pytest.mark.parametrize("extinction", [0.3, 1.0])
 def test_leaves_follow_beer_and_lambert(extinction):
     rng, site = np.random.default_rng(0), Site(plan_town(1), 0, 0)
-    site.box(0, 0, 0, 30, 30, 0, 4.0, VEGETATION, "leaf", leafy=extinction)
+    site.box(Footprint(0, 0, 0, 30, 30), 0, 4.0, leaves(extinction))
     scene, passed = scene_of(site), 0
     tested = np.full(1, -1)
     for beam in range(2000):
         place = site.u0 + rng.uniform(-25, 25), site.v0 + rng.uniform(-25, 25), 50.0
-        passed += first_hit(scene, *place, 0.0, 0.0, -1.0, 50.0, tested, beam, rng)[1] < 0
+        passed += first_hit(scene, (*place, 0.0, 0.0, -1.0), 50.0, tested, beam, rng)[1] < 0
     assert passed / 2000 == pytest.approx(math.exp(-4.0 * extinction), abs=0.03)
 
 

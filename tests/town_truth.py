@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdal_stages.synthetic.districts import filled
-from pdal_stages.synthetic.solids import Site
+from pdal_stages.synthetic.districts import filled_site
+from pdal_stages.synthetic.solids import Footprint, Site
 from pdal_stages.synthetic.town import SPAN, TownOptions
 from pdal_stages.synthetic.townplan import block_at, plan_town
 
@@ -81,14 +80,14 @@ def true_objects(options: TownOptions) -> TrueObjects:
 
     houses, trees, cables, decks = [], [], [], []
     for i, j in itertools.product(range(i0, i1 + 1), range(j0, j1 + 1)):
-        site = filled(plan, i, j)
+        site = filled_site(plan, i, j)
         for kind, *what in site.built:
             if kind == "house":
-                a, b, turn, half_l, half_w, over_l, over_w, eave, top, cuts = what
+                base, overhang, eave, top, cuts = what
                 z = options.origin[2]
                 roof, walls = (
-                    placed(site, _corners(a, b, turn, half_l + p, half_w + q))
-                    for p, q in ((over_l, over_w), (0, 0))
+                    placed(site, _corners(base, p, q))
+                    for p, q in ((overhang / 2, overhang), (0, 0))
                 )
                 if inside(roof):
                     slopes = tuple((p, q, height + z) for p, q, height in cuts)
@@ -112,12 +111,7 @@ def true_objects(options: TownOptions) -> TrueObjects:
     )
 
 
-def _corners(
-    a: float, b: float, turn: float, half_l: float, half_w: float
-) -> list[tuple[float, float]]:
-    c, s = math.cos(turn), math.sin(turn)
-    around = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-    return [
-        (a + p * half_l * c - q * half_w * s, b + p * half_l * s + q * half_w * c)
-        for p, q in around
-    ]
+def _corners(base: Footprint, wider_l: float = 0, wider_w: float = 0) -> list[tuple[float, float]]:
+    """Return the corners of a footprint, in order, with its half sides made longer."""
+    half_l, half_w = base.half_l + wider_l, base.half_w + wider_w
+    return [base.place(p * half_l, q * half_w) for p, q in ((1, 1), (-1, 1), (-1, -1), (1, -1))]

@@ -34,7 +34,7 @@ _DISTINGUISHING = ("gps_time", "return_number", "number_of_returns", "classifica
 
 
 def write_corrections(
-    before: str, output: str, after: str = "", areas: Sequence[str] = (), around: float = 1.0
+    before: str, output: str, after: str = "", areas: Sequence[str] = (), radius: float = 1.0
 ) -> list[str]:
     """Write the points of a file with corrected classes, and mark those that were checked.
 
@@ -51,7 +51,7 @@ def write_corrections(
         File of the same points after editing, in any order; empty for none.
     areas : sequence of str
         Files of polygons in which everything was checked, so unchanged classes are right.
-    around : float
+    radius : float
         Distance from changed points within which the same holds, meters.
 
     Returns
@@ -59,7 +59,7 @@ def write_corrections(
     list of str
         Counts and warnings.
     """
-    _refuse_inputs(before, output, after, areas, around)
+    _refuse_inputs(before, output, after, areas, radius)
     reference = reference_of_file(before)
     las = _read(before)
     xyz = np.column_stack([las.x, las.y, las.z])
@@ -69,7 +69,7 @@ def write_corrections(
     changed = new != codes
     units = reference.units
     meters = xyz * [units.horizontal, units.horizontal, units.vertical]
-    checked = is_near(meters, changed, around)
+    checked = is_near(meters, changed, radius)
     for area in areas:
         checked |= _in_area(area, xyz, reference.wkt, warnings)
     if CHECKED in las.point_format.extra_dimension_names:
@@ -85,19 +85,22 @@ def write_corrections(
     with whole_files(output) as (part,):
         las.write(str(part))
         finish(part, [before])
-    percent = f"{100 * checked.mean():.2f} %"
-    out = [
-        f"{len(codes):,} points, {changed.sum():,} changed, {checked.sum():,} checked ({percent})"
-    ]
+    return [*_describe(codes, new, checked), *warnings]
+
+
+def _describe(codes: NDArray, new: NDArray, checked: NDArray) -> list[str]:
+    """Return counts of changed and checked points as lines of text."""
+    changed, percent = new != codes, f"{100 * checked.mean():.2f} %"
+    counts = f"{len(codes):,} points, {changed.sum():,} changed, {checked.sum():,} checked"
     moves = Counter(zip(codes[changed].tolist(), new[changed].tolist(), strict=True))
-    out += [f"  {old} became {code}{n:>14,}" for (old, code), n in moves.most_common()]
-    return [*out, *warnings]
+    lines = [f"  {old} became {code}{n:>14,}" for (old, code), n in moves.most_common()]
+    return [f"{counts} ({percent})", *lines]
 
 
 def _refuse_inputs(
-    before: str, output: str, after: str, areas: Sequence[str], around: float
+    before: str, output: str, after: str, areas: Sequence[str], radius: float
 ) -> None:
-    checks.number("'--around'", around, 0, 100, unit="m")
+    checks.number("'--around'", radius, 0, 100, unit="m")
     if not after and not areas:
         raise OptionError(
             "there is nothing to mark: neither corrected points nor a checked area",

@@ -1,4 +1,4 @@
-"""A generated town under a simulated flight, with true labels: data for tests, demos and benchmarks."""
+"""A generated town under a simulated flight, with true classes (an extra)."""
 
 from .town import Town, TownOptions, make_town, write_town
 

@@ -1,4 +1,4 @@
-"""The main job on a generated town: train on one half, classify the other, say how well."""
+"""Demo on a generated town: train on one half, classify the other, score the result."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..base.files import write_json
 from ..classifier.model_file import STANDARD
 from ..stages.preprocessing import PREPARATION
 
-#: Classes of the town that the demo tells apart; small ones are left to the reader.
+#: Classes of the town that the demo trains; rare ones are left out.
 CLASSES = {
     "2": "Ground",
     "3": "Low vegetation",
@@ -27,11 +27,11 @@ CLASSES = {
 def run_demo(
     folder: str | Path, *, size: float = 200.0, density: float = 7.0, seed: int = 1
 ) -> None:
-    """Generate, train, classify, compare, draw.
+    """Generate a town, train, classify, score, draw.
 
-    Everything goes through PDAL, as a user's pipelines would. Files in `folder`: ``town.laz``, ``town.model``,
-    ``classified.laz``, ``accuracy.json``, ``accuracy.html``, ``classified.png``, ``standard.laz`` (by the model that comes
-    with the package) and the three pipelines.
+    Everything goes through PDAL, as a user's pipelines would. Files in `folder`: ``town.laz``,
+    ``town.model``, ``classified.laz``, ``accuracy.json``, ``accuracy.html``, ``classified.png``,
+    ``standard.laz`` (by the model that comes with the package) and the three pipelines.
     """
     import numpy as np
 
@@ -46,9 +46,9 @@ def run_demo(
     with _step(
         f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"
     ):
-        made = make_town(size, density, seed)
-        write_town(made, str(folder / "town.laz"))
-    stages = pipelines(folder, float(np.floor((made.x.min() + made.x.max()) / 2)), seed)
+        town = make_town(size, density, seed)
+        write_town(town, str(folder / "town.laz"))
+    stages = pipelines(folder, float(np.floor((town.x.min() + town.x.max()) / 2)), seed)
     for name, listed in stages.items():
         write_json(folder / f"{name}.json", listed, indent=4)
     with _step("training on the western half"):
@@ -56,27 +56,24 @@ def run_demo(
     with _step("classifying the eastern half; how right that is"):
         job = Pipeline(stages["classify"])
         job.execute()
-    with _step(
-        "the same with the model that comes with the package, which has never seen such a town"
-    ):
+    with _step("the same with the model that comes with the package, trained on real surveys"):
         Pipeline(stages["standard"]).execute(arrays=False)
     with _step("drawing the picture"):
         (points,) = job.arrays
         shown = points[np.isin(points["Reference"], [*map(int, CLASSES)])]
         columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
         write_png(folder / "classified.png", triptych(*columns))
-    print(
-        "points, heights beside classes beside errors, and how right the first model is, for a browser:"
-    )
+    print("points; a picture of heights, classes and errors; a page of the accuracy:")
     for file in ("classified.laz", "classified.png", "accuracy.html"):
         print(f"  {folder / file}")
 
 
 def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str, Any]]]:
-    """The pipelines ``train``, ``classify`` and ``standard`` of a town in a folder, parted at an X."""
-    town, model = (
-        {"type": "readers.las", "filename": str(folder / "town.laz")},
+    """Return the pipelines ``train``, ``classify``, ``standard`` of a town, divided at an X."""
+    town = {"type": "readers.las", "filename": str(folder / "town.laz")}
+    model, las = (
         str(folder / "town.model"),
+        {"type": "writers.las", "forward": "all", "extra_dims": "all"},
     )
     train = [
         town,
@@ -96,7 +93,6 @@ def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str
         {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
         *PREPARATION,
     ]
-    las = {"type": "writers.las", "forward": "all", "extra_dims": "all"}
     classify = [
         *eastern,
         {"type": "filters.modelclassifier", "model": model, "margin": True},
@@ -120,7 +116,7 @@ def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str
 
 @contextlib.contextmanager
 def _step(text: str) -> Iterator[None]:
-    """Says what is being done, and how long it took."""
+    """Print a step of the demo, and the time it took."""
     started = time.monotonic()
     print(f"{text} ...", file=sys.stderr, flush=True)
     yield

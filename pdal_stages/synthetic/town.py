@@ -1,4 +1,4 @@
-"""A generated town under a simulated flight: options, points, a LAS or LAZ file."""
+"""Generate a town under a simulated flight: options, flight, points, a LAS or LAZ file."""
 
 from __future__ import annotations
 
@@ -20,35 +20,50 @@ from ..base.settings import Settings, setting
 from ..base.threads import map_blocks
 from ..base.version import __version__
 from .districts import fill
-from .solids import VEGETATION, build_scene, cast
+from .ray_casting import build_scene, cast
+from .solids import VEGETATION
 from .townplan import block_at, heights, plan_town
 
-ALTITUDE, SPEED = 350.0, 60.0  # meters, meters a second
-SCAN_ANGLE, OVERLAP = 25.0, 0.3  # half opening in degrees, share of a swath seen twice
-TURN = 240.0  # seconds from the end of a strip to the start of the next
-GPS_START = 270_000_000.0  # adjusted standard GPS time: April 2020
-BESIDE = 25.0  # meters beyond the square that are flown as well: what stands outside throws shadows into it
-
+#: Of the aircraft above the quays, meters.
+ALTITUDE = 350.0
+#: Of the aircraft, meters a second.
+SPEED = 60.0
+#: Half the opening of the scanner, degrees.
+SCAN_ANGLE = 25.0
+#: Share of a swath that the next one covers as well.
+OVERLAP = 0.3
+#: From the end of a strip to the start of the next, seconds.
+TURN = 240.0
+#: Adjusted standard GPS time of the first pulse: April 2020.
+GPS_START = 270_000_000.0
+#: Flown beyond the square, meters: what stands outside throws shadows into it.
+BESIDE = 25.0
+#: Pulses cast at a time, about.
 PULSES_PER_CHUNK = 60_000
-SAMPLE = 20_000  # pulses that tell how many returns a pulse gives
-SIDEWAYS = 45.0  # meters a beam may travel between the highest thing and the lowest ground
-SPAN = 65.0  # meters a thing may stand out of its block: the wires to the next
+#: Pulses of the trial that shows how many returns a pulse gives.
+SAMPLE = 20_000
+#: Farthest that a beam travels sideways from the highest solid to the lowest ground, meters.
+SIDEWAYS = 45.0
+#: Farthest that a solid reaches out of its block, meters: wires to the next one.
+SPAN = 65.0
 
-#: The reference system of a town's file.
+#: Reference system of a town's file.
 WKT = (
-    'PROJCS["ETRS89 / UTM zone 32N",GEOGCS["ETRS89",DATUM["European_Terrestrial_Reference_System_1989",'
-    'SPHEROID["GRS 1980",6378137,298.257222101,AUTHORITY["EPSG","7019"]],AUTHORITY["EPSG","6258"]],'
-    'PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],'
-    'AUTHORITY["EPSG","4258"]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0],'
-    'PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
-    'PARAMETER["false_northing",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],'
-    'AXIS["Northing",NORTH],AUTHORITY["EPSG","25832"]]'
+    'PROJCS["ETRS89 / UTM zone 32N",GEOGCS["ETRS89",'
+    'DATUM["European_Terrestrial_Reference_System_1989",SPHEROID["GRS 1980",6378137,'
+    '298.257222101,AUTHORITY["EPSG","7019"]],AUTHORITY["EPSG","6258"]],PRIMEM["Greenwich",0,'
+    'AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],'
+    'AUTHORITY["EPSG","4258"]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",9],'
+    'PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
+    'PARAMETER["false_northing",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",'
+    'EAST],AXIS["Northing",NORTH],AUTHORITY["EPSG","25832"]]'
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class TownOptions(Settings):
-    """How to make a town; wrong values raise an OptionError."""
+    """Options of a town; wrong values raise an OptionError."""
 
     size: float = setting(200.0, "number", "Side of the square, meters", 20, 20_000)
     density: float = setting(
@@ -59,6 +74,7 @@ class TownOptions(Settings):
     origin: tuple = (500_000.0, 5_400_000.0, 60.0)  #: x, y of the low corner; height of the quays
 
     def __post_init__(self) -> None:
+        """Check all options."""
         super().__post_init__()
         if np.shape(self.origin) != (3,):
             raise OptionError("'origin' must be three numbers: x, y, z", found=self.origin)
@@ -68,24 +84,21 @@ class TownOptions(Settings):
 
 @dataclasses.dataclass
 class Town:
-    """Points of a town (or of a chunk of one) with what is true about them."""
+    """Points of a town, or of a part of it, with their true classes and heights."""
 
-    xyz: np.ndarray  # (n, 3) float64: meters, multiples of 1 mm
-    classification: (
-        np.ndarray
-    )  # (n,) uint8: true ASPRS class; 3, 4, 5: below 0.5 m, below 2 m, above
-    intensity: np.ndarray  # (n,) uint16
-    return_number: np.ndarray  # (n,) uint8
-    number_of_returns: np.ndarray  # (n,) uint8
-    gps_time: np.ndarray  # (n,) float64: adjusted standard GPS time, unique to each pulse
-    point_source_id: np.ndarray  # (n,) uint16: the strip, from 1
-    scan_angle: np.ndarray  # (n,) float32: degrees, positive to the right of the flight
-    height_above_ground: (
-        np.ndarray
-    )  # (n,) float32: above the true bare ground; of water, its surface
+    xyz: np.ndarray  #: (n, 3) float64, meters, multiples of 1 mm
+    classification: np.ndarray  #: (n,) uint8, ASPRS; 3, 4, 5: below 0.5 m, below 2 m, above
+    intensity: np.ndarray  #: (n,) uint16
+    return_number: np.ndarray  #: (n,) uint8
+    number_of_returns: np.ndarray  #: (n,) uint8
+    gps_time: np.ndarray  #: (n,) float64, adjusted standard GPS time, unique to each pulse
+    point_source_id: np.ndarray  #: (n,) uint16, the strip, from 1
+    scan_angle: np.ndarray  #: (n,) float32, degrees, positive to the right of the flight
+    height_above_ground: np.ndarray  #: (n,) float32, above the bare ground or the water
     options: TownOptions
 
     def __len__(self) -> int:
+        """Return the number of points."""
         return len(self.xyz)
 
     x = property(lambda self: self.xyz[:, 0])
@@ -93,7 +106,7 @@ class Town:
     z = property(lambda self: self.xyz[:, 2])
 
     def ground_height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """True height of the bare ground at any coordinates of the town (same system as ``xyz``)."""
+        """Return the true height of the bare ground at places (n,), in the system of ``xyz``."""
         plan = plan_town(int(self.options.seed))
         local = np.column_stack([x, y]) - self.options.origin[:2] - self.options.size / 2
         return heights(local @ plan.turn, plan) + self.options.origin[2]
@@ -107,20 +120,19 @@ class Flight:
         rng, half = np.random.default_rng([seed, 0xF117]), math.radians(SCAN_ANGLE)
         self.heading = math.radians(rng.uniform(70, 110))  # from east
         swath = 2.0 * ALTITUDE * math.tan(half)
-        self.reach = (
-            0.5 * size * (abs(math.cos(self.heading)) + abs(math.sin(self.heading))) + BESIDE
-        )
-        apart = swath * (1.0 - OVERLAP)
+        diagonal = abs(math.cos(self.heading)) + abs(math.sin(self.heading))
+        self.reach = 0.5 * size * diagonal + BESIDE
+        distance = swath * (1.0 - OVERLAP)
         # At least two strips, so that every town is seen from two sides.
-        self.strips = max(2, math.ceil((2 * self.reach - swath * OVERLAP) / apart))
-        self.across = (np.arange(self.strips) - 0.5 * (self.strips - 1)) * apart
+        self.strips = max(2, math.ceil((2 * self.reach - swath * OVERLAP) / distance))
+        self.across = (np.arange(self.strips) - 0.5 * (self.strips - 1)) * distance
         self.lines = math.ceil(2 * self.reach / spacing)
         self.per_line = math.ceil(2 * half * ALTITUDE / spacing)
         # A turning polygon: every line runs from right to left.
         self.angles = half - (np.arange(self.per_line) + 0.5) * (2 * half / self.per_line)
 
     def parts(self, pulses: int) -> list[tuple[int, int, int]]:
-        """The flight in order of time: strip, first line, line after the last, with about so many pulses each."""
+        """Return parts of about `pulses` pulses by time: strip, first line, end of lines."""
         step = max(1, int(pulses / min(self.per_line, 2 * self.reach / self.spacing)))
         firsts = range(0, self.lines, step)
         return [
@@ -128,16 +140,26 @@ class Flight:
         ]
 
     def aimed(self, part: int) -> int:
-        """How many of all pulses, made so many at a time, would meet level ground inside the square."""
+        """Count the pulses that would meet level ground inside the square, `part` at a time."""
         return sum(
             (np.abs(self.pulses(*p)[2]) < self.size / 2).all(axis=1).sum() for p in self.parts(part)
         )
 
     def pulses(self, strip: int, first: int, last: int) -> list[np.ndarray]:
-        """The pulses of some scan lines of a strip that come near the square, in order of time.
+        """Return the pulses of scan lines of a strip that come near the square, in order of time.
 
-        Origin (n, 3) in meters from the middle of the square at its mean height, unit direction (n, 3), place (n, 2)
-        where the beam would meet level ground, GPS time in seconds, scan angle in degrees (right of the flight: positive).
+        Returns
+        -------
+        origin : (n, 3)
+            Meters from the middle of the square at the height of the quays.
+        direction : (n, 3)
+            Unit vectors.
+        level : (n, 2)
+            Places where the beams would meet level ground.
+        time : (n,)
+            GPS time, seconds.
+        angle : (n,)
+            Scan angle, degrees, positive to the right of the flight.
         """
         forward = 1.0 - 2.0 * (strip % 2)
         left = self.across[strip] - forward * ALTITUDE * np.tan(self.angles)
@@ -157,13 +179,13 @@ class Flight:
 
 
 class FlownTown:
-    """One town's plan, things and flight, ready to be cast part by part."""
+    """Plan, solids and flight of a town, ready to be cast part by part."""
 
     def __init__(self, options: TownOptions) -> None:
         self.options, self.plan = options, plan_town(int(options.seed))
         # Blocks are made when first needed; the latest ones are kept.
         self.block = lru_cache(1500)(lambda i, j: fill(self.plan, i, j))
-        # The spacing that gives the wanted density: from the returns of a coarse flight over the middle of the town.
+        # The returns of a coarse flight over the middle of the town give the spacing.
         sizes = min(options.size, 400.0), options.size
         trial, coarse = (
             Flight(int(options.seed), size, size / math.sqrt(SAMPLE)) for size in sizes
@@ -175,7 +197,7 @@ class FlownTown:
         )
 
     def town(self, flight: Flight, strip: int, first: int, last: int) -> Town:
-        """The points of some scan lines of a strip."""
+        """Return the points of some scan lines of a strip."""
         o, turn, plan = self.options, self.plan.turn, self.plan
         rng = np.random.default_rng([int(o.seed), strip, first, last])
         origin, direction, level, time, angle = flight.pulses(strip, first, last)
@@ -192,18 +214,14 @@ class FlownTown:
         # One error per pulse, mostly in height, so that its returns stay in order.
         xyz = hits[:, 1:4] + o.noise * (rng.standard_normal(origin.shape) * (0.5, 0.5, 1.0))[pulse]
         xyz[:, :2] = xyz[:, :2] @ turn.T + flight.size / 2
-        mm = np.round(xyz * 1000.0)  # whole numbers, so that a file's coordinates are exactly these
+        mm = np.round(xyz * 1000.0)  # so that a file holds exactly these
         outside = (mm[:, :2] < 0).any(axis=1) | (mm[:, :2] >= 1000.0 * flight.size).any(axis=1)
         keep = ~np.isin(pulse, pulse[outside])  # a pulse has all its returns or none
         mm, pulse, distance, (code, echo) = mm[keep], pulse[keep], hits[keep, 0], hits[keep, 4:6].T
         above = mm[:, 2] / 1000.0 - heights((mm[:, :2] / 1000.0 - flight.size / 2) @ turn, plan)
         code = np.where(code == VEGETATION, np.select([above < 0.5, above < 2.0], [3, 4], 5), code)
-        echo = (
-            4000.0
-            * echo
-            * (ALTITUDE / distance) ** 2
-            * np.exp(0.12 * rng.standard_normal(len(echo)))
-        )
+        speckle = np.exp(0.12 * rng.standard_normal(len(echo)))
+        echo = 4000.0 * echo * (ALTITUDE / distance) ** 2 * speckle
         _, start, nth, count = np.unique(
             pulse, return_index=True, return_inverse=True, return_counts=True
         )
@@ -222,11 +240,12 @@ class FlownTown:
 
 
 def make_town(size=200.0, density=7.0, seed=1, *, threads=None, progress=True, **changes) -> Town:
-    """A generated town under a simulated flight, with true classes and heights.
+    """Return a generated town under a simulated flight, with true classes and heights.
 
-    Pulses are cast as five sub-beams each through the solids of the town, so shadows, facades, roof edges with two
-    returns and ground below trees come out as they do in a scan. Other options are the fields of :class:`TownOptions`;
-    wrong ones raise an OptionError. The same options give the same points, whatever the number of threads.
+    Pulses are cast as five sub-beams each through the solids of the town, so shadows, facades, roof
+    edges with two returns and ground below trees come out as they do in a scan. Other options are
+    the fields of :class:`TownOptions`; wrong ones raise an OptionError. The same options give the
+    same points, whatever the number of threads.
     """
     known = [f.name for f in dataclasses.fields(TownOptions)]
     for name in set(changes) - set(known):
@@ -252,36 +271,26 @@ def write_town(town: Town, path: str | os.PathLike) -> None:
 
     target = Path(path)
     if not named_las(target):
-        raise OptionError(
-            "the output's name must end in .las or .laz", where="write_town", found=str(path)
-        )
+        what = "the output's name must end in .las or .laz"
+        raise OptionError(what, where="write_town", found=str(path))
     if not len(town):
         raise StageError(
             "no pulse hit this town", where="synthetic", cure="Give a larger 'size' or 'density'"
         )
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, 0.001), np.floor(np.array(town.options.origin))
-    header.creation_date = datetime.date(
-        2020, 7, 1
-    )  # fixed, so that the same town gives the same bytes
-    header.system_identifier, header.generating_software = (
-        "generated town",
-        f"pdal-stages {__version__}",
-    )
+    # A fixed date, so that the same town gives the same bytes.
+    header.creation_date = datetime.date(2020, 7, 1)
+    header.system_identifier = "generated town"
+    header.generating_software = f"pdal-stages {__version__}"
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True
     header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "OGC WKT", WKT.encode() + b"\0"))
     las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(town), header=header))
     las.X, las.Y, las.Z = np.round((town.xyz - header.offsets) * 1000.0).astype(np.int32).T
-    for name in (
-        "classification",
-        "intensity",
-        "return_number",
-        "number_of_returns",
-        "gps_time",
-        "point_source_id",
-    ):
-        las[name] = getattr(town, name)
+    for field in dataclasses.fields(Town):
+        if field.name not in ("xyz", "scan_angle", "height_above_ground", "options"):
+            las[field.name] = getattr(town, field.name)
     las["scan_angle"] = np.round(town.scan_angle / 0.006).astype(np.int16)
     with whole_files(target) as (part,), open(part, "wb") as file:
         las.write(file, do_compress=target.suffix.lower() == ".laz")
