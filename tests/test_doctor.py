@@ -50,5 +50,5 @@ def test_another_python_is_told(tmp_path, monkeypatch):
             "/other\n/other/lib/pdal_stages/__init__.py"
         )
 
-    assert "another pdal_stages" in doctor._python_of("filters.python", another).found
-    assert "did not run" in doctor._python_of("filters.python", lambda stages: None).found
+    assert "another pdal_stages" in doctor._python_of("filters.python", another).result
+    assert "did not run" in doctor._python_of("filters.python", lambda stages: None).result

@@ -1,3 +1,1 @@
-"""Our stages as native PDAL plugins: the build of ``stage.cpp``, and the Python code that it
-calls.
-"""
+"""Stages as native PDAL plugins: ``stage.cpp``, its compilation, and the Python that it calls."""

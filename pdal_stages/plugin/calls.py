@@ -41,9 +41,9 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     # PDAL's module object stays alive; the register need not grow.
     sys.modules.pop(question["label"], None)
     try:
-        stage, context = _made(question)
+        stage, context = _make_stage(question)
         if question["step"] == "prepare":
-            said = [
+            leaves = [
                 runtime.leaf("dimension", f"{name}={kind}")
                 for name, kind in stage.creates().items()
             ]
@@ -51,16 +51,16 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
             warnings = [warning] if warning else []
         else:
             report = runtime.run_on_view(stage, context, module, ins, outs)
-            said, warnings = runtime.leaves(report), report.messages
-        said += [runtime.leaf("pdal_stages_warning", text) for text in warnings]
+            leaves, warnings = runtime.leaves(report), report.messages
+        leaves += [runtime.leaf("pdal_stages_warning", text) for text in warnings]
     except BaseException as error:
         outs.clear()
-        said = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
-    module["out_metadata"] = runtime.node("pdal_stages", said)
+        leaves = [runtime.leaf("pdal_stages_error", str(runtime.as_stage_error(error, where)))]
+    module["out_metadata"] = runtime.node("pdal_stages", leaves)
     return True
 
 
-def _made(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
+def _make_stage(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
     """Return the stage of a call, placed in its pipeline, and its context."""
     kind = stage_type(question["stage"])
     if (question["version"], question["digest"]) != (__version__, declarations.digest(kind)):
@@ -70,30 +70,28 @@ def _made(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
             f"({declarations.digest(kind)}) in {sys.prefix}",
             cure="Build it again: pdal-stages plugin --install",
         )
-    given: dict[str, str] = {}
+    options: dict[str, str] = {}
     for name, value in question["options"]:  # lists come as several values
-        given[name] = f"{given[name]},{value}" if name in given else value
+        options[name] = f"{options[name]},{value}" if name in options else value
     before = _stages(question["pipeline"])[:-1]
     named = {"type": kind.type, "tag": question.get("tag")}
-    stage = stage_from({**kind.from_pipeline(given, before), **given, **named})
-    upstream = [(one, _creates(one)) for one in before]
+    stage = stage_from({**kind.from_pipeline(options, before), **options, **named})
+    upstream = [(earlier, _creates(earlier)) for earlier in before]
     stage, created_before = expansion.settle_upstream(stage, upstream)
     return stage, StageContext(created_before)
 
 
 def _stages(text: str) -> list[dict[str, Any]]:
-    """The pipeline up to the stage itself, as PDAL writes it; before PDAL 2.9 all values are
-    text.
-    """
+    """Return the pipeline up to the stage itself; before PDAL 2.9 all its values are text."""
     try:
-        found = json.loads(text)["pipeline"]
+        stages = json.loads(text)["pipeline"]
     except (ValueError, KeyError):  # `user_data` that is not JSON
         return [{}]
-    return found if isinstance(found, list) else [found]
+    return stages if isinstance(stages, list) else [stages]
 
 
 def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
-    """The dimensions that an earlier stage creates; of PDAL's stages, only heights."""
+    """Return the dimensions that an earlier stage creates; of PDAL's stages, only heights."""
     if stage.get("type") not in stage_types():
         return expansion.heights_of(stage)
     try:
@@ -103,8 +101,7 @@ def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
 
 
 def _end_on_interrupt() -> None:
-    """Within a program that is not Python, such as `pdal`, let Ctrl-C end it at once, as PDAL's own
-    stages do.
+    """Let Ctrl-C end a program that is not Python, such as `pdal`, at once, as PDAL's stages do.
 
     There filters.python starts an interpreter, which takes the signal and keeps it while PDAL
     works.

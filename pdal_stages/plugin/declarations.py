@@ -22,19 +22,15 @@ _KINDS = {
 
 
 def header() -> str:
-    """The text of ``declarations.hpp``, which ``stage.cpp`` includes below its types of stages and
-    options.
-    """
+    """Return the text of ``declarations.hpp``, which ``stage.cpp`` includes."""
     options, stages = [], []
     for number, kind in enumerate(stage_types().values()):
         name = f"OPTIONS_{number}"
         options.append(f"const Option {name}[] = {{{_options(kind)}}};")
         texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")
         gathers = str(bool(kind.instead_of_tiles)).lower()
-        stages.append(
-            "    "
-            f"{{ {', '.join(map(json.dumps, texts))}, {name}, sizeof({name}) / sizeof(Option), {gathers} }},"
-        )
+        shown = ", ".join(map(json.dumps, texts))
+        stages.append(f"    {{ {shown}, {name}, sizeof({name}) / sizeof(Option), {gathers} }},")
     version = f"constexpr const char *VERSION = {json.dumps(__version__)};"
     names = ", ".join(map(json.dumps, sorted({"filters.merge", *SPLITS})))
     one_view = (
@@ -45,15 +41,14 @@ def header() -> str:
 
 
 def digest(kind: type[Stage]) -> str:
-    """Return a digest of what PDAL sees of a stage: names, types and defaults of its options, not
-    their help.
-    """
+    """Return a digest of what PDAL sees of a stage: names, types and defaults of options."""
     gathers = bool(kind.instead_of_tiles)
     held = f"{kind.type} {gathers} {[fields[:-1] for fields in _fields(kind)]}"
     return hashlib.sha256(held.encode()).hexdigest()[:16]
 
 
 def _options(kind: type[Stage]) -> str:
+    """Return the options of a stage as C++ text."""
     lines = [f"    {{ {', '.join(fields)} }}," for fields in _fields(kind)]
     return "\n".join(["", *lines, ""])
 
@@ -76,6 +71,7 @@ def _fields(kind: type[Stage]) -> Iterator[list[str]]:
 
 
 def _help(option: Option) -> str:
+    """Return an option's help with its choices and unit."""
     text = option.help
     if option.choices:
         text += f" (one of: {', '.join(map(str, option.choices))})"

@@ -28,7 +28,7 @@ _EXTRAS = {
     "deep": ("torch", "the neural network"),
     "vector": ("pyogrio", "objects as vector files, and polygons of a map"),
 }
-#: Memory that a job needs besides the cloud; less is reported.
+#: Bytes of free memory that a job needs besides the cloud; less is reported.
 _LITTLE_MEMORY = 2 * 2**30
 _SCRIPT = """
 def stage(ins, outs):
@@ -49,25 +49,26 @@ class Finding:
     """One line of the result."""
 
     what: str
-    found: str
+    result: str
     cure: str = ""  #: empty where all is well
     needed: bool = True  #: whether jobs fail without it
 
     def __str__(self) -> str:
+        """Return the line, with the cure below it."""
         mark = "ok" if not self.cure else "MISSING" if self.needed else "no"
-        return f"{mark:8}{self.what}: {self.found}" + (
+        return f"{mark:8}{self.what}: {self.result}" + (
             f"\n        -> {self.cure}" if self.cure else ""
         )
 
 
 def examine() -> Iterator[Finding]:
-    """All findings. Each check is independent, so that one fault does not hide the next."""
+    """Yield all findings; each check is independent, so that one fault does not hide the next."""
     for look in (_package, _bindings, _program, _plugin, _machine, _extras):
         try:
             yield from look()
         except StageError as error:
-            found = " ".join(str(error.found or "").split())
-            yield Finding(error.what, found, error.cure or "See docs/install.md")
+            details = " ".join(str(error.found or "").split())
+            yield Finding(error.what, details, error.cure or "See docs/install.md")
 
 
 def _package() -> Iterator[Finding]:
@@ -105,7 +106,7 @@ def _run_program(stages: list) -> None:
 
 
 def _python_of(what: str, run: Callable[[list], object]) -> Finding:
-    """Which Python PDAL runs, and whether it has our package."""
+    """Return which Python PDAL runs, and whether it has our package."""
     point = {
         "type": "readers.faux",
         "mode": "constant",
@@ -123,14 +124,14 @@ def _python_of(what: str, run: Callable[[list], object]) -> Finding:
         if not answer.is_file():
             cure = "Install pdal-plugins again, for this PDAL and this Python"
             return Finding(what, "the script did not run", cure)
-        prefix, found = answer.read_text().splitlines()[:2]
+        prefix, package = answer.read_text().splitlines()[:2]
     python, here = f"Python of {prefix}", Path(__file__).resolve().parents[1]
-    if not os.path.isabs(found):
+    if not os.path.isabs(package):
         return Finding(
-            what, f"{python}; {found}", f"{prefix}/bin/python -m pip install pdal-stages"
+            what, f"{python}; {package}", f"{prefix}/bin/python -m pip install pdal-stages"
         )
-    if Path(found).resolve().parent != here:
-        other = f"{python}, which has another pdal_stages: {found}"
+    if Path(package).resolve().parent != here:
+        other = f"{python}, which has another pdal_stages: {package}"
         return Finding(what, other, "Keep one of them, or one version")
     return Finding(what, python)
 

@@ -1,6 +1,4 @@
-"""Compile the plugin for the installed PDAL, install it where PDAL looks, check and uninstall
-it.
-"""
+"""Compile the plugin for the installed PDAL, install it where PDAL looks, check, uninstall."""
 
 from __future__ import annotations
 
@@ -27,15 +25,13 @@ SOURCE = Path(__file__).with_name("stage.cpp")
 #: Suffix of a shared library, by which PDAL knows its plugins.
 SUFFIX = ".dylib" if sys.platform == "darwin" else ".so"
 _PYTHON_FILTER = f"libpdal_plugin_filter_python{SUFFIX}"
-#: A function of PDAL's library in every version, whose address gives the library's file.
+#: Symbol that PDAL's library has in every version; its address leads to the library's file.
 _OF_PDAL = "_ZN4pdal12StageFactoryC1Eb"
 _STILL_WORK = "pdal-stages pipeline and pdal-stages expand still work"
 
 
 def libraries() -> list[str]:
-    """The files that PDAL looks for: ``filters.hag_minima`` is in
-    ``libpdal_plugin_filter_hag_minima.so``.
-    """
+    """Return the files that PDAL looks for, such as ``libpdal_plugin_filter_hag_minima.so``."""
     parts = (name.partition(".") for name in stage_types())
     return [
         f"libpdal_plugin_{family.removesuffix('s')}_{name}{SUFFIX}" for family, _, name in parts
@@ -43,7 +39,7 @@ def libraries() -> list[str]:
 
 
 def usual_folder() -> Path:
-    """The folder in PDAL's path that has the plugin; otherwise the folder of ``filters.python``."""
+    """Return the folder in PDAL's path with the plugin, else that of ``filters.python``."""
     named = [
         Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part
     ]
@@ -52,13 +48,12 @@ def usual_folder() -> Path:
 
 
 def install(folder: Path | None = None) -> list[Path]:
-    """Compile the plugin and install it into a folder, by default beside ``filters.python``;
-    returns the files.
+    """Compile the plugin and install it, by default beside ``filters.python``; return the files.
 
     A missing `folder` is created.
     """
     target = folder or usual_folder()
-    found, cxx = pdal(), compiler()
+    installed, cxx = pdal(), compiler()
     if folder is not None:
         with contextlib.suppress(OSError):  # reported below
             folder.mkdir(parents=True, exist_ok=True)
@@ -73,7 +68,7 @@ def install(folder: Path | None = None) -> list[Path]:
     with tempfile.TemporaryDirectory(prefix=".pdal_stages_", dir=target) as work:
         library = Path(work, "library")
         Path(work, "declarations.hpp").write_text(declarations.header())
-        link = ["-shared", f"-L{found.library}", "-lpdalcpp", f"-Wl,-rpath,{found.library}"]
+        link = ["-shared", f"-L{installed.library}", "-lpdalcpp", f"-Wl,-rpath,{installed.library}"]
         link += [] if sys.platform == "darwin" else ["-Wl,-Bsymbolic", "-s"]
         flags = [
             "-std=c++17",
@@ -82,7 +77,7 @@ def install(folder: Path | None = None) -> list[Path]:
             "-fvisibility=hidden",
             "-w",
             f"-I{work}",
-            f"-I{found.headers}",
+            f"-I{installed.headers}",
         ]
         _run([*cxx, *flags, str(SOURCE), *link, "-o", str(library)])
         files = [target / name for name in libraries()]
@@ -92,7 +87,7 @@ def install(folder: Path | None = None) -> list[Path]:
 
 
 def uninstall(folder: Path | None = None) -> list[Path]:
-    """Remove the plugin; returns the removed files."""
+    """Remove the plugin; return the removed files."""
     target = folder or usual_folder()
     gone = [target / name for name in libraries() if (target / name).is_file()]
     for path in gone:
@@ -106,8 +101,9 @@ def uninstall(folder: Path | None = None) -> list[Path]:
 
 
 def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
-    """What is installed, and what is missing with its cure. An outdated plugin is reported when it
-    runs.
+    """Return lines on what is installed, and on what is missing with its cure.
+
+    An outdated plugin is reported when it runs.
     """
     good: list[str] = []
     bad: list[str] = []
@@ -142,7 +138,7 @@ class Pdal(NamedTuple):
 
 
 def compiler() -> list[str]:
-    """The C++ compiler, $CXX first."""
+    """Return the command of the C++ compiler, $CXX first."""
     named = os.environ.get("CXX", "").split()
     for words in [named] if named else [["c++"], ["g++"], ["clang++"]]:
         if shutil.which(words[0]):
@@ -157,19 +153,17 @@ def compiler() -> list[str]:
 
 
 def pdal() -> Pdal:
-    """PDAL's library and headers; :class:`DependencyError` with the cure where they are missing or
-    do not fit.
-    """
+    """Return PDAL's library and headers; DependencyError where they are missing or differ."""
     library, version = _library_folder(), pdal_env.dotted_version()
     for prefix in dict.fromkeys([*library.parents, Path(sys.prefix)]):
         headers = prefix / "include"
         if not (headers / "pdal" / "Filter.hpp").is_file():
             continue
-        found = _headers_version(headers)
-        if found not in (version, ""):
+        headers_version = _headers_version(headers)
+        if headers_version not in (version, ""):
             raise DependencyError(
                 "PDAL's headers and library are of different versions",
-                found=f"{headers / 'pdal'}: {found}, {library}: {version}",
+                found=f"{headers / 'pdal'}: {headers_version}, {library}: {version}",
                 cure="Install both from one place",
             )
         return Pdal(library, headers, version)
@@ -182,7 +176,7 @@ def pdal() -> Pdal:
 
 
 def plugin_folder() -> Path:
-    """The folder of ``filters.python``, where PDAL will find our plugin too."""
+    """Return the folder of ``filters.python``, where PDAL finds our plugin, too."""
     named = [
         Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part
     ]
@@ -200,7 +194,7 @@ def plugin_folder() -> Path:
     )
 
 
-class _Found(ctypes.Structure):
+class _LibraryOfAddress(ctypes.Structure):
     """``Dl_info`` of dladdr(3)."""
 
     _fields_ = [
@@ -210,15 +204,15 @@ class _Found(ctypes.Structure):
 
 
 def _library_folder() -> Path:
-    """The folder of the library that python-pdal is linked to."""
+    """Return the folder of the library that python-pdal is linked to."""
     extension = (
         importlib.import_module(f"{pdal_env.bindings().__name__}.libpdalpython").__file__ or ""
     )
     try:
         address = ctypes.cast(getattr(ctypes.CDLL(extension), _OF_PDAL), ctypes.c_void_p)
-        found = _Found()
-        if ctypes.CDLL(None).dladdr(address, ctypes.byref(found)) and found.file:
-            return Path(os.fsdecode(found.file)).resolve().parent
+        about = _LibraryOfAddress()
+        if ctypes.CDLL(None).dladdr(address, ctypes.byref(about)) and about.file:
+            return Path(os.fsdecode(about.file)).resolve().parent
     except (OSError, AttributeError):
         pass
     raise DependencyError(
@@ -229,7 +223,7 @@ def _library_folder() -> Path:
 
 
 def _headers_version(headers: Path) -> str:
-    """The version in PDAL's headers; empty where there is none."""
+    """Return the version in PDAL's headers; empty where there is none."""
     for name in ("pdal_features.hpp", "pdal_config.hpp"):
         path = headers / "pdal" / name
         text = path.read_text(errors="replace") if path.is_file() else ""
@@ -240,6 +234,7 @@ def _headers_version(headers: Path) -> str:
 
 
 def _run(command: Sequence[str]) -> None:
+    """Run the compiler; StageError with its first errors where it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         lines = done.stderr.splitlines()
