@@ -98,8 +98,8 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         be replaced: a folder, a write-protected file, a file of another kind.
     """
 
-    def refuse(problem: str, cure: str | None = None, found: str = str(path)) -> NoReturn:
-        raise StageError(problem.format(what), found=found, cure=cure)
+    def refuse(problem: str, cure: str | None = None, value: str = str(path)) -> NoReturn:
+        raise StageError(problem.format(what), found=value, cure=cure)
 
     if not os.fspath(path) or "\0" in os.fspath(path):
         refuse("the {} file has no name", "Is a shell variable unset?", ascii(path))
@@ -119,7 +119,7 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     if real.is_dir():
         refuse("the {} file names a folder", "Give a file name")
     if not os.access(real.parent, os.W_OK):
-        refuse("the folder of the {} file cannot be written to", found=str(real.parent))
+        refuse("the folder of the {} file cannot be written to", value=str(real.parent))
     if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
         refuse("the {} file is write-protected", "Give another name, or change its mode")
     older = kind_of(real) if kind else ""

@@ -229,19 +229,20 @@ def geotiff_code(path: str | os.PathLike) -> str:
     return f"EPSG:{across}{height}" if 0 < across < 32767 else ""
 
 
-#: GeoTIFF keys: type of the model (1 projected), angular unit, unit of x and y.
-_MODEL_TYPE, _ANGULAR_UNIT, _PLANE_UNIT = 1024, 2054, 3076
+# Numbers of GeoTIFF keys.
+_MODEL_TYPE = 1024  #: type of the model, 1 for projected
+_ANGULAR_UNIT = 2054
+_PLANE_UNIT = 3076  #: unit of x and y
 #: EPSG's codes of units by their length in meters.
 _UNIT_CODES = {1.0: 9001, 0.3048: 9002, 1200 / 3937: 9003}
 
 
 def set_geotiff_unit(path: str | os.PathLike, unit: float) -> None:
-    """Set the unit of x and y in the GeoTIFF keys of a LAS file, in place, where the keys name a unit.
+    """Set the unit of x and y in the GeoTIFF keys of a LAS file, in place, where they name one.
 
-    GDAL writes the unit of z there where the two differ, and of a plane without a projection it leaves out the
-    model's type, without which the unit of z is not read. `unit` is a length in meters; one without a code of EPSG's
-    changes nothing.
-    """
+    GDAL writes the unit of z there where the two differ, and of a plane without a projection it
+    leaves out the model's type, without which the unit of z is not read. `unit` is a length in
+    meters; one without a code of EPSG's changes nothing."""
     code = next((c for length, c in _UNIT_CODES.items() if math.isclose(length, unit)), None)
     header = read_header(path)
     if code is None or header is None:

@@ -77,7 +77,7 @@ BY_DIMENSIONALITY = (
 
 
 def radii_of(first: float, last: float, step: float) -> np.ndarray:
-    """The radii first, first + step, ... up to `last`, rounded to nanometers.
+    """Return the radii first, first + step, ... up to `last`, rounded to nanometers.
 
     >>> radii_of(0.25, 0.4, 0.05).tolist()
     [0.25, 0.3, 0.35, 0.4]
@@ -87,7 +87,9 @@ def radii_of(first: float, last: float, step: float) -> np.ndarray:
 
 
 def curvature_threshold(curvatures: np.ndarray) -> float:
-    """The curvature from which on a point is scattered [H17 eq. 1-3]; ValueError where there is no finite value (n,).
+    """Return the curvature from which on a point is scattered [H17 eq. 1-3].
+
+    ValueError where `curvatures` (n,) are not all finite, or n is 0.
 
     Two means, started at the smallest and the largest value, give the centers cur1 and cur2 of two
     groups of n1 and n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are
@@ -341,28 +343,33 @@ def adaptive_block(tree, points, search, surfaces, shapes, results):
         too few); curvatures; shapes and features of surfaces.
     """
     qx, qy, qz = points
-    queries = make_groups(qx, qy, qz)
-    ks = search.ks
-    need = min(ks[-1] + 1 if len(ks) else 0, len(tree.perm))
-    wanted = Wanted(need, search.within2, search.cap2)
-    near, scratch = make_near(CROWD * need + ROOM), make_scratch(len(search.radii) + len(ks))
+    queries, need = make_groups(qx, qy, qz), _wanted(tree, search).need
+    near = make_near(CROWD * need + ROOM)
+    scratch = make_scratch(len(search.radii) + len(search.ks))
     record = np.empty((0, 4), np.float32)
     done = 0
     while True:
         if shapes is not None:
             record = np.empty((len(near.x), 4), np.float32)
-        done = _serve_groups(
-            tree, queries, wanted, search, surfaces, shapes, results, (near, record, scratch), done
-        )
+        buffers = near, record, scratch
+        done = _serve_groups(tree, queries, search, surfaces, shapes, results, buffers, done)
         if done == len(qx):
             return
         near = make_near(4 * len(near.x))
 
 
+@device(forceinline=True)
+def _wanted(tree, search):
+    """Return the neighbors that a search needs."""
+    need = min(search.ks[-1] + 1 if len(search.ks) else 0, len(tree.perm))
+    return Wanted(need, search.within2, search.cap2)
+
+
 @device
-def _serve_groups(tree, queries, wanted, search, surfaces, shapes, results, buffers, done):
+def _serve_groups(tree, queries, search, surfaces, shapes, results, buffers, done):
     """Serve the queries from order[done] on; return up to where there is room for candidates."""
     near, record, scratch = buffers
+    wanted = _wanted(tree, search)
     need, within2, cap2 = wanted.need, wanted.within2, wanted.cap2
     starts, guess = queries.starts, FIRST2
     for group in range(np.searchsorted(starts, done, "right") - 1, len(starts) - 1):

@@ -1,16 +1,9 @@
-"""Cells of an absolute grid: means over them and those around them, one point for each, how many points they hold.
+"""Means over cells of the grid and their neighbors, and the density of a cloud.
 
 Means are of probabilities and of return flags: values are counted in 65535ths and added as whole
 numbers over a point's own cell and the cells around it, then divided by the number of points
 there. So a mean has the same bits for any order of points, number of threads, and in any tile that
 holds those cells; and a point costs as much in a dense cloud as in a sparse one.
-
-One point for each voxel bounds the cost of a point, and evens out how clouds are sampled. A sphere
-of 5 m holds 100,000 points of a drone's cloud, and 50 nearest neighbors there are a hand's
-breadth: features take long and mean something else than in the clouds a model was trained on. So
-each voxel is represented by one of its points, and the others take its result. Which one it is
-follows from the points' own coordinates and values: the same in any order and in any tile that
-holds whole voxels.
 """
 
 from __future__ import annotations
@@ -54,8 +47,9 @@ def cell_means(
 
 
 def density(xyz: npt.NDArray[np.float64]) -> float:
-    """Points per square meter: the median over the occupied cells of :data:`CELL` meters, 0 for an empty cloud.
+    """Return points per square meter: the median over the occupied cells of :data:`CELL` meters.
 
+    0 for an empty cloud.
     Strays, holes and the cloud's outline do not matter, and the order of the points does not.
     """
     if not len(xyz):
@@ -72,7 +66,7 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
 
 @njit
 def add_cells(order, start, shares, votes, cell, sums):
-    """Fill `cell` with each point's, and `sums` with each cell's shares (or votes) and, last, its points."""
+    """Fill `cell` with the points' cells, and `sums` with the cells' shares or votes and points."""
     classes = shares.shape[1]
     for k in range(len(start) - 1):
         for j in range(start[k], start[k + 1]):

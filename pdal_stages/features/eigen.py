@@ -99,7 +99,7 @@ def _turn(c, s, a, b):
 
 @device(forceinline=True)
 def _sweep(matrix, a, b, c):
-    """Return a matrix after a cyclic sweep of Jacobi's rotations, and three vectors turned along."""
+    """Return a matrix after a cyclic sweep of Jacobi's rotations, and vectors turned along."""
     xx, xy, xz, yy, yz, zz = matrix
     ax, ay, az = a
     bx, by, bz = b

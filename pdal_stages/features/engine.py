@@ -123,7 +123,7 @@ class FeatureEngine:
 
     @property
     def fitted(self) -> Fitted:
-        """What was given or fitted, as the kernels take it."""
+        """Values that were passed in or fitted, as the kernels take them."""
         return Fitted(self.bins, self.copt_threshold, self.seed)
 
     # ---- fitting
@@ -206,7 +206,9 @@ class FeatureEngine:
         memory_mb: float = 512,
         progress: Progress | bool | None = None,
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Compute features block by block, on every core; :meth:`run` is for more work on each block in its thread.
+        """Compute features block by block, on every core.
+
+        :meth:`run` is for more work on each block in its thread.
 
         Parameters
         ----------
@@ -399,7 +401,7 @@ class Run:
 
 
 def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return indices into the cloud, or None, and coordinates of queries, None for the whole cloud."""
+    """Return indices into the cloud, or None; and coordinates, None for the whole cloud."""
     if queries is None:
         return None, None
     array = np.asarray(queries)
@@ -422,7 +424,7 @@ def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
 def _dimensions(
     plan: FeaturePlan, dimensions: Mapping[str, npt.ArrayLike] | None, count: int
 ) -> dict[str, np.ndarray]:
-    """Return the plan's dimensions of `count` queries; DimensionError for a missing or wrong one."""
+    """Return the plan's dimensions of `count` queries; DimensionError for a missing one."""
     dimensions = dimensions or {}
     columns = {}
     for name in plan.dimensions:
@@ -522,25 +524,24 @@ def fit_clouds(
     if not plan.shapes:
         return None, threshold
     samples = [smallest_hashes(np.asarray(cloud), seed) for cloud in clouds]
-    hashes = np.sort(np.concatenate([found for found, _ in samples]))
+    hashes = np.sort(np.concatenate([of_cloud for of_cloud, _ in samples]))
     last = hashes[min(SAMPLES, len(hashes)) - 1]
     values: dict[str, list[np.ndarray]] = {}
-    for cloud, (found, of_cloud) in zip(clouds, samples, strict=True):
-        rows = of_cloud[found <= last]  # a thinned copy's points tie, and all stay
+    for cloud, (of_cloud, rows) in zip(clouds, samples, strict=True):
+        rows = rows[of_cloud <= last]  # a thinned copy's points tie, and all stay
         if len(rows):
             engine = FeatureEngine(
                 cloud, plan, copt_threshold=threshold, seed=seed, threads=threads
             )
-            for token, some in engine.shape_values(rows).items():
-                values.setdefault(token, []).append(some)
+            for token, metrics in engine.shape_values(rows).items():
+                values.setdefault(token, []).append(metrics)
             del engine  # one index at a time
-    return ShapeBins.fit(
-        {token: np.concatenate(parts) for token, parts in values.items()}
-    ), threshold
+    joined = {token: np.concatenate(parts) for token, parts in values.items()}
+    return ShapeBins.fit(joined), threshold
 
 
 def warmup() -> None:
-    """Compile every kernel and fill the cache, e.g. at installation; seconds where it is filled already."""
+    """Compile every kernel and fill the cache, e.g. at installation."""
     xyz = np.random.default_rng(0).uniform(0.0, 3.0, (60, 3))
     compute_features(xyz, None, "c1,s1,k5,kopt(2,5),ropt,copt", "all,surfaces", threads=1)
     compute_features(xyz, np.zeros((1, 3)), neighborhoods="c1", feature_set="covariance", threads=1)

@@ -27,26 +27,30 @@ class FeatureTable:
     report: Report = field(default_factory=Report)  #: see :class:`FeatureEngine`
 
     def __len__(self) -> int:
+        """Return the number of queries."""
         return len(self.values)
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Numbers of queries and features."""
         return self.values.shape
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        """Return the values, for NumPy."""
         return np.array(self.values, dtype) if copy else np.asarray(self.values, dtype)
 
     def __iter__(self) -> Iterator[str]:
-        """The names, as a data frame iterates."""
+        """Iterate over the names, as a data frame does."""
         return iter(self.names)
 
     def __contains__(self, name: object) -> bool:
+        """Return whether there is a feature of that name."""
         return name in self.names
 
     def __getitem__(self, name: str | list[str]) -> np.ndarray:
-        """The column of that name, a view; or those of several names, (m, names)."""
+        """Return the column of a name, a view; or those of several names, (m, names)."""
         if isinstance(name, list):
-            return np.stack([self[one] for one in name], axis=1)
+            return np.stack([self[each] for each in name], axis=1)
         if name not in self.names:
             raise KeyError(
                 f"no feature '{name}' in this table. {suggest(name, self.names)}".strip()

@@ -66,8 +66,7 @@ def build_nodes(tree, keys, node, lo, hi, depth, whole):
     """Make a node of the points perm[lo:hi] and, if `whole`, the `depth` levels below it."""
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     stack = np.empty((STACK, 4), np.int64)
-    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = node, lo, hi, depth
-    top = 1
+    top = push(stack, 0, node, lo, hi, depth)
     while top > 0:
         top -= 1
         node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
@@ -79,20 +78,15 @@ def build_nodes(tree, keys, node, lo, hi, depth, whole):
         middle = halve(x, y, z, perm, keys, lo, hi, box)
         if not whole:
             return
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
-            2 * node + 2,
-            middle,
-            hi,
-            depth - 1,
-        )
-        top += 1
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
-            2 * node + 1,
-            lo,
-            middle,
-            depth - 1,
-        )
-        top += 1
+        top = push(stack, top, 2 * node + 2, middle, hi, depth - 1)
+        top = push(stack, top, 2 * node + 1, lo, middle, depth - 1)
+
+
+@device(forceinline=True)
+def push(stack, top, node, lo, hi, depth):
+    """Put a node of the points perm[lo:hi] on a stack; return the size of the stack."""
+    stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = node, lo, hi, depth
+    return top + 1
 
 
 @device
@@ -184,7 +178,7 @@ def enough2(tree, box, need):
 
 @device
 def gather(tree, box, reach2, copies, limit, candidates):
-    """Collect the points within sqrt(`reach2`) of `box`; return how many, or -1 for more than `limit`.
+    """Collect the points within sqrt(`reach2`) of `box`; return their number, or -1 above `limit`.
 
     `candidates` has room for them: arrays x, y, z, at (positions in the cloud) and a stack.
 
@@ -201,9 +195,8 @@ def gather(tree, box, reach2, copies, limit, candidates):
         candidates.stack,
     )
     # Unsigned: what may be negative is looked up with a detour.
-    count, one = np.uint64(0), np.uint64(1)
-    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, len(perm), tree.depth
-    top = 1
+    count, step = np.uint64(0), np.uint64(1)
+    top = push(stack, 0, 0, 0, len(perm), tree.depth)
     while top > 0:
         top -= 1
         node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
@@ -228,21 +221,9 @@ def gather(tree, box, reach2, copies, limit, candidates):
                 cz[count] = c
                 ci[count] = np.uint32(p)
                 # Written always, kept if near: no branch to mispredict.
-                count += one if dx * dx + dy * dy + dz * dz <= reach2 else np.uint64(0)
+                count += step if dx * dx + dy * dy + dz * dz <= reach2 else np.uint64(0)
             continue
         middle = (lo + hi) // 2
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
-            2 * node + 2,
-            middle,
-            hi,
-            depth - 1,
-        )
-        top += 1
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = (
-            2 * node + 1,
-            lo,
-            middle,
-            depth - 1,
-        )
-        top += 1
+        top = push(stack, top, 2 * node + 2, middle, hi, depth - 1)
+        top = push(stack, top, 2 * node + 1, lo, middle, depth - 1)
     return np.int64(count)

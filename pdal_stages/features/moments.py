@@ -1,4 +1,4 @@
-"""Moments of neighborhoods, summed over candidates within a radius, and the features made of them."""
+"""Moments of neighborhoods, summed over candidates within a radius, and features of them."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ def distance2(dx, dy, dz, spherical):
 def sums_within(candidates, count, point, spherical, r2, out, j):
     """Write moments about a point of the first `count` candidates within sqrt(r2) of it.
 
-    They go to ``out[:, j]``. `spherical` is 1 for a sphere and 0 for a cylinder. The order of the sums follows from `count`
-    alone.
+    They go to ``out[:, j]``. `spherical` is 1 for a sphere and 0 for a cylinder. The order of the
+    sums follows from `count` alone.
     """
     px, py, pz, keys = candidates
     qx, qy, qz = point
@@ -126,7 +126,8 @@ def sums_within(candidates, count, point, spherical, r2, out, j):
 def write_eigen_features(values, j, n, l1, l2, l3, nz):
     """Write the features of eigenvalues l1 >= l2 >= l3 of `n` points to column `j` of `values`.
 
-    A new eigen-feature is one line here, ``values[ROW.Name, j] = ...``, and its entry in the registry.
+    A new eigen-feature is one line here, ``values[ROW.Name, j] = ...``, and one entry in the
+    registry.
     `nz` is the height of the unit eigenvector of l3. With fewer than three points, or points that
     all coincide, features are 0 and the surface variation is 1/3 [H17].
     """
@@ -146,6 +147,29 @@ def write_eigen_features(values, j, n, l1, l2, l3, nz):
     values[ROW.EigenvalueSum, j] = total if real else 0.0
     values[ROW.SurfaceVariation, j] = e3 if real else 1.0 / 3.0
     values[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= LEAST_MEMBERS else 0.0
+
+
+@device(forceinline=True)
+def _center(moments, heights, count, m, values):
+    """Write covariances about the means to `m`, and the features of heights to `values`."""
+    for j in range(count):
+        n = moments[N, j]
+        inverse = 1.0 / (n if n > 0.0 else 1.0)
+        mx, my, mz = moments[SX, j], moments[SY, j], moments[SZ, j]
+        mx, my, mz = mx * inverse, my * inverse, mz * inverse
+        ax, ay, az = moments[SXX, j], moments[SYY, j], moments[SZZ, j]
+        ax, ay, az = ax * inverse, ay * inverse, az * inverse
+        xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
+        apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
+        m[XX, j], m[YY, j], m[ZZ, j] = xx, yy, zz
+        m[XY, j] = moments[SXY, j] * inverse - mx * my
+        m[XZ, j] = moments[SXZ, j] * inverse - mx * mz
+        m[YZ, j] = moments[SYZ, j] * inverse - my * mz
+        # Not read from the moments again, which LLVM must fear to overlap with what is written.
+        m[COUNT, j] = n if apart else 0.0
+        values[ROW.HeightRange, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
+        values[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
+        values[ROW.HeightAboveLowest, j] = heights[j] - moments[LOW, j] if n > 0.0 else 0.0
 
 
 @njit
@@ -177,26 +201,7 @@ def finish(table, volume, heights, few, copies, columns, out):
     for start in range(0, len(heights), BATCH):
         count = min(BATCH, len(heights) - start)
         moments = table[:, start : start + count]
-        for j in range(count):
-            n = moments[N, j]
-            inverse = 1.0 / (n if n > 0.0 else 1.0)
-            mx, my, mz = moments[SX, j], moments[SY, j], moments[SZ, j]
-            mx, my, mz = mx * inverse, my * inverse, mz * inverse
-            ax, ay, az = moments[SXX, j], moments[SYY, j], moments[SZZ, j]
-            ax, ay, az = ax * inverse, ay * inverse, az * inverse
-            xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
-            apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
-            m[XX, j], m[YY, j], m[ZZ, j] = xx, yy, zz
-            m[XY, j] = moments[SXY, j] * inverse - mx * my
-            m[XZ, j] = moments[SXZ, j] * inverse - mx * mz
-            m[YZ, j] = moments[SYZ, j] * inverse - my * mz
-            # Not read from the moments again, which LLVM must fear to overlap with what is written.
-            m[COUNT, j] = n if apart else 0.0
-            values[ROW.HeightRange, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
-            values[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
-            values[ROW.HeightAboveLowest, j] = (
-                heights[start + j] - moments[LOW, j] if n > 0.0 else 0.0
-            )
+        _center(moments, heights[start:], count, m, values)
         for j in range(count):
             r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
             values[ROW.Radius, j] = moments[RADIUS, j]

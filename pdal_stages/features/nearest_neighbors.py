@@ -77,9 +77,9 @@ def make_near(room):
     """Return room for `room` candidates."""
     f, u = np.float64, np.uint32
     return Near(
-        np.empty(room, f), np.empty(room, f), np.empty(room, f), np.empty(room, u), np.empty(room, f),
-        np.empty(room, np.int32), np.empty(room, f), np.empty(room, u), np.empty(BINS + 1, np.int64),
-        np.empty((STACK, 4), np.int64),
+        np.empty(room, f), np.empty(room, f), np.empty(room, f), np.empty(room, u),
+        np.empty(room, f), np.empty(room, np.int32), np.empty(room, f), np.empty(room, u),
+        np.empty(BINS + 1, np.int64), np.empty((STACK, 4), np.int64),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Neighborhood tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``copt``) and presets, parsed and checked.
+"""Neighborhood tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``copt``) and presets.
 
 One token is used alike in options, dimension suffixes, model files and documents. Sources: [B16]
 Blomley, Jutzi, Weinmann 2016, doi:10.5194/isprsannals-III-3-169-2016; [W18] Weinmann, Blomley,
@@ -44,7 +44,8 @@ MAX_K = 10_000
 AROUND = 10
 #: Density takes smaller radii as this, meters: copies of one point lie at a distance of 0.
 LEAST_RADIUS = 0.001
-MIN_RADIUS, MAX_RADIUS = 0.001, 100_000.0  # meters
+MIN_RADIUS = 0.001  #: meters
+MAX_RADIUS = 100_000.0  #: meters
 #: Neighborhoods of one plan: a model file of a few kB must not ask for hours of work.
 MOST = 64
 
@@ -101,10 +102,11 @@ class Neighborhood:
 
     @property
     def adaptive(self) -> bool:
-        """Whether the size is chosen point by point (and so is a feature, ``Radius``)."""
+        """True where the size is chosen point by point, so that there is a feature ``Radius``."""
         return self.kind in ADAPTIVE
 
     def __str__(self) -> str:
+        """Return the token."""
         return self.token
 
 
@@ -126,27 +128,29 @@ def parse_neighborhoods(spec: str | Iterable[str]) -> list[Neighborhood]:
     >>> [str(n) for n in parse_neighborhoods("c2.0, s.5, c2, kopt(10,100)")]
     ['c2', 's0.5', 'kopt']
     """
-    found: dict[str, Neighborhood] = {}
+    parsed: dict[str, Neighborhood] = {}
     for word in _words(spec):
         for token in PRESETS[word][0] if word in PRESETS else (word,):
-            one = _parse_token(token)
-            found.setdefault(one.token, one)
-    if not found:
+            neighborhood = _parse_token(token)
+            parsed.setdefault(neighborhood.token, neighborhood)
+    if not parsed:
         raise OptionError("no neighborhood was given", found=repr(spec), cure=_CURE)
-    if len(found) > MOST:
-        raise OptionError(f"at most {MOST} neighborhoods can be used together", found=len(found))
+    if len(parsed) > MOST:
+        raise OptionError(f"at most {MOST} neighborhoods can be used together", found=len(parsed))
     suffixes: dict[str, str] = {}
-    for token, one in found.items():  # ropt(1,2.5,1) and ropt(1.2,5,1) would share dimension names
-        if suffixes.setdefault(one.suffix, token) != token:
+    # ropt(1,2.5,1) and ropt(1.2,5,1) would share dimension names
+    for token, neighborhood in parsed.items():
+        suffix = neighborhood.suffix
+        if suffixes.setdefault(suffix, token) != token:
             raise OptionError(
-                f"'{suffixes[one.suffix]}' and '{token}' would both be called ..._{one.suffix}",
+                f"'{suffixes[suffix]}' and '{token}' would both be called ..._{suffix}",
                 cure="Use them in two stages",
             )
-    return list(found.values())
+    return list(parsed.values())
 
 
 def preset_dimensions(spec: str | Iterable[str]) -> tuple[str, ...]:
-    """The points' own dimensions that the presets named in `spec` use as features."""
+    """Return the points' own dimensions that the presets named in `spec` use as features."""
     used = (PRESETS[word][1] for word in _words(spec) if word in PRESETS)
     return tuple(dict.fromkeys(name for names in used for name in names))
 
@@ -216,7 +220,8 @@ def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
             MIN_RADIUS <= values[0] <= values[1] <= MAX_RADIUS and values[2] >= MIN_RADIUS
         ):
             raise OptionError(
-                f"{head} takes meters, {head}(r_min,r_max,step), each at least {MIN_RADIUS}, r_min <= r_max",
+                f"{head} takes meters, {head}(r_min,r_max,step), each at least {MIN_RADIUS}, "
+                "r_min <= r_max",
                 found=text,
             )
         if (values[1] - values[0]) / values[2] > 1000:
@@ -229,7 +234,7 @@ def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
 
 
 def _rounded(value: float) -> float:
-    """The value its token prints: two radii are one neighborhood exactly when their tokens are equal."""
+    """Return the value that a token prints: equal tokens mean equal radii."""
     return float(_number(value))
 
 

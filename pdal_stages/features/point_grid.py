@@ -1,9 +1,9 @@
 """A cloud sorted by the cells of the absolute grid, and a sparse table of its cells.
 
-The size of cells follows from the neighborhoods alone, never from the cloud, so every tile of a cloud
-sees the same cells with the same points in the same order. That order is what makes sums the same to
-the last bit however the points were stored. Only occupied cells are kept, so one stray point a million
-kilometers away costs one cell.
+The size of cells follows from the neighborhoods alone, never from the cloud, so every tile of a
+cloud sees the same cells with the same points in the same order. That order is what makes sums the
+same to the last bit however the points were stored. Only occupied cells are kept, so one stray
+point a million kilometers away costs one cell.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class Feature:
     group: str  #: covariance, geometric, shapes, relative or surfaces
     unit: str  #: 1 for ratios
     definition: str
-    #: Kinds of neighborhoods that have the feature; empty: all.
+    #: Kinds of neighborhoods that have the feature; empty for all.
     kinds: tuple[str, ...] = ()
 
 
@@ -54,29 +54,35 @@ FEATURES = (
     Feature("Eigenentropy", "covariance", "1", "-(e1 ln e1 + e2 ln e2 + e3 ln e3), 0 ln 0 = 0"),
     Feature("EigenvalueSum", "covariance", "m²", "l1 + l2 + l3"),
     Feature("SurfaceVariation", "covariance", "1", "e3"),
-    Feature("Density", "geometric", "1/m² or 1/m³", "n / (π r²) of cylinders, n / (4/3 π r³) of the rest"),
+    Feature("Density", "geometric", "1/m² or 1/m³",
+            "n / (π r²) of cylinders, n / (4/3 π r³) of the rest"),
     Feature("Verticality", "geometric", "1", "1 - abs(nz)"),
     Feature("HeightRange", "geometric", "m", "highest minus lowest z"),
     Feature("HeightStd", "geometric", "m", "standard deviation of z (divisor n)"),
-    Feature("Radius", "geometric", "m", "the chosen radius; kopt, ropt, rdim and copt only", ADAPTIVE),
+    Feature("Radius", "geometric", "m", "the chosen radius; kopt, ropt, rdim and copt only",
+            ADAPTIVE),
     *(
         Feature(f"{metric}_{number}", "shapes", "1", f"share of pulls in bin {number}: {measured}")
         for metric, measured in SHAPES.items()
         for number in range(SHAPE_BINS)
     ),
-    Feature("HeightAboveLowest", "relative", "m", "z of the point minus lowest z of the neighborhood [HWS16]"),
-    Feature("NormalAgreement", "surfaces", "1", "mean abs(n·n′) of the normals of the point and its neighbors",
-            ("knn",)),
-    Feature("SurfaceVariationMin", "surfaces", "1", "lowest surface variation of the neighbors", ("knn",)),
-    Feature("SurfaceVariationMean", "surfaces", "1", "mean surface variation of the neighbors", ("knn",)),
-    Feature("SurfaceVariationStd", "surfaces", "1", "standard deviation of the neighbors' surface variation",
-            ("knn",)),
+    Feature("HeightAboveLowest", "relative", "m",
+            "z of the point minus lowest z of the neighborhood [HWS16]"),
+    Feature("NormalAgreement", "surfaces", "1",
+            "mean abs(n·n′) of the normals of the point and its neighbors", ("knn",)),
+    Feature("SurfaceVariationMin", "surfaces", "1",
+            "lowest surface variation of the neighbors", ("knn",)),
+    Feature("SurfaceVariationMean", "surfaces", "1",
+            "mean surface variation of the neighbors", ("knn",)),
+    Feature("SurfaceVariationStd", "surfaces", "1",
+            "standard deviation of the neighbors' surface variation", ("knn",)),
 )  # fmt: skip
 
 BY_NAME = {feature.name: feature for feature in FEATURES}
 
 
 def _names(*groups: str) -> tuple[str, ...]:
+    """Return the names of the features of groups, in the order of the columns."""
     return tuple(feature.name for feature in FEATURES if feature.group in groups)
 
 
@@ -99,5 +105,5 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 
 def rows_of(*names: str) -> Any:
-    """Return the rows of a kernel's table as a named tuple, ``rows.Linearity`` and so on; kernels see constants."""
+    """Return the rows of a kernel's table by name: a named tuple, whose values kernels see."""
     return namedtuple("Rows", names)(*range(len(names)))

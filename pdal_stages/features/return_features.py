@@ -1,4 +1,4 @@
-"""What return numbers say of a point and of its surroundings: how often pulses go through.
+"""Features of return numbers: how often pulses go through a point's surroundings.
 
 A pulse that meets a roof gives one return, one that meets a tree several. Two flags say so of a
 point: it is one of several returns (`MultipleReturn`), or not the last of its pulse
@@ -50,7 +50,10 @@ class ReturnFeature:
 
 
 def parse(name: str) -> ReturnFeature | None:
-    """The feature of a name such as ``EarlierReturn_box0_5``; None for another name, OptionError for another side."""
+    """Return the feature of a name such as ``EarlierReturn_box0_5``; None for another name.
+
+    OptionError for a side that is not in :data:`SIDES`.
+    """
     match = _NAME.fullmatch(name)
     if match is None:
         return None
@@ -67,8 +70,8 @@ def parse(name: str) -> ReturnFeature | None:
 
 
 def reach(names: Iterable[str]) -> float:
-    """Meters, along x or y, to the farthest point that can matter to any of these dimensions."""
-    return max((2.0 * one.side for one in map(parse, names) if one is not None), default=0.0)
+    """Return meters, along x or y, to the farthest point that matters to any of these names."""
+    return max((2.0 * feature.side for feature in map(parse, names) if feature), default=0.0)
 
 
 def return_features(
@@ -77,12 +80,14 @@ def return_features(
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
-    """Those of `names` that are return features, for every point of a cloud: (n,) each, 0 to 1, whole numbers or float32.
+    """Compute those of `names` that are return features, for every point of a cloud.
+
+    (n,) each, from 0 to 1; uint8 for the point itself, float32 for its surroundings.
 
     Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all
     is 0.
     """
-    wanted = {name: one for name in names if (one := parse(name)) is not None}
+    wanted = {name: feature for name in names if (feature := parse(name)) is not None}
     if not wanted:
         return {}
     number, total = (
@@ -92,13 +97,13 @@ def return_features(
     flags[:, 0] = np.where(total > 1, WHOLE, 0)
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
     del number, total
-    own = (flags > 0).view(np.uint8)
-    found: dict[str, npt.NDArray[Any]] = {}
-    for scale in dict.fromkeys((one.axes, one.side) for one in wanted.values()):
-        cell, means = (
-            cell_means(xyz[:, : scale[0]], flags, scale[1]) if scale[0] else (slice(None), own)
-        )
-        for name, one in wanted.items():
-            if (one.axes, one.side) == scale:
-                found[name] = means[:, list(FLAGS).index(one.flag)][cell]
-    return {name: found[name] for name in wanted}
+    values: dict[str, npt.NDArray[Any]] = {}
+    for axes, side in dict.fromkeys((feature.axes, feature.side) for feature in wanted.values()):
+        cell: Any = slice(None)
+        means: npt.NDArray[Any] = (flags > 0).view(np.uint8)
+        if axes:
+            cell, means = cell_means(xyz[:, :axes], flags, side)
+        for name, feature in wanted.items():
+            if (feature.axes, feature.side) == (axes, side):
+                values[name] = means[:, list(FLAGS).index(feature.flag)][cell]
+    return {name: values[name] for name in wanted}

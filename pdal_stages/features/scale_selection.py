@@ -136,8 +136,9 @@ def estimate_entropies(s, entropy, first, last, least):
         w = 1.0 / n[j]
         a, b, c = x[j] * w, y[j] * w, z[j] * w
         value = estimate_entropy(
-            xx[j] * w - a * a, xy[j] * w - a * b, xz[j] * w - a * c, yy[j] * w - b * b, yz[j] * w - b * c,
-            zz[j] * w - c * c, COINCIDENT * w * (xx[j] + yy[j] + zz[j]),
+            xx[j] * w - a * a, xy[j] * w - a * b, xz[j] * w - a * c,
+            yy[j] * w - b * b, yz[j] * w - b * c, zz[j] * w - c * c,
+            COINCIDENT * w * (xx[j] + yy[j] + zz[j]),
         )  # fmt: skip
         entropy[j] = value if n[j] >= least else NEVER
 

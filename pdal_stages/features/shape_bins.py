@@ -1,4 +1,4 @@
-"""Thresholds of the shape distributions' bins, which sample neighborhoods fill evenly [B16 3.2.2]."""
+"""Thresholds of shape distributions' bins, which sample neighborhoods fill evenly [B16 3.2.2]."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class ShapeBins:
         return tuple(self._thresholds)
 
     def thresholds(self, token: str) -> np.ndarray:
-        """Return the thresholds of one neighborhood, (metrics, 9) float64, in radians and meters."""
+        """Return thresholds (metrics, 9) float64 of one neighborhood, in radians and meters."""
         try:
             return self._thresholds[token].copy()
         except KeyError:
@@ -136,7 +136,8 @@ def _check(token: str, rows: Any) -> np.ndarray:
         array = np.zeros(0)
     if array.shape != (len(METRICS), INNER):
         raise OptionError(
-            f"the shape thresholds of '{token}' must be {INNER} numbers for each of {', '.join(METRICS)}",
+            f"the shape thresholds of '{token}' must be {INNER} numbers for each of "
+            f"{', '.join(METRICS)}",
             cure=_CURE,
         )
     for name, row in zip(METRICS, array, strict=True):

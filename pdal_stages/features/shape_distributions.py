@@ -1,4 +1,4 @@
-"""Shape distributions A3, D1, D2, D3, D4 of a neighborhood by random pulls [B16 3.2.2; Osada et al. 2002].
+"""Shape distributions A3, D1, D2, D3, D4 by random pulls [B16 3.2.2; Osada et al. 2002].
 
 A pull draws four different members a, b, c, d. All five metrics are taken from it:
 
@@ -18,13 +18,13 @@ are 0, as they are. The angle is 0 where b or c coincides with a.
 A new metric is an entry of ``registry.SHAPES``, a line in :func:`measure` and an entry of
 ``shape_bins.COMPARABLE``; columns, groups and the size of every array follow.
 
-**No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's float64
-coordinates, the neighborhood's token, i) and members come in a canonical order, so counts have the
-same bits for any order of points, tile or number of threads.
+**No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's
+float64 coordinates, the neighborhood's token, i) and members come in a canonical order, so counts
+have the same bits for any order of points, tile or number of threads.
 
-**No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 4 area^2 (D3: 4 t^4),
-as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3); all ascend with the
-metric.
+**No root is taken.** Metrics are compared with their thresholds as squares (D1, D2), as 4 area^2
+(D3: 4 t^4), as 6 volume (D4: 6 t^3) and as the negative signed square of the cosine (A3); all
+ascend with the metric.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def shapes_of(chosen: Sequence[Columns], points: Axes, seed: int, bins: ShapeBin
 
 
 class Fitted(NamedTuple):
-    """What follows from a cloud, or was given, beside a plan."""
+    """Values that were fitted to a cloud, or passed in, beside a plan."""
 
     bins: ShapeBins | None = None  #: thresholds of the shape distributions, where shapes are wanted
     copt_threshold: float | None = None  #: curvature that parts scattered from regular points
@@ -157,7 +157,7 @@ class NeighborhoodGroup:
         raise NotImplementedError
 
     def shape_values(self, points: Axes, fitted: Fitted) -> dict[str, np.ndarray]:
-        """Return by token the metrics of all pulls round points, (m, METRICS, PULLS), comparable."""
+        """Return by token the metrics (m, METRICS, PULLS) of all pulls round points, comparable."""
         fitted = fitted._replace(bins=None)
         shapes = self.shapes(points, fitted)
         if shapes is None:
@@ -284,7 +284,7 @@ def _draw_few(low, high, n, draws):
 
 @device
 def fetch(record, draws, points):
-    """Copy the drawn members' records one after another (16 bytes at once: loads and stores, no more)."""
+    """Copy the drawn members' records one after another, 16 bytes at once."""
     for i in range(DRAWN * ROOM):
         p = draws[i]
         x, y, z, w = record[p, 0], record[p, 1], record[p, 2], record[p, 3]
