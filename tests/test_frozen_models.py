@@ -65,7 +65,7 @@ def test_a_new_feature_is_one_entry_and_one_line_and_changes_no_model(cloud, tmp
             "FEATURES = (\n",
             '    Feature("Dummy", "covariance", "1", "always 0.75"),\n',
         ),
-        ("moments.py", "    entropy = entropy_term(e1)", "    made[ROW.Dummy, j] = 0.75\n"),
+        ("moments.py", "    entropy = entropy_term(e1)", "    values[ROW.Dummy, j] = 0.75\n"),
     ):
         path = tmp_path / "pdal_stages" / "features" / file
         text = path.read_text(encoding="utf-8")
