@@ -1,4 +1,4 @@
-"""The picture of docs/architecture.md: the way of a tile from reader to writer, and the room in which each step is done.
+"""Draw the picture of docs/architecture.md: the core as the way of a tile, and the extras as doors.
 
 python docs/architecture_picture.py        # writes docs/pictures/architecture.svg
 """
@@ -10,17 +10,15 @@ from pathlib import Path
 
 TARGET = Path(__file__).resolve().parent / "pictures" / "architecture.svg"
 
-#: (heading, steps) of each column; a step is two lines of words and the room that does it ("PDAL": not ours).
+#: (heading, steps) of each column; a step is two lines of text and its room ("PDAL": not ours).
 COLUMNS = (
     (
         "Before any point",
         (
-            ("Read the pipeline as PDAL does,", "with line numbers for messages", "pipeline/"),
-            ("Apply what the command line", "overrides", "pipeline/"),
+            ("Read the pipeline as PDAL does,", "apply options of the command line", "pipeline/"),
             ("Make each of our stages an object:", "checked options, plan, model", "stages/"),
             ("Turn our stages into filters.python:", "plain PDAL JSON", "pipeline/"),
-            ("With --tile: find the inputs, lay", "the grid, hand out the tiles", "tiling/"),
-            ("With --tile: cut the tile and its", "surroundings out of the files", "tiling/"),
+            ("In tiles: cut each tile with its", "surroundings out of the files", "tiling/"),
         ),
     ),
     (
@@ -28,66 +26,104 @@ COLUMNS = (
         (
             ("Reader", "", "PDAL"),
             ("Hand the points to the stage,", "in meters, class codes without flags", "pipeline/"),
-            ("Heights above a terrain", "", "terrain/"),
+            ("Heights, ground, noise;", "decks, wires, towers", "terrain/ structures/"),
             ("Features of many neighborhoods,", "block by block", "features/"),
-            (
-                "Forest or network; a second pass",
-                "reads what the first said all around",
-                "classifier/",
-            ),
-            ("Classes, reliability, margin", "", "classifier/"),
         ),
     ),
     (
-        "Afterwards",
+        "Classes, and afterwards",
         (
-            ("With --tile: put the tiles' results", "into the points of each file", "tiling/"),
-            ("Writer, under a hidden name", "", "PDAL"),
-            ("Check that the file is complete,", "then give it its name", "base/"),
+            ("Forest or network, a second pass;", "class, reliability", "classifier/ alsnet/"),
+            ("In tiles: put the tiles' results", "into the points of each file", "tiling/"),
+            ("Writer; the file gets its name", "when it is complete", "PDAL base/"),
             ("Compare with a reference", "", "accuracy/"),
-            ("Pages and pictures", "", "reports/"),
         ),
     ),
 )
-WIDE, GAP, BOX, STEP, TOP = 316, 28, 64, 82, 62
+#: (room, what it adds, its doors in the core) of each extra.
+EXTRAS = (
+    ("objects/", "outlines of buildings, trees", "filters.objects, objects"),
+    ("review/", "what a person checks, corrects", "review, corrections"),
+    ("reports/", "pages, pictures, vector files", "--html, --report"),
+    ("synthetic/", "a generated town", "demo"),
+    ("qgis/", "the plugin for QGIS", "calls the command"),
+)
+COLUMN_WIDTH = 316
+GAP = 28
+BOX_HEIGHT = 64
+STEP = 82
+TOP = 62
+EXTRA_GAP = 14
+
+STYLE = (
+    "<style>text{font:14px system-ui,Arial,sans-serif;fill:#181d23}"
+    ".head{font-weight:600;font-size:16px}.small{font-size:12.5px}"
+    ".room{font:13px ui-monospace,Menlo,Consolas,monospace;fill:#1f6fb2}"
+    ".ours{fill:#fff;stroke:#9aa3ad}.pdal{fill:#f3ead9;stroke:#b08954}"
+    ".extra{fill:#eef4ee;stroke:#7d9a7d;stroke-dasharray:4 3}"
+    ".way{stroke:#58616c;stroke-width:1.6;fill:none;marker-end:url(#tip)}.page{fill:#fafaf8}</style>"
+    '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" '
+    'orient="auto"><path d="M0 0L8 4L0 8Z" fill="#58616c"/></marker></defs>'
+)
 
 
 def picture() -> str:
-    """The SVG."""
-    width = len(COLUMNS) * (WIDE + GAP) + GAP
-    height = TOP + max(len(steps) for _, steps in COLUMNS) * STEP + 8
+    """Return the SVG."""
+    width = len(COLUMNS) * (COLUMN_WIDTH + GAP) + GAP
+    rows = max(len(steps) for _, steps in COLUMNS)
+    extras_top = TOP + rows * STEP + 14
+    height = extras_top + 120
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" '
-        'aria-label="The way of a tile from reader to writer">',
-        "<style>text{font:14px system-ui,Arial,sans-serif;fill:#181d23}.head{font-weight:600;font-size:16px}"
-        ".room{font:13px ui-monospace,Menlo,Consolas,monospace;fill:#1f6fb2}.ours{fill:#fff;stroke:#9aa3ad}"
-        ".pdal{fill:#f3ead9;stroke:#b08954}.way{stroke:#58616c;stroke-width:1.6;fill:none;marker-end:url(#tip)}"
-        ".page{fill:#fafaf8}</style>",
-        '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" orient="auto">'
-        '<path d="M0 0L8 4L0 8Z" fill="#58616c"/></marker></defs>',
+        'aria-label="The core as the way of a tile from reader to writer, and the extras">',
+        STYLE,
         f'<rect class="page" width="{width}" height="{height}"/>',
     ]
     for number, (heading, steps) in enumerate(COLUMNS):
-        left = GAP + number * (WIDE + GAP)
+        left = GAP + number * (COLUMN_WIDTH + GAP)
         parts.append(f'<text class="head" x="{left}" y="36">{number + 1}. {escape(heading)}</text>')
-        for row, (first, second, room) in enumerate(steps):
+        for row, step in enumerate(steps):
             top = TOP + row * STEP
-            kind = "pdal" if room == "PDAL" else "ours"
-            parts.append(
-                f'<rect class="{kind}" x="{left}" y="{top}" width="{WIDE}" height="{BOX}" rx="6"/>'
-                f'<text x="{left + 14}" y="{top + (20 if second else 28)}">{escape(first)}</text>'
-                f'<text x="{left + 14}" y="{top + 37}">{escape(second)}</text>'
-                f'<text class="room" x="{left + 14}" y="{top + (55 if second else 49)}">{escape(room)}</text>'
-            )
+            parts += draw_step(left, top, *step)
             if row + 1 < len(steps):
-                parts.append(
-                    f'<path class="way" d="M{left + WIDE // 2} {top + BOX}V{top + STEP - 1}"/>'
-                )
-            elif number + 1 < len(COLUMNS):
-                turn = left + WIDE + GAP // 2
-                way = f"M{left + WIDE} {top + BOX // 2}H{turn}V{TOP + BOX // 2}H{left + WIDE + GAP - 1}"
+                way = f"M{left + COLUMN_WIDTH // 2} {top + BOX_HEIGHT}V{top + STEP - 1}"
                 parts.append(f'<path class="way" d="{way}"/>')
+            elif number + 1 < len(COLUMNS):
+                turn = left + COLUMN_WIDTH + GAP // 2
+                way = f"M{left + COLUMN_WIDTH} {top + BOX_HEIGHT // 2}H{turn}"
+                way += f"V{TOP + BOX_HEIGHT // 2}H{left + COLUMN_WIDTH + GAP - 1}"
+                parts.append(f'<path class="way" d="{way}"/>')
+    parts.append(
+        f'<text class="head" x="{GAP}" y="{extras_top + 16}">Extras: the core works without them; '
+        "each is entered by its doors alone</text>"
+    )
+    wide = (width - 2 * GAP - (len(EXTRAS) - 1) * EXTRA_GAP) / len(EXTRAS)
+    for number, extra in enumerate(EXTRAS):
+        parts += draw_extra(GAP + number * (wide + EXTRA_GAP), extras_top + 32, wide, *extra)
     return "\n".join([*parts, "</svg>", ""])
+
+
+def draw_step(left: int, top: int, first: str, second: str, room: str) -> list[str]:
+    """Return the box of a step."""
+    kind = "pdal" if room.startswith("PDAL") else "ours"
+    first_y, room_y = (20, 55) if second else (28, 49)
+    return [
+        f'<rect class="{kind}" x="{left}" y="{top}" width="{COLUMN_WIDTH}" height="{BOX_HEIGHT}" '
+        'rx="6"/>',
+        f'<text x="{left + 14}" y="{top + first_y}">{escape(first)}</text>',
+        f'<text x="{left + 14}" y="{top + 37}">{escape(second)}</text>',
+        f'<text class="room" x="{left + 14}" y="{top + room_y}">{escape(room)}</text>',
+    ]
+
+
+def draw_extra(left: float, top: int, wide: float, room: str, adds: str, doors: str) -> list[str]:
+    """Return the box of an extra."""
+    return [
+        f'<rect class="extra" x="{left:g}" y="{top}" width="{wide:g}" height="72" rx="6"/>',
+        f'<text class="room" x="{left + 10:g}" y="{top + 21}">{escape(room)}</text>',
+        f'<text class="small" x="{left + 10:g}" y="{top + 41}">{escape(adds)}</text>',
+        f'<text class="small" x="{left + 10:g}" y="{top + 60}">door: {escape(doors)}</text>',
+    ]
 
 
 if __name__ == "__main__":

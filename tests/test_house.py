@@ -13,6 +13,13 @@ FLOORS = (
     "base", "features terrain accuracy", "structures classifier", "alsnet objects", "reports", "stages", "pipeline",
     "synthetic tiling plugin review", "cli",
 )  # fmt: skip
+#: Rooms that the core works without, and the modules of the core that may import them.
+EXTRAS = {"objects", "review", "reports", "synthetic"}
+DOORS = {
+    "stages/accuracy.py", "stages/group_objects.py", "stages/write_objects.py",
+    "tiling/objects_from_files.py", "cli/classify.py", "cli/extras.py", "cli/installation.py",
+    "cli/models.py",
+}  # fmt: skip
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
 
 
@@ -35,6 +42,19 @@ def test_house(path):
                 if one.name.startswith("_") and one.name != "__version__"
             ]
             assert room == own or not private, f"line {node.lineno}: {private} of {room}"
+
+
+def test_the_core_imports_extras_in_their_doors_alone():
+    importing = set()
+    for path in sorted(ROOT.rglob("*.py")):
+        name, room = str(path.relative_to(ROOT)), path.relative_to(ROOT).parts[0]
+        if room in EXTRAS or room == "__init__.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            module = (node.module or "").split(".")[0] if isinstance(node, ast.ImportFrom) else ""
+            if module in EXTRAS and node.level == 2:
+                importing.add(name)
+    assert importing == DOORS
 
 
 @pytest.mark.parametrize(
