@@ -1,8 +1,8 @@
 """Protocol of stages that look too far for the surroundings of a tile: a first round serves them.
 
-The points of each tile are reduced to what matters far away (:meth:`FarReaching.left_of`), blocks
-of a grid are computed from that (:meth:`FarReaching.block_of`), and a tile joins the parts of the
-blocks that it needs (:meth:`FarReaching.made_of_blocks`).
+The points of each tile are reduced to what matters far away (:meth:`FarReaching.reduce_points`), blocks
+of a grid are computed from that (:meth:`FarReaching.compute_block`), and a tile joins the parts of the
+blocks that it needs (:meth:`FarReaching.join_blocks`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Blocks(NamedTuple):
 
     side: float
     reach: float  #: how far around a block points matter
-    around: float  #: how far beyond the points that are read a tile needs blocks
+    margin: float  #: how far beyond the points that are read a tile needs blocks
     spill: float  #: how far beyond all points blocks hold something
     cell: float = 1.0  #: side of the cells that they are rasters of
 
@@ -41,7 +41,7 @@ class FarReaching(Stage):
         """Return the blocks that the stage needs; None where it looks no farther than its halo."""
 
     @abstractmethod
-    def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
+    def reduce_points(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """Return what blocks need of points.
 
         That is an array (n, 4) ``around``, for blocks that the points do not lie in, and (n, 3)
@@ -49,18 +49,18 @@ class FarReaching(Stage):
         """
 
     @abstractmethod
-    def block_of(
+    def compute_block(
         self,
-        around: NDArray[np.float64],
+        far_points: NDArray[np.float64],
         inside: Iterable[NDArray[np.float64]],
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
-        """Compute a block (column, row) from what :meth:`left_of` returned around and in it."""
+        """Compute a block (column, row) from what :meth:`reduce_points` returned around and in it."""
 
     @abstractmethod
-    def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
+    def arrays_in(self, box: Sequence[float]) -> set[str]:
         """Return names of arrays that a box (min x, min y, max x, max y, meters) needs."""
 
     @abstractmethod
-    def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
+    def join_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
         """Join these arrays of the blocks that a box touches to :attr:`StageContext.blocks`."""

@@ -147,7 +147,7 @@ class HagMorphological(FarReaching):
         reach = (reach_of_block(self._filter) + 2) * cell
         return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
 
-    def left_of(self, points: Points) -> dict[str, NDArray[np.float64]]:
+    def reduce_points(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """Return the lowest points that blocks around need, and the points inside each block."""
         x, y, z = points.axes
         usable = points.usable(self.ignore)
@@ -157,20 +157,20 @@ class HagMorphological(FarReaching):
             **{inside_block(block): xyz for block, xyz in inside.items()},
         }
 
-    def block_of(
+    def compute_block(
         self,
-        around: NDArray[np.float64],
+        far_points: NDArray[np.float64],
         inside: Iterable[NDArray[np.float64]],
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
         """Compute the cells of a block, in squares that tiles read by themselves."""
-        return cells_of_block(around, block, self._filter, inside).in_parts(_PART)
+        return cells_of_block(far_points, block, self._filter, inside).in_parts(_PART)
 
-    def needed_of_blocks(self, box: Sequence[float]) -> set[str]:
+    def arrays_in(self, box: Sequence[float]) -> set[str]:
         """Return names of the squares that a box needs."""
         return GroundCells.names_within(_PART, *(math.floor(side / self.cell) for side in box))
 
-    def made_of_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
+    def join_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
         """Join the squares of several blocks."""
         return GroundCells.of_blocks(blocks, len(self.openings))
 

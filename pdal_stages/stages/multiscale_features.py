@@ -205,11 +205,11 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
         raise _not_thresholds(path, str(error)) from None
 
 
-def _not_thresholds(path: str, found: str) -> OptionError:
+def _not_thresholds(path: str, fault: str) -> OptionError:
     """Return the error on a file that does not hold what is needed."""
     return OptionError(
         f"option 'bins': '{path}' does not hold the thresholds that this stage writes",
-        found=found,
+        found=fault,
         cure="Delete it to have it written again, or name another file",
     )
 

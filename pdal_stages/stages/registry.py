@@ -113,7 +113,7 @@ def place(type_name: str, tag: str | None) -> str:
     return f"{type_name} (tag '{tag}')" if tag else type_name
 
 
-def stage_from(given: Mapping[str, Any]) -> Stage:
+def stage_from(stage: Mapping[str, Any]) -> Stage:
     """Make a stage of ours from its object in a pipeline."""
-    options = {name: value for name, value in given.items() if name not in ("type", *PDAL_OWN)}
-    return stage_type(given["type"])(options, place(given["type"], given.get("tag")))
+    options = {name: value for name, value in stage.items() if name not in ("type", *PDAL_OWN)}
+    return stage_type(stage["type"])(options, place(stage["type"], stage.get("tag")))

@@ -65,7 +65,7 @@ def make_block(
         parts.append(points[:, (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)])
     inside = (load_arrays(path, [inside_block(block)]) for path in tiles)
     mine = (points for found in inside for points in found.values())
-    save_arrays(target, stage_of(plan).block_of(np.concatenate(parts, axis=1).T, mine, block))
+    save_arrays(target, stage_of(plan).compute_block(np.concatenate(parts, axis=1).T, mine, block))
     return {"outputs": written([target])}
 
 
@@ -86,18 +86,18 @@ def from_before(
     """The results of the earlier rounds for a tile that is read with so many meters around it."""
     first = context.plan.first
     assert first is not None
-    around = read_m + first.blocks.around + first.blocks.spill
+    around = read_m + first.blocks.margin + first.blocks.spill
     own = context.grid.box(tile)
     blocks = map(block_name, blocks_around(context, own, around))
     stage = stage_of(context.plan)
-    needed = stage.needed_of_blocks(_box_m(context, own, around))
+    needed = stage.arrays_in(_box_m(context, own, around))
     found = (
         load_arrays(path, needed) for path in _there(context.rasters, blocks)
     )  # others have no points
     squares = context.squares.covering(context.grid.box(tile, read_m / context.unit))
     left = _there(context.rasters, [left_name(context.squares, each) for each in squares])
     changed = _changed(first.kept or (), left, cuts)
-    return FromBefore(stage.made_of_blocks(found), changed)
+    return FromBefore(stage.join_blocks(found), changed)
 
 
 def _there(folder: str, names: Iterable[str]) -> list[str]:

@@ -207,7 +207,7 @@ def run_first_round(
         mine = ins[OUTSIDE] < 0
         if mine.any():
             own = {name: ins[name][mine] for name in ins}
-            left.append(stage.left_of(points_of(stage, WHOLE_CLOUD, module, own)))
+            left.append(stage.reduce_points(points_of(stage, WHOLE_CLOUD, module, own)))
 
     # Class codes that do not fit the writers may still be changed by the stages after these: no tail.
     before = replace(

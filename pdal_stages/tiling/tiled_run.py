@@ -428,7 +428,7 @@ class _Run:
         # Blocks and tiles left by an earlier run with other inputs must not be used.
         store.remove(".block.npz", [f"{block_name(block)}.npz" for block in places])
         store.remove(".first.npz", [f"{left_name(squares, each)}.npz" for each in points])
-        around = self.farthest * unit + first.blocks.around
+        around = self.farthest * unit + first.blocks.margin
         wanted = {
             job.name: places.intersection(blocks_around(context, boxes[tile], around))
             for tile, job in by_tile.items()
