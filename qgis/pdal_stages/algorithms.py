@@ -77,7 +77,7 @@ class _Showing(Algorithm):
         self.addParameter(made)
 
     def style(self, context, path, act):
-        """A style for a raster that QGIS will show."""
+        """Return a style for a raster that QGIS will show."""
         if context.willLoadLayerOnCompletion(path):
             context.layerToLoadOnCompletionDetails(path).setPostProcessor(results.Style(act))
 
@@ -196,7 +196,7 @@ class ClassifySurvey(_Classifying):
 
 
 class Heights(_Showing):
-    """The dimension HeightAboveGround."""
+    """Compute the dimension HeightAboveGround."""
 
     key, title, stage = "heights", "Heights above ground", "filters.hag_morphological"
     about = (
@@ -309,7 +309,7 @@ class TerrainModels(_Showing):
 
 
 class Train(Algorithm):
-    """A model file from labels."""
+    """Train a model file from labels."""
 
     key, title, command = "train", "Train a model", "train"
     about = (
@@ -332,7 +332,7 @@ class Train(Algorithm):
 
 
 class Accuracy(Algorithm):
-    """A report."""
+    """Compare classes with a reference and show the report."""
 
     key, title, command = "accuracy", "Accuracy of a classified point cloud", "accuracy"
     about = (
@@ -419,7 +419,7 @@ class Objects(_Showing):
 
 
 class Review(_Showing):
-    """Where to look."""
+    """List the places that a person should check."""
 
     key, title, command = (
         "review",
@@ -454,7 +454,7 @@ class Review(_Showing):
 
 
 class Corrections(_Showing):
-    """What a person has looked at, for training."""
+    """Mark points that a person has checked, for training."""
 
     key, title, command = "corrections", "Corrections: mark what was looked at", "corrections"
     about = (

@@ -21,7 +21,7 @@ LAZ = "LAZ files (*.laz);;LAS files (*.las);;COPC files (*.copc.laz)"
 
 
 class Named(QgsProcessingAlgorithm):
-    """What QGIS asks of every algorithm: its name, and the provider's picture."""
+    """Base of algorithms: the name and the provider's icon, which QGIS requests."""
 
     key = title = ""
 
@@ -44,8 +44,8 @@ class Named(QgsProcessingAlgorithm):
 class Algorithm(Named):
     """An algorithm that runs commands of the program.
 
-    `command` names the command (or `stage` the stage) whose declarations give the parameters that `listed` and `advanced`
-    name; what a new version adds is found under "Advanced" by itself.
+    `command` names the command (or `stage` the stage) whose declarations give the parameters that
+    `listed` and `advanced` name; what a new version adds is found under "Advanced" by itself.
     """
 
     about = command = ""
@@ -61,7 +61,7 @@ class Algorithm(Named):
 
     @classmethod
     def available(cls, forms):
-        """Whether the program knows what is needed."""
+        """Return whether the program has the commands and stages that are needed."""
         return (not cls.command or cls.command in forms["commands"]) and (
             not cls.stage or cls.stage in forms["stages"]
         )
@@ -85,7 +85,8 @@ class Algorithm(Named):
             return False, str(error)
         return True, ""
 
-    # ---- parameters ------------------------------------------------------------------------------------
+    # ---- parameters
+    # ------------------------------------------------------------------------------------
 
     def checkParameterValues(self, parameters, context):
         """Refuse what QGIS passes over: unknown names, rasters of other formats, text for an optional number."""
@@ -113,7 +114,7 @@ class Algorithm(Named):
         return super().checkParameterValues(parameters, context)
 
     def add_declared(self):
-        """The command's or stage's own arguments: those of `listed`, then all others as advanced."""
+        """Add the arguments of a command or stage: those of `listed`, then others as advanced."""
         if self.stage:
             declared = self.forms["stages"][self.stage]["options"]
         else:
@@ -128,14 +129,14 @@ class Algorithm(Named):
         self.addParameter(form.parameter(declared, key, label, advanced))
 
     def arguments(self, parameters, context):
-        """What was chosen, as words of a command line."""
+        """Return the values of the dialog as words of a command line."""
         out = []
         for key, declared in self.declared.items():
             out += form.words(self, declared, key, parameters, context)
         return out
 
     def options(self, parameters, context):
-        """What was chosen, as options of a stage."""
+        """Return the values of the dialog as options of a stage."""
         chosen = {
             declared["name"]: form.value_of(self, declared, key, parameters, context)
             for key, declared in self.declared.items()
@@ -143,7 +144,7 @@ class Algorithm(Named):
         return {name: value for name, value in chosen.items() if value is not None}
 
     def help_of(self, name):
-        """The command's own help for one of its arguments."""
+        """Return the command's help text for one of its arguments."""
         arguments = self.forms["commands"][self.command]["arguments"]
         return next((one["help"] for one in arguments if one["name"] == name), "")
 
@@ -158,7 +159,7 @@ class Algorithm(Named):
         self.addParameter(made)
 
     def destination(self, parameters, key, context):
-        """The file that was chosen, in a folder that is there; empty where none was."""
+        """Return the chosen file, in a folder that exists; empty where none was chosen."""
         path = self.parameterAsFileOutput(parameters, key, context)
         return written(path) if path else ""
 
@@ -187,7 +188,8 @@ class Algorithm(Named):
             raise QgsProcessingException("No point cloud was given: add files, or name a folder.")
         return found
 
-    # ---- running ---------------------------------------------------------------------------------------
+    # ---- running
+    # ---------------------------------------------------------------------------------------
 
     def execute(self, arguments, feedback, text=None, quiet=False):
         """Run the program; QGIS's exception with its message where it fails."""
@@ -198,7 +200,7 @@ class Algorithm(Named):
 
 
 def written(path, folder=False):
-    """A destination whose folder is there."""
+    """Return a destination whose folder exists."""
     os.makedirs(path if folder else os.path.dirname(os.path.abspath(path)), exist_ok=True)
     return path
 

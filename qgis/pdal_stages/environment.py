@@ -17,7 +17,8 @@ INSTALL = (
 )
 _WINDOWS = sys.platform == "win32"
 _NAME = "pdal-stages.exe" if _WINDOWS else "pdal-stages"
-#: Variables that QGIS sets for its own Python, GDAL and PROJ, which another environment must not see.
+#: Variables that QGIS sets for its own Python, GDAL and PROJ, which another environment must not
+#: see.
 _OF_QGIS = (
     "PYTHONHOME", "PYTHONPATH", "PYTHONEXECUTABLE", "VIRTUAL_ENV", "GDAL_DATA", "GDAL_DRIVER_PATH", "PROJ_LIB", "PROJ_DATA",
 )  # fmt: skip
@@ -35,11 +36,11 @@ _CONDA = (
 
 
 class Missing(Exception):
-    """The program is not there, or does not work; the text says what to do."""
+    """Raised where the program is missing or does not work; the text says what to do."""
 
 
 def find(setting=""):
-    """The program: the setting, ``PDAL_STAGES_PROGRAM``, PATH, then the environments of conda, pip and pipx.
+    """Return the program: the setting, ``PDAL_STAGES_PROGRAM``, PATH, conda, pip, pipx.
 
     Raises
     ------
@@ -87,7 +88,7 @@ def environments():
 
 
 def variables(program):
-    """The environment variables to run it with: as if its environment were activated, without QGIS's own."""
+    """Return environment variables to run the program as if its environment were active."""
     out = {name: value for name, value in os.environ.items() if name not in _OF_QGIS}
     folder = Path(program).parent
     prefix = folder.parent
@@ -115,7 +116,7 @@ def without_window():
 
 
 def ask(program, *arguments, timeout=120):
-    """What it prints; :class:`Missing` where it fails."""
+    """Return what the program prints, or raise :class:`Missing` where it fails."""
     try:
         done = subprocess.run(
             [program, *arguments],
@@ -136,7 +137,7 @@ def ask(program, *arguments, timeout=120):
 
 
 def forms(program, cache):
-    """What commands and stages take: asked once for each installation, kept in the folder `cache`."""
+    """Return the arguments of commands and stages, cached in a folder per installation."""
     status = os.stat(program)
     root = Path(program).resolve().parent.parent
     # An upgrade in place leaves the program as it is, and changes the folder of packages
@@ -167,7 +168,7 @@ def forms(program, cache):
 
 
 def checked(text, program):
-    """The JSON, if it is of the form that is known here."""
+    """Return the parsed JSON, or raise :class:`Missing` where its form is not known."""
     try:
         answer = json.loads(text)
         if answer["format"] == FORMAT:
@@ -179,6 +180,6 @@ def checked(text, program):
 
 
 def shipped():
-    """What commands and stages took when the plugin was packed, for dialogs before it is found; None in a checkout."""
+    """Return the arguments at the time the plugin was packed; None in a checkout."""
     path = Path(__file__).with_name("commands.json")
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None

@@ -34,9 +34,10 @@ def label_of(declared):
 
 
 def parameter(declared, key, label="", advanced=False):
-    """A parameter of an argument or option that is declared.
+    """Return the QGIS parameter of a declared argument or option.
 
-    Where it is left empty the program's own default holds, so numbers without a default are optional.
+    Where it is left empty the program's own default holds, so numbers without a default are
+    optional.
     """
     label = label or label_of(declared)
     if declared.get("unit"):
@@ -77,7 +78,7 @@ def parameter(declared, key, label="", advanced=False):
 
 
 def value_of(algorithm, declared, key, parameters, context):
-    """What was chosen, as text for the program; None where it is left to its default."""
+    """Return a chosen value as text for the program; None for its default."""
     if parameters.get(key) is None:
         return None
     kind = declared["kind"]
@@ -99,7 +100,7 @@ def value_of(algorithm, declared, key, parameters, context):
 
 
 def words(algorithm, declared, key, parameters, context):
-    """The words of a command line that say what was chosen."""
+    """Return the words of a command line for a chosen value."""
     value = value_of(algorithm, declared, key, parameters, context)
     if value is None:
         return []

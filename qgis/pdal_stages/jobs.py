@@ -15,7 +15,7 @@ def plain(ins, outs):
 
 
 def reader(source):
-    """A reader that sees extra dimensions of old LAS files too."""
+    """Return a reader that reads extra dimensions of old LAS files as well."""
     if source.lower().endswith((".las", ".laz")) and not source.lower().endswith(".copc.laz"):
         return {"type": "readers.las", "filename": source, "use_eb_vlr": True}
     return {"filename": source}
@@ -34,14 +34,14 @@ def plain_classes(source):
 
 
 def writer(target):
-    """A writer that keeps everything."""
+    """Return a writer that keeps everything."""
     if target.lower().endswith((".las", ".laz")) and not target.lower().endswith(".copc.laz"):
         return {"type": "writers.las", "filename": target, "forward": "all", "extra_dims": "all"}
     return {"filename": target}
 
 
 def raster(target, side, dimension, what):
-    """A writer of a GeoTIFF."""
+    """Return a writer of a GeoTIFF."""
     return {
         "type": "writers.gdal",
         "filename": target,

@@ -44,11 +44,11 @@ class Provider(QgsProcessingProvider):
         ProcessingConfig.removeSetting(SETTING)
 
     def program(self):
-        """The program's path; :class:`environment.Missing` says what to do."""
+        """Return the program's path, or raise :class:`environment.Missing`."""
         return environment.find(ProcessingConfig.getSetting(SETTING) or "")
 
     def forms(self):
-        """What commands and stages take; None where nothing can say."""
+        """Return the arguments of commands and stages; None where they are not known."""
         try:
             cache = os.path.join(QgsApplication.qgisSettingsDirPath(), "cache", "pdal_stages")
             return environment.forms(self.program(), cache)

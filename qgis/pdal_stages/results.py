@@ -21,7 +21,7 @@ LAYERS = ("tiles", "patches", "buildings", "decks", "crowns", "spans", "trees")
 
 
 def shows_point_clouds():
-    """Whether this QGIS reads LAS and LAZ files; Debian's does not."""
+    """Return whether this QGIS reads LAS and LAZ files; Debian's does not."""
     return "pdal" in QgsProviderRegistry.instance().providerList()
 
 
@@ -34,7 +34,7 @@ def categories(classes):
 
 
 def point_cloud(path, classes):
-    """A layer of a LAS or LAZ file, colored by class."""
+    """Return a layer of a LAS or LAZ file, colored by class."""
     layer = QgsPointCloudLayer(str(path), os.path.splitext(os.path.basename(path))[0], "pdal")
     if layer.isValid():
         layer.setRenderer(QgsPointCloudClassifiedRenderer("Classification", categories(classes)))
@@ -42,7 +42,7 @@ def point_cloud(path, classes):
 
 
 def vector_layers(path):
-    """The layers of a vector file that hold anything; their styles lie in the file or beside it."""
+    """Return the layers of a vector file with features; styles lie in it or beside it."""
     stem, ending = os.path.splitext(str(path))
     layers = []
     for name in LAYERS:
@@ -60,7 +60,7 @@ def vector_layers(path):
 
 
 class Style(QgsProcessingLayerPostProcessorInterface):
-    """What is done to a raster once it is on the map."""
+    """Style a raster once it is on the map."""
 
     #: Processing holds no reference.
     _kept = []
@@ -96,7 +96,7 @@ def heights(layer):
 
 
 def classes_of(classes):
-    """A style for a raster of class codes: those that are there."""
+    """Return a style for a raster of class codes, with the classes that occur."""
 
     def act(layer):
         provider = layer.dataProvider()

@@ -19,7 +19,7 @@ PATIENCE = 20.0
 
 
 class Failed(Exception):
-    """The program ended with an error; the text is its message."""
+    """Raised where the program ended with an error; the text is its message."""
 
 
 def run(program, arguments, feedback, text=None, quiet=False):
@@ -127,7 +127,7 @@ def _write(stream, text):
 
 
 def _interrupt(process):
-    """As Ctrl-C does, to its workers as well."""
+    """Interrupt the program and its workers, as Ctrl-C does."""
     try:
         if _WINDOWS:
             process.send_signal(signal.CTRL_BREAK_EVENT)
