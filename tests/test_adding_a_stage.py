@@ -51,14 +51,18 @@ def in_another_package(folder: Path) -> None:
     (about / "entry_points.txt").write_text(f"[{group}]\n{entry.replace(chr(34), '')}\n")
 
 
-@pytest.fixture(params=[in_this_package, in_another_package])
-def run(request, tmp_path):
-    """Run a program that finds the stage; what it printed."""
-    folder = tmp_path / "site"
-    folder.mkdir()
-    request.param(folder)
+@pytest.fixture
+def env(tmp_path):
+    """Return an environment in which Python finds packages in the folder site."""
+    (tmp_path / "site").mkdir()
     programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    env = {"PYTHONPATH": str(folder), "PATH": programs}
+    return {"PYTHONPATH": str(tmp_path / "site"), "PATH": programs}
+
+
+@pytest.fixture(params=[in_this_package, in_another_package])
+def run(request, tmp_path, env):
+    """Run a program that finds the stage; what it printed."""
+    request.param(tmp_path / "site")
     return lambda *words: processes.printed(*words, cwd=tmp_path, env=env)
 
 
@@ -119,3 +123,14 @@ def test_it_works_at_all_doors_and_in_tiles(run, cloud, tmp_path, pdal_program):
         "else: raise AssertionError\n",
     )
     assert classes(tmp_path / "object.laz") == BANDS * 40
+
+
+def test_a_package_whose_stage_is_broken_is_named(tmp_path, env):
+    in_another_package(tmp_path / "site")
+    (tmp_path / "site" / "my_package" / "heightband.py").write_text("import not_there\n")
+    command = ("python", "-m", "pdal_stages.cli", "options")
+    done = processes.ended(*command, "filters.heightband", cwd=tmp_path, env=env)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "of the package my-package cannot be loaded" in done.stderr
+    assert "not_there" in done.stderr
+    assert "coarse" in processes.printed(*command, "filters.hag_minima", cwd=tmp_path, env=env)
