@@ -16,7 +16,8 @@ drawn ones take the empty places: c, d = a, b for two members, d = a for three, 
 are 0, as they are. The angle is 0 where b or c coincides with a.
 
 A new metric is an entry of ``registry.SHAPES``, a line in :func:`measure` and an entry of
-``shape_bins.COMPARABLE``; columns, groups and the size of every array follow.
+``shape_bins.COMPARABLE``; columns, groups and the size of every array follow. Models that were
+trained with shapes before hold no thresholds of it and must be trained again.
 
 **No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's
 float64 coordinates, the neighborhood's token, i) and members come in a canonical order, so counts
