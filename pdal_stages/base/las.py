@@ -242,7 +242,8 @@ def set_geotiff_unit(path: str | os.PathLike, unit: float) -> None:
 
     GDAL writes the unit of z there where the two differ, and of a plane without a projection it
     leaves out the model's type, without which the unit of z is not read. `unit` is a length in
-    meters; one without a code of EPSG's changes nothing."""
+    meters; one without a code of EPSG's changes nothing.
+    """
     code = next((c for length, c in _UNIT_CODES.items() if math.isclose(length, unit)), None)
     header = read_header(path)
     if code is None or header is None:

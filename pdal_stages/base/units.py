@@ -100,7 +100,8 @@ def median_slope(xyz_m: NDArray, height_m: NDArray, limits: UnitDoubts = UnitDou
     """Return the median slope between mean heights of the terrain in neighboring cells.
 
     0 where too few cells are neighbors. `xyz_m` (n, 3) and `height_m` (n,), above the terrain, are
-    in meters."""
+    in meters.
+    """
     sample = slice(None, None, 1 + len(xyz_m) // limits.most_points)
     column, row = cell_numbers(xyz_m[sample, :2].T, limits.cell_m)
     cells, inverse = np.unique(np.column_stack([column, row]), axis=0, return_inverse=True)
