@@ -11,7 +11,6 @@ from pdal_stages.stages.registry import stage_type, stage_types
 
 NEEDED = {
     "filters.modelclassifier": {"model": "standard"},
-    "filters.polygons": {"polygons": "tests/data/none.gpkg=9"},
     "writers.classifiermodel": {"filename": "new.model"},
     "writers.objects": {"filename": "new.gpkg"},
 }
@@ -20,7 +19,7 @@ NEEDED = {
 @pytest.mark.parametrize("name", [name for name in stage_types() if name != "filters.polygons"])
 def test_stages_are_immutable(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    stage = stage_type(name)(NEEDED.get(name, {}))
+    stage = stage_type(name)(NEEDED.get(name, stage_type(name).example))
     before = stage.options.copy()
     for attribute in ("upstream", "place", "options", "threads", "_condition", "anything"):
         with pytest.raises(AttributeError):
