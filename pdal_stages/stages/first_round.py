@@ -1,8 +1,8 @@
 """Protocol of stages that look too far for the surroundings of a tile: a first round serves them.
 
-The points of each tile are reduced to what matters far away (:meth:`FarReaching.reduce_points`), blocks
-of a grid are computed from that (:meth:`FarReaching.compute_block`), and a tile joins the parts of the
-blocks that it needs (:meth:`FarReaching.join_blocks`).
+The points of each tile are reduced to what matters far away (:meth:`FarReaching.reduce_points`),
+blocks of a grid are computed from that (:meth:`FarReaching.compute_block`), and a tile joins the
+parts of the blocks that it needs (:meth:`FarReaching.join_blocks`).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class FarReaching(Stage):
         inside: Iterable[NDArray[np.float64]],
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
-        """Compute a block (column, row) from what :meth:`reduce_points` returned around and in it."""
+        """Compute a block (column, row) from the reduced points around and in it."""
 
     @abstractmethod
     def arrays_in(self, box: Sequence[float]) -> set[str]:
