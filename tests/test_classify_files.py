@@ -192,18 +192,17 @@ def test_an_interrupt_says_what_is_finished(folder, tmp_path, write_las):
         500,
     ]
     command = [sys.executable, "-m", "pdal_stages.cli", *map(str, words), "--workers", "1"]
-    command += ["--log", str(tmp_path / "log"), "--metadata", str(tmp_path / "m.json")]
+    command += ["--metadata", str(tmp_path / "m.json")]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as run:
         seen = [run.stdout.readline() for _ in range(3)]
         run.send_signal(signal.SIGINT)
         _, err = run.communicate(timeout=60)
-    logged = (tmp_path / "log").read_text()
     assert run.returncode == 130, err
     written = [f"out_t{number}.laz" for number in range(3)]
     assert sorted(Path(line.partition(":")[0]).name for line in seen) == written
-    assert all("500 points; " in line and line.strip() in logged for line in seen), seen
+    assert all("500 points; " in line for line in seen), seen
     assert "3 of 4 files written" in err and "--resume" in err, err
     assert files_in(tmp_path, "*out_*") == written
     assert '"waiting"' in (tmp_path / "m.json").read_text() and not list(
@@ -353,7 +352,7 @@ def test_points_beyond_the_box_of_the_header(folder, classify, tmp_path, tile):
 def test_heights_of_vegetation_reach_the_classifier():
     (classifier,) = [
         stage
-        for stage in ClassifyRequest(vegetation_heights="0.5,2").stages
+        for stage in ClassifyRequest(classifier_options={"vegetation_heights": "0.5,2"}).stages
         if stage["type"] == "filters.modelclassifier"
     ]
     assert classifier["vegetation_heights"] == "0.5,2"

@@ -12,7 +12,8 @@ import pytest
 from block_scene import ground_and_block
 from processes import ended
 
-from pdal_stages.cli import _COMMANDS, main, parsed
+from pdal_stages.cli import main
+from pdal_stages.cli.parser import COMMANDS, parse
 from pdal_stages.stages.registry import stage_types
 
 pytestmark = pytest.mark.pdal
@@ -132,12 +133,12 @@ def test_train_model_classify_accuracy(cloud, tmp_path, run):
     ],
 )
 def test_names_may_stand_behind_flags(words, inputs, output):
-    seen = parsed(words.split(), is_program=False)
+    seen = parse(words.split(), is_program=False)
     assert seen.inputs == inputs and getattr(seen, "output", None) == output
 
 
 @pytest.mark.parametrize(
-    "command", [None, *(name for names in _COMMANDS.values() for name in names)]
+    "command", [None, *(name for names in COMMANDS.values() for name in names)]
 )
 def test_help_fits_a_screen(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")

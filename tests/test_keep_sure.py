@@ -74,7 +74,7 @@ def test_what_is_damaged_or_not_there_is_refused(tmp_path):
 
 
 def test_the_shipped_model_says_what_it_costs():
-    lines = ClassifyRequest(keep_sure=0.95).cost
+    lines = ClassifyRequest(classifier_options={"keep_sure": 0.95}).cost
     assert lines[0].startswith("to be right in 95 % of the points of each class, about ")
     assert any("6 Building" in line for line in lines) and ClassifyRequest().cost == []
     known = Calibration()
@@ -98,7 +98,9 @@ def test_the_shipped_model_says_what_it_costs():
         and both.points([2, 5, 6]) > 1e6
     )
     assert calibrate_on_base(own, {}, "nowhere.model") == own
-    sure = ClassifyRequest(keep_sure=0.98).cost  # buildings stay with 98 %, too
+    sure = ClassifyRequest(
+        classifier_options={"keep_sure": 0.98}
+    ).cost  # buildings stay with 98 %, too
     assert not any("no point keeps it" in line for line in sure)
 
 

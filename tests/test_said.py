@@ -43,42 +43,10 @@ def test_warnings_of_pdal_are_shown_once(cloud, tmp_path, run_job, tiles):
     assert err.count("no spatial reference") == 1
 
 
-def test_a_log_file(cloud, tmp_path, run_job):
-    log = tmp_path / "run.log"
+def test_metadata_names_the_final_outputs(cloud, tmp_path, run_job):
     out, meta = tmp_path / "o.las", tmp_path / "m.json"
-    assert (
-        run_job([cloud, {"type": "filters.hag_minima"}, out], "--log", log, "--metadata", meta)[0]
-        == 0
-    )
+    assert run_job([cloud, {"type": "filters.hag_minima"}, out], "--metadata", meta)[0] == 0
     assert json.loads(meta.read_text())["metadata"]["writers.las"]["filename"] == [str(out)]
-    assert run_job([cloud, {"type": "filters.hag_minima", "cell": -1}, out], "--log", log)[0] == 1
-    lines = log.read_text().splitlines()
-    assert "pipeline" in lines[0] and "--log" in lines[0] and lines[0][:4].isdigit()
-    assert any("meters were assumed" in line for line in lines)
-    assert any("must be a number" in line for line in lines)
-    assert [line.split(" ", 2)[2].split(" after")[0] for line in lines if "exit code" in line] == [
-        "exit code 0",
-        "exit code 1",
-    ]
-
-
-def test_the_log_hears_the_workers_of_tiles_and_the_summary(cloud, tmp_path, run_job):
-    """What libraries print in the workers' processes is in the log, and what goes to standard output."""
-    says = (
-        "import os\ndef f(ins, outs):\n    os.write(2, b'said by a worker\\n')\n    return True\n"
-    )
-    script = {"type": "filters.python", "source": says, "function": "f", "module": "m"}
-    log, stages = (
-        tmp_path / "run.log",
-        [cloud, {"type": "filters.hag_minima"}, script, tmp_path / "o.las"],
-    )
-    assert run_job(stages, "--log", log, "--tile", 100, "--workers", 2, "--buffer", 0)[0] == 0
-    lines = log.read_text().splitlines()
-    assert any(line.endswith("said by a worker") for line in lines)
-    assert any(" tiles done; " in line or " tile done; " in line for line in lines)
-    assert (
-        all(line[:2] == "20" and line[10] == " " for line in lines) and "exit code 0" in lines[-1]
-    )
 
 
 def test_extra_dimensions_that_pdal_does_not_read_are_named(cloud, tmp_path, run_job):

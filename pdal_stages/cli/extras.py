@@ -1,73 +1,64 @@
-"""Commands after classification: objects, review and corrections."""
+"""Commands that are extras: objects, review and corrections of classified files, and the demo."""
 
 from __future__ import annotations
 
 import argparse
 import re
 
-from . import Parser, takes_options
+from .parser import Parser, add_stage_options, stage_options
 
 #: Options of ``writers.objects`` that ``objects`` has flags for.
-_OF_OBJECTS = ("outlines", "cell")
+_OBJECT_OPTIONS = ("outlines", "cell")
+_INPUTS = "Classified files, folders or patterns"
+_VECTOR_FILE = "Vector file to write: .gpkg, .geojson, .fgb or .shp"
+_WORKERS = "Files to read at the same time (default: 1)"
 
 
 def add_commands(parser: Parser) -> None:
-    """``objects``, ``review`` and ``corrections``."""
+    """Add ``objects``, ``review``, ``corrections`` and ``demo``."""
     what = "Write buildings, trees, wires and bridge decks to a vector file"
-    takes = parser.command("objects", _objects, what, overrides=True, logged=True)
-    takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
-    takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    takes_options(takes, "writers.objects", *_OF_OBJECTS)
-    takes(
-        "--workers",
-        type=int,
-        default=1,
-        metavar="N",
-        help="Files to read at the same time (default: 1)",
-    )
-    takes("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
+    add = parser.command("objects", _objects, what, overrides=True, progress=True)
+    add("inputs", nargs="+", metavar="input", help=_INPUTS)
+    add("output", help=_VECTOR_FILE)
+    add_stage_options(add, "writers.objects", *_OBJECT_OPTIONS)
+    add("--workers", type=int, default=1, metavar="N", help=_WORKERS)
+    add("--metadata", metavar="FILE", help="Write counts, verdicts and settings to a JSON file")
 
     what = "List the places that a person should check, worst first"
-    takes = parser.command("review", _review, what, logged=True)
-    takes("inputs", nargs="+", metavar="input", help="Classified files, folders or patterns")
-    takes("output", help="Vector file to write: .gpkg, .geojson, .fgb or .shp")
-    takes("--html", metavar="FILE", help="Web page to write (default: beside the vector file)")
-    takes("--json", metavar="FILE", help="Write figures to a JSON file")
-    takes(
+    add = parser.command("review", _review, what, progress=True)
+    add("inputs", nargs="+", metavar="input", help=_INPUTS)
+    add("output", help=_VECTOR_FILE)
+    add("--html", metavar="FILE", help="Web page to write (default: beside the vector file)")
+    add("--json", metavar="FILE", help="Write figures to a JSON file")
+    add(
         "--share",
         type=float,
         default=0.95,
         metavar="SHARE",
         help="Share of expected errors to cover (0.95)",
     )
-    takes(
+    add(
         "--cell",
         type=float,
         default=0.0,
         metavar="METERS",
         help="Side of the cells (default: by density)",
     )
-    takes(
-        "--workers",
-        type=int,
-        default=1,
-        metavar="N",
-        help="Files to read at the same time (default: 1)",
-    )
-    takes(
+    add("--workers", type=int, default=1, metavar="N", help=_WORKERS)
+    add(
         "--model",
         default="standard",
         help="Model for files without Reliability (default: standard)",
     )
 
     what = "Mark points that a person corrected or confirmed, to train on"
-    takes = parser.command("corrections", _corrections, what)
-    takes("before", help="LAS or LAZ file as classified")
-    takes("after", nargs="?", help="The same points after a person's corrections, in any order")
-    takes("--out", required=True, metavar="FILE", help="File to write: new classes, and Checked")
+    add = parser.command("corrections", _corrections, what)
+    add("before", help="LAS or LAZ file as classified")
+    add("after", nargs="?", help="The same points after a person's corrections, in any order")
+    add("--out", required=True, metavar="FILE", help="File to write: new classes, and Checked")
     area = "Polygons in which all points were checked; of review's file, those with 'done' 1"
-    takes("--area", action="append", default=[], metavar="FILE", help=area)
-    takes(
+    add("--area", action="append", default=[], metavar="FILE", help=area)
+    add(
         "--around",
         type=float,
         default=1.0,
@@ -75,32 +66,55 @@ def add_commands(parser: Parser) -> None:
         help="Radius checked around changes (1)",
     )
 
+    add = parser.command(
+        "demo", _demo, "Make a town, train on one half, classify the other", progress=True
+    )
+    add(
+        "folder",
+        nargs="?",
+        default="pdal-stages-demo",
+        help="Folder for the results (pdal-stages-demo)",
+    )
+    add("--size", type=float, default=200.0, help="Side of the town in meters (200)")
+    add("--density", type=float, default=7.0, help="Points per square meter (7)")
+    add("--seed", type=int, default=1, help="Another number gives another town (1)")
+
 
 def _objects(options: argparse.Namespace) -> None:
+    """Write the objects of classified files."""
     from ..tiling.objects_from_files import objects_of_files, writer
 
-    given = {name: value for name in _OF_OBJECTS if (value := getattr(options, name)) is not None}
-    stage = writer(options.output, options.overrides, **given)
+    values = stage_options(options, *_OBJECT_OPTIONS)
+    stage = writer(options.output, options.overrides, **values)
     objects_of_files(options.inputs, stage, options.workers, options.metadata)
 
 
 def _review(options: argparse.Namespace) -> None:
+    """List the places to check."""
     from ..review.review_output import lines, write_review
 
     html = re.sub(r"\.\w+$", ".html", options.output) if options.html is None else options.html
-    how = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
-    found = write_review(options.inputs, options.output, html, options.json or "", **how)
-    print("\n".join(lines(found.to_dict())))
+    settings = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
+    review = write_review(options.inputs, options.output, html, options.json or "", **settings)
+    print("\n".join(lines(review.to_dict())))
     print(f"written to {', '.join(name for name in (options.output, html, options.json) if name)}")
 
 
 def _corrections(options: argparse.Namespace) -> None:
+    """Mark corrected points."""
     from ..review.corrections import write_corrections
 
-    told = write_corrections(
+    results = write_corrections(
         options.before, options.out, options.after or "", options.area, options.around
     )
-    print("\n".join(told))
+    print("\n".join(results))
     print(
         f"written to {options.out}; next: pdal-stages train --base MODEL {options.out} --model NEW"
     )
+
+
+def _demo(options: argparse.Namespace) -> None:
+    """Run the demo."""
+    from ..synthetic.demo import run_demo
+
+    run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)

@@ -1,4 +1,4 @@
-"""Commands about the installation: stages, options, the plugin for PDAL, a first example."""
+"""Commands about the installation: stages, options, the plugin for PDAL, compiled kernels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError, suggest
-from . import Parser
+from .parser import Parser
 
 #: Version of the JSON of ``commands``, for its readers.
 _FORMAT = 1
@@ -21,20 +21,20 @@ _TYPES = {int: "integer", float: "number"}
 
 
 def add_commands(parser: Parser) -> None:
-    """``drivers``, ``options``, ``commands``, ``doctor``, ``plugin``, ``demo`` and ``warmup``."""
-    takes = parser.command("drivers", _drivers, "List all stages: ours, then PDAL's")
-    takes("--ours", action="store_true", help="Only our stages")
-    takes("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
+    """Add ``drivers``, ``options``, ``commands``, ``doctor``, ``plugin`` and ``warmup``."""
+    add = parser.command("drivers", _drivers, "List all stages: ours, then PDAL's")
+    add("--ours", action="store_true", help="Only our stages")
+    add("--showjson", action="store_true", help="As JSON, like pdal --drivers --showjson")
 
-    takes = parser.command("options", _options, "List the options of a stage")
-    takes("stage", help="One of ours or PDAL's, e.g. filters.hag_minima")
-    takes("--showjson", action="store_true", help="As JSON Schema")
+    add = parser.command("options", _options, "List the options of a stage")
+    add("stage", help="One of ours or PDAL's, e.g. filters.hag_minima")
+    add("--showjson", action="store_true", help="As JSON Schema")
 
-    takes = parser.command(
+    add = parser.command(
         "commands", partial(_commands, parser), "List commands with their arguments"
     )
     told = "As JSON, with stages, models and classes, for programs that build dialogs"
-    takes("--showjson", action="store_true", help=told)
+    add("--showjson", action="store_true", help=told)
 
     parser.command("doctor", _doctor, "Check what is installed, and say how to get what is missing")
 
@@ -49,23 +49,10 @@ def add_commands(parser: Parser) -> None:
     folder = "Another folder; PDAL_DRIVER_PATH must name it and the folder of filters.python"
     command.add_argument("--folder", type=Path, metavar="DIR", help=folder)
 
-    takes = parser.command(
-        "demo", _demo, "Make a town, train on one half, classify the other", logged=True
-    )
-    takes(
-        "folder",
-        nargs="?",
-        default="pdal-stages-demo",
-        help="Folder for the results (pdal-stages-demo)",
-    )
-    takes("--size", type=float, default=200.0, help="Side of the town in meters (200)")
-    takes("--density", type=float, default=7.0, help="Points per square meter (7)")
-    takes("--seed", type=int, default=1, help="Another number gives another town (1)")
-
-    takes = parser.command(
+    add = parser.command(
         "warmup", _warmup, "Compile the kernels now, so that later runs do not wait"
     )
-    takes(
+    add(
         "--all",
         action="store_true",
         help="Also the kernels of kopt, ropt, copt and shape distributions",
@@ -145,7 +132,7 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     """Arguments of commands and stages, models and classes, as JSON, for programs that build dialogs (the QGIS plugin).
 
     An argument has ``name``, ``flag`` (empty for one without), ``kind`` (``number``, ``integer``, ``boolean``, ``string``),
-    ``help``, ``default``, ``choices``, ``required``, ``many`` (takes several, or may be repeated) and ``value`` (what usage
+    ``help``, ``default``, ``choices``, ``required``, ``many`` (add several, or may be repeated) and ``value`` (what usage
     calls its value).
     """
     from ..base.asprs import NAMES, class_color
@@ -235,12 +222,6 @@ def _plugin(options: argparse.Namespace) -> int:
     files = install.install(options.folder)
     print(f"{len(files)} stages in {files[0].parent}; see them with: pdal --drivers")
     return 0
-
-
-def _demo(options: argparse.Namespace) -> None:
-    from ..synthetic.demo import run_demo
-
-    run_demo(options.folder, size=options.size, density=options.density, seed=options.seed)
 
 
 def _warmup(options: argparse.Namespace) -> None:

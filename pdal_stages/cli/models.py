@@ -10,10 +10,12 @@ from pathlib import Path
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs
 from ..base.messages import print_messages
-from . import INPUTS, Parser, classify, takes_options
+from . import signals
+from .parser import INPUTS, Parser, add_stage_options, stage_options
+from .tile_options import add_tile_sizes, tiling_options
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
-_OF_TRAINING = (
+_TRAINING_OPTIONS = (
     "recipe",
     "base",
     "passes",
@@ -26,67 +28,65 @@ _OF_TRAINING = (
 
 
 def add_commands(parser: Parser) -> None:
-    """``models``, ``train``, ``adapt``, ``accuracy`` and ``model``."""
+    """Add ``models``, ``train``, ``adapt``, ``accuracy`` and ``model``."""
     parser.command("models", _models, "List the models that come with the package")
 
     rare = ("neighborhoods", "feature_set", "count", "trees", "passes")
     what = "Train a model on labeled point clouds"
-    takes = parser.command("train", _train, what, overrides=True, logged=True, rare=rare)
-    takes("inputs", nargs="+", metavar="input", help=INPUTS)
-    takes("--model", required=True, help="Model file to write")
-    takes_options(takes, "writers.classifiermodel", *_OF_TRAINING)
+    add = parser.command("train", _train, what, overrides=True, progress=True, rare=rare)
+    add("inputs", nargs="+", metavar="input", help=INPUTS)
+    add("--model", required=True, help="Model file to write")
+    add_stage_options(add, "writers.classifiermodel", *_TRAINING_OPTIONS)
     surveys = (
         "Files that belong to one survey, e.g. north=north/*.laz; any other file counts as a survey"
     )
-    takes("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
+    add("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
 
-    classify.add_sizes(parser.commands["train"])
+    add_tile_sizes(parser.commands["train"])
     what = "Fit a model to a survey without labels"
-    takes = parser.command("adapt", _adapt, what, logged=True)
-    takes("inputs", nargs="+", metavar="input", help=INPUTS)
-    takes("--model", required=True, help="Model file to write, for classify --model")
-    takes(
+    add = parser.command("adapt", _adapt, what, progress=True)
+    add("inputs", nargs="+", metavar="input", help=INPUTS)
+    add("--model", required=True, help="Model file to write, for classify --model")
+    add(
         "--teacher",
         default="standard",
         metavar="MODEL",
         help="Model to learn from (default: standard)",
     )
-    takes(
+    add(
         "--sure",
         type=float,
         default=0.7,
         metavar="SHARE",
         help="Least Reliability to learn from (0.7)",
     )
-    classify.add_sizes(parser.commands["adapt"])
+    add_tile_sizes(parser.commands["adapt"])
 
     what = "Compare classes with a reference, points or objects"
-    takes = parser.command("accuracy", _accuracy, what, overrides=True, logged=True)
-    takes("inputs", nargs="+", metavar="input", help=INPUTS)
-    takes(
+    add = parser.command("accuracy", _accuracy, what, overrides=True, progress=True)
+    add("inputs", nargs="+", metavar="input", help=INPUTS)
+    add(
         "--reference",
         action="append",
         metavar="FILE",
         help="True classes: the same points in their order",
     )
-    takes("--model", help="Classify labeled files with this model and score it")
-    takes(
+    add("--model", help="Classify labeled files with this model and score it")
+    add(
         "--dimension",
         default="Classification",
         metavar="NAME",
         help="Dimension to score (Classification)",
     )
-    takes("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
-    takes(
-        "--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)"
-    )
-    takes("--area", metavar="FILE", help="With --objects: count only objects inside these polygons")
-    takes("--json", metavar="FILE", help="Write the figures to a JSON file")
-    takes("--html", metavar="FILE", help="Write a report to a web page")
+    add("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
+    add("--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)")
+    add("--area", metavar="FILE", help="With --objects: count only objects inside these polygons")
+    add("--json", metavar="FILE", help="Write the figures to a JSON file")
+    add("--html", metavar="FILE", help="Write a report to a web page")
 
-    takes = parser.command("model", _model, "Describe a model file")
-    takes("file", help="A model file or a shipped model")
-    takes("--showjson", action="store_true", help="Print all of it as JSON")
+    add = parser.command("model", _model, "Describe a model file")
+    add("file", help="A model file or a shipped model")
+    add("--showjson", action="store_true", help="Print all of it as JSON")
 
 
 def _models(options: argparse.Namespace) -> None:
@@ -105,24 +105,23 @@ def _train(options: argparse.Namespace) -> None:
     from ..pipeline.inputs_outputs import input_files
     from ..tiling.train_survey import TrainTask, surveys_of
 
-    extra = {name: value for name in _OF_TRAINING if (value := getattr(options, name)) is not None}
     files = input_files(options.inputs)
     surveys = {} if options.surveys is None else surveys_of(files, options.surveys)
     task = TrainTask(
         files,
         options.model,
         options.overrides,
-        extra,
-        classify.options_of(options),
+        stage_options(options, *_TRAINING_OPTIONS),
+        tiling_options(options),
         surveys,
         named=options.inputs,
     )
-    with classify.interruptible():
-        said = task.run()
-    # Nothing is said of one written into a pipe or device
+    with signals.sigterm_like_ctrl_c():
+        messages = task.run()
+    # A model that was written into a pipe or device is not described.
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""
     score = text.partition("\n")[0]
-    print_messages(*(line for line in said if not score or not line.endswith(score)))
+    print_messages(*(line for line in messages if not score or not line.endswith(score)))
     if text:
         print(text)
 
@@ -131,8 +130,8 @@ def _adapt(options: argparse.Namespace) -> None:
     from ..classifier.load_model import load_model
     from ..tiling.self_training import adapt
 
-    how = classify.options_of(options)
-    with classify.interruptible():
+    how = tiling_options(options)
+    with signals.sigterm_like_ctrl_c():
         print_messages(*adapt(options.inputs, options.model, options.teacher, options.sure, how))
     if Path(options.model).is_file():
         print(load_model(options.model))
@@ -170,7 +169,7 @@ def _compare_objects(options: argparse.Namespace) -> None:
 
     if len(options.inputs) != 1 or options.reference or options.overrides or options.html:
         raise StageError(
-            "--objects compares one vector file with another, and takes --area and --json alone",
+            "--objects compares one vector file with another, and add --area and --json alone",
             found=options.html or ", ".join(options.inputs),
         )
     found, reference = options.inputs[0], options.objects

@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs, write_json, write_whole
 from ..base.messages import print_messages
-from . import Parser, classify
+from . import signals
+from .parser import Parser
+from .tile_options import RunFiles, add_tile_options, requests_tiles, tiling_options
+from .tile_results import end_run, print_plan, print_run
 
 if TYPE_CHECKING:
     from ..pipeline.json_source import PipelineSource
@@ -25,22 +28,22 @@ _LEVELS = {0: logging.ERROR, 1: logging.WARNING, 2: logging.INFO}
 
 
 def add_commands(parser: Parser) -> None:
-    """``pipeline``, ``expand`` and ``validate``."""
+    """Add ``pipeline``, ``expand`` and ``validate``."""
     help = "Run a PDAL pipeline, with our stages or without"
     rare = ("file_option", "nostream", "verbose", "scheduler", "per", "buffer")
-    takes = parser.command("pipeline", _pipeline, help, overrides=True, logged=True, rare=rare)
-    _input(takes)
-    takes("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
-    takes("--validate", action="store_true", help="Check without reading points, then stop")
-    takes("--nostream", action="store_true", help="Accepted as in PDAL; our stages never stream")
+    add = parser.command("pipeline", _pipeline, help, overrides=True, progress=True, rare=rare)
+    _input(add)
+    add("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    add("--validate", action="store_true", help="Check without reading points, then stop")
+    add("--nostream", action="store_true", help="Accepted as in PDAL; our stages never stream")
     levels = "PDAL's log: 1 warnings (default), 2 what it does, 3 everything"
-    takes("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
-    classify.add_arguments(parser.commands["pipeline"])
+    add("-v", "--verbose", type=int, default=1, metavar="LEVEL", help=levels)
+    add_tile_options(parser.commands["pipeline"])
 
     help = "Print a pipeline as plain PDAL JSON, for stock 'pdal pipeline'"
-    takes = parser.command("expand", _expand, help, overrides=True)
-    _input(takes)
-    takes("-o", "--output", metavar="FILE", help="Write to a file, not to standard output")
+    add = parser.command("expand", _expand, help, overrides=True)
+    _input(add)
+    add("-o", "--output", metavar="FILE", help="Write to a file, not to standard output")
 
     _input(
         parser.command(
@@ -49,14 +52,15 @@ def add_commands(parser: Parser) -> None:
     )
 
 
-def _input(takes: Callable) -> None:
-    takes("file", nargs="?", help="Pipeline JSON file")
-    takes("-i", "--input", dest="file_option", metavar="FILE", help="The same file, as in PDAL")
-    takes("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
+def _input(add: Callable) -> None:
+    """Add the arguments that name a pipeline."""
+    add("file", nargs="?", help="Pipeline JSON file")
+    add("-i", "--input", dest="file_option", metavar="FILE", help="The same file, as in PDAL")
+    add("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
 
 
 def _source(options: argparse.Namespace) -> Path | PipelineSource:
-    """A file's path, or what was read from standard input."""
+    """Return the path of the pipeline file, or what was read from standard input."""
     if options.stdin:
         from ..pipeline.json_source import decode, parse_pipeline
 
@@ -71,23 +75,24 @@ def _source(options: argparse.Namespace) -> Path | PipelineSource:
     return Path(name)
 
 
-def _built(options: argparse.Namespace) -> Pipeline:
+def _build(options: argparse.Namespace) -> Pipeline:
+    """Return the pipeline with its overrides."""
     from ..pipeline.run import Pipeline
 
     return Pipeline(_source(options), options.overrides)
 
 
 def _pipeline(options: argparse.Namespace) -> int:
-    if classify.wants_tiles(options):
-        return _in_tiles(options)
+    """Run a pipeline in one piece or in tiles; return the exit code."""
+    if requests_tiles(options):
+        return _run_tiles(options)
     if options.validate:
         return _validate(options)
-    pipeline, metadata = _built(options), options.metadata
-    more = [Output(options.log, "log")] if options.log else []
-    pipeline.check_outputs(*more, *([Output(metadata, "metadata", JSON)] if metadata else []))
+    pipeline, files = _build(options), RunFiles(options.metadata)
+    pipeline.check_outputs(*files.outputs)
     before = list(pipeline.expanded.warnings)
     print_messages(*before)
-    classify.end_at_once(options)
+    signals.end_at_ctrl_c(options.is_program)
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(options.verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
     lines = pipeline.log_lines
@@ -95,36 +100,42 @@ def _pipeline(options: argparse.Namespace) -> int:
     print_messages(*(f"PDAL says: {line}" for line in shown))
     if len(lines) > len(shown):
         print_messages(f"PDAL says {len(lines) - len(shown):,} more lines; -v 2 shows them")
-    if metadata:
-        write_json(metadata, pipeline.metadata, indent=2)
+    if files.metadata:
+        write_json(files.metadata, pipeline.metadata, indent=2)
     print_messages(*(line for line in pipeline.messages if line not in before))
     return 0
 
 
-def _in_tiles(options: argparse.Namespace) -> int:
+def _run_tiles(options: argparse.Namespace) -> int:
+    """Run a pipeline in tiles; return the exit code."""
     from ..pipeline.run import Pipeline
     from ..pipeline.stage_files import writers_outputs
     from ..tiling.plan import make_plan
     from ..tiling.tiled_run import run_tiled
 
-    chosen, extra = classify.options_of(options), classify.extra_files(options)
+    tiling, files = tiling_options(options), RunFiles.parse(options)
     pipeline = Pipeline(_source(options), options.overrides, whole=False)
     if options.validate:
-        make_plan(pipeline, chosen.buffer)
+        make_plan(pipeline, tiling.buffer)
         print(pipeline.validate())
         return 0
-    outputs = writers_outputs(
-        pipeline.expanded.stages
-    )  # '#' stands for names here, not for numbers
-    named = [one for one in outputs if "#" not in one.path and Path(one.path).parent.is_dir()]
-    check_outputs([*named, *extra], pipeline.inputs())
-    run, interrupted = classify.ran(lambda: run_tiled(pipeline, chosen, dry_run=options.dry_run))
-    classify.print_dry(run) if options.dry_run else classify.print_run(run)
-    return classify.end_run(options, run, "run it again with --resume" if interrupted else "")
+    # In names of tiled runs '#' stands for names, not for numbers; folders may not be there yet.
+    outputs = [
+        output
+        for output in writers_outputs(pipeline.expanded.stages)
+        if "#" not in output.path and Path(output.path).parent.is_dir()
+    ]
+    check_outputs([*outputs, *files.outputs], pipeline.inputs())
+    run, interrupted = signals.run_until_interrupted(
+        lambda: run_tiled(pipeline, tiling, dry_run=options.dry_run)
+    )
+    print_plan(run) if options.dry_run else print_run(run)
+    return end_run(files, run, "run it again with --resume" if interrupted else "")
 
 
 def _expand(options: argparse.Namespace) -> None:
-    pipeline = _built(options)
+    """Print or write the expanded pipeline."""
+    pipeline = _build(options)
     text = pipeline.json + "\n"
     if options.output:
         check_outputs([Output(options.output, "output", JSON)], pipeline.inputs())
@@ -136,7 +147,7 @@ def _expand(options: argparse.Namespace) -> None:
 def _validate(options: argparse.Namespace) -> int:
     """Print PDAL's verdict or ours as JSON, on standard output; an error goes to standard error too."""
     try:
-        pipeline = _built(options)
+        pipeline = _build(options)
         print(pipeline.validate())
         print_messages(*pipeline.expanded.warnings)
         return 0

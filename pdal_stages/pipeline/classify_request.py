@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,8 @@ class ClassifyRequest:
     where: str | None = None
     #: Created dimensions to write besides the input's own; ``all`` and ``none`` are allowed.
     dimensions: tuple[str, ...] = WRITTEN
+    #: options of ``filters.modelclassifier``, such as ``keep_sure`` and ``vegetation_heights``
+    classifier_options: Mapping[str, Any] = field(default_factory=dict)
     noise: bool = True  #: mark low and high noise first
     bridges: bool = (
         False  #: find bridge decks, where heights come from ``filters.hag_morphological``
@@ -52,9 +55,6 @@ class ClassifyRequest:
     wires: bool = False  #: find wires, where heights are computed
     towers: bool = False  #: find wires, and their towers
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
-    #: Two heights in meters, ``0.5,2``, below which vegetation is low and medium; empty for high alone.
-    vegetation_heights: str = ""
-    keep_sure: float | None = None  #: see ``filters.modelclassifier``
     given_ground: bool = False  #: points of class 2 are the ground, and stay so
 
     @property
@@ -66,14 +66,11 @@ class ClassifyRequest:
         stage: dict[str, Any] = {
             "type": "filters.modelclassifier",
             "model": self.model,
+            "compact": True,
             **self._inside,
             **({"mark": SELECTED} if self.where else {}),
+            **self.classifier_options,
         }
-        stage["compact"] = True
-        if self.keep_sure is not None:
-            stage["keep_sure"] = self.keep_sure
-        if self.vegetation_heights:
-            stage["vegetation_heights"] = self.vegetation_heights
         for option, name in (("margin", "Margin"), ("probabilities", "Probability_")):
             if any(one.startswith(name) for one in self.dimensions):
                 stage[option] = True

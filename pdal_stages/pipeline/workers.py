@@ -15,7 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessP
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import get_context, parent_process, resource_tracker
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from ..base import checks
@@ -23,7 +23,6 @@ from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
 from ..base.messages import PlainStream
 from ..base.progress import Progress
-from ..base.run_log import LoggedStream
 from ..base.threads import CORES, available_threads
 from .pdal import check_interrupt, gentle
 
@@ -113,7 +112,6 @@ class WorkerProcesses(AbstractContextManager):
         self.slots, self.threads = slots, threads
         self._idle: list[ProcessPoolExecutor] = []
         self._busy: dict[Future, ProcessPoolExecutor] = {}
-        self._readers: list[threading.Thread] = []
 
     def __exit__(self, *exc: object) -> None:
         for pool in [*self._idle, *self._busy.values()]:
@@ -122,8 +120,6 @@ class WorkerProcesses(AbstractContextManager):
                 process.join(10.0)
             _stop_sending(pool)
             pool.shutdown(cancel_futures=True)
-        for reader in self._readers:
-            reader.join(1.0)
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Send a task to a free worker."""
@@ -131,7 +127,7 @@ class WorkerProcesses(AbstractContextManager):
             pool = self._idle.pop()
             future = pool.submit(perform, task)
         else:
-            with _environment(self.threads), self._logged():
+            with _environment(self.threads):
                 try:
                     pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
                 except OSError as error:
@@ -142,24 +138,6 @@ class WorkerProcesses(AbstractContextManager):
                 future = pool.submit(perform, task)
         self._busy[future] = pool
         return future
-
-    @contextmanager
-    def _logged(self) -> Iterator[None]:
-        """With a log, pass what a process started meanwhile prints through this process."""
-        if not isinstance(sys.stderr, LoggedStream):
-            yield
-            return
-        resource_tracker.ensure_running()  # whose standard error stays
-        (ours, theirs), before = os.pipe(), os.dup(2)
-        os.dup2(theirs, 2)
-        try:
-            yield
-        finally:
-            os.dup2(before, 2)
-            os.close(theirs)
-            os.close(before)
-        self._readers.append(threading.Thread(target=_repeat, args=(ours, sys.stderr), daemon=True))
-        self._readers[-1].start()
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Those that are done, at least one."""
@@ -182,11 +160,6 @@ def _stop_sending(pool: Any) -> None:
             open(os.devnull) as nothing,
         ):  # the pool's own thread closes the reader
             os.dup2(nothing.fileno(), pool._call_queue._reader.fileno())
-
-
-def _repeat(pipe: int, stream: LoggedStream) -> None:
-    with open(pipe, errors="backslashreplace") as lines:
-        stream.writelines(lines)
 
 
 def _begin() -> None:

@@ -14,7 +14,6 @@ from qgis.core import (
 _WORDS = re.compile(r'(?:"[^"]*"|[^\s"])+')
 #: Settings of a terminal, of a batch system, or that a dialog has its own widgets for.
 LEFT_OUT = (
-    "log",
     "progress",
     "scheduler",
     "dry_run",

@@ -74,10 +74,8 @@ def test_files_that_are_written(tmp_path, cloud, model):
         model,
         "--metadata",
         "m.json",
-        "--log",
-        "run.log",
     ]
-    assert written(tmp_path, *words) == {"out.las", "m.json", "run.log"}
+    assert written(tmp_path, *words) == {"out.las", "m.json"}
     path = job(
         tmp_path,
         "raw.las",

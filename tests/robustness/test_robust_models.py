@@ -154,30 +154,26 @@ def test_the_label_as_a_dimension_and_more_samples_than_points(command, tmp_path
 
 
 def test_names_that_command_a_terminal_or_pass_for_lines(command, tmp_path, cloud, model):
-    """They are printed as codes, in a log on one line."""
-    red, log = "\x1b]0;title\x07\x1b[31mred\u202eder", tmp_path / "run.log"
+    """They are printed as codes."""
+    red = "\x1b]0;title\x07\x1b[31mred\u202eder"
 
     def edit(head, _):
         head["classes"][0]["name"] = f"Ground\n  6 Roof{red}"
         head["training"]["clouds"][0]["name"] = "a\noverall accuracy 100 %\x1b[2J"
 
     evil = repack(model, tmp_path / "evil.model", edit)
-    odd = tmp_path / "a\n2026-01-01 00:00:00 exit code 0 after 1.0 s\x1b[2J\x07.las"
+    odd = tmp_path / "a\n2 Ground 1,000 points\x1b[2J\x07.las"
     odd.write_bytes(cloud.read_bytes())
-    words = ["classify", odd, tmp_path / "o\x1b[0m.las", "--model", evil]
     for done in (
         command.runs(["model", evil]),
-        command.runs([*words, "--log", log]),
+        command.runs(["classify", odd, tmp_path / "o\x1b[0m.las", "--model", evil]),
         command("classify", odd, odd, "--model", model),
     ):
         assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", done.out + done.err)
         assert (
             "Roof\\x1b]0;title\\x07\\x1b[31mred\\u202eder" in done.out
-            or "after 1.0 s\\x1b[2J\\x07.las" in done.err
+            or "1,000 points\\x1b[2J\\x07.las" in done.err
         )
-    assert "\x1b" not in log.read_text()
-    lines = log.read_text().splitlines()
-    assert sum("exit code" in line and "\\n" not in line for line in lines) == 1
 
 
 def test_figures_of_any_size(command, tmp_path, model):

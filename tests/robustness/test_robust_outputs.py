@@ -187,7 +187,6 @@ REPLACING = [
     ([*CLASSIFY, "o.las", "--objects", "x.geojson", "--metadata", "x.geojson"], "the objects file is the metadata file too"),
     (["accuracy", "ti.geojson", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
     (["accuracy", "a.las", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
-    (["accuracy", "points.txt", "--reference", "b.las", "--log", "points.txt"], INPUT),
     (["objects", "ti.geojson", "t.gpkg", "--metadata", "ti.geojson"], INPUT),
     (["review", "ti.geojson", "t.gpkg", "--json", "ti.geojson"], INPUT),
     (["review", "ti.geojson", "ti.geojson"], INPUT),

@@ -1,0 +1,183 @@
+"""The parser of the command line: commands of one screen of help each, and flags from options that stages declare."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import itertools
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from ..base.errors import StageError, suggest
+from ..base.version import __version__
+
+#: Modules and their commands. Only the module of the requested command is imported; all for ``commands``.
+COMMANDS = {
+    "classify": ("classify",),
+    "models": ("models", "train", "adapt", "accuracy", "model"),
+    "pipelines": ("pipeline", "expand", "validate"),
+    "installation": ("drivers", "options", "doctor", "plugin", "warmup"),
+    "extras": ("objects", "review", "corrections", "demo"),
+}
+OVERRIDES = "Stages take options as in PDAL: --stage.TAG.option=V, --filters.name.option=V"
+INPUTS = "Files, folders, patterns, tile indexes, EPT sources"
+#: What argparse prints where a value is not among the choices.
+_INVALID_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
+_WORD = re.compile(r"[\w-]+")
+#: Choices that take more columns stand in the help text instead of before it.
+_CHOICES_WIDTH = 40
+
+
+def parse(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
+    """Return the command, its arguments, and options of stages among them (`overrides`).
+
+    `is_program` says whether this process runs for the command alone; it is handed on.
+
+    Raises
+    ------
+    SystemExit
+        Where usage is wrong, or only help was requested.
+    """
+    # Imported here, so that a missing package is reported in one sentence.
+    from ..pipeline.overrides import parse_overrides
+
+    overrides, words = parse_overrides(arguments)
+    parser = Parser(
+        prog="pdal-stages",
+        description="Classify airborne laser scans, alone or in PDAL pipelines.",
+        epilog="Help on a command: pdal-stages COMMAND --help. With --debug errors show tracebacks.",
+    )
+    parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
+    module_of = {command: module for module, names in COMMANDS.items() for command in names}
+    modules = [module_of[words[0]]] if words and words[0] in module_of else COMMANDS
+    for module in modules:
+        importlib.import_module(f".{module}", __package__).add_commands(parser)
+    if "--help-all" in words:
+        words = ["--help" if word == "--help-all" else word for word in words]
+        for command_parser in parser.commands.values():
+            command_parser.rare = ()
+    if not words or words[0] not in parser.commands:
+        parser.parse_args(words or ["--help"])  # prints help, the version or what is wrong; exits
+    command = parser.commands[words[0]]
+    for before, word in itertools.pairwise(words):
+        if not word or re.fullmatch("--[a-z-]+=", word):  # as a path it would be the current folder
+            command.error(f"what follows '{word or before}' is empty: is a shell variable unset?")
+    options, unknown = command.parse_known_intermixed_args(words[1:])
+    if unknown:
+        near = suggest(unknown[0].partition("=")[0], command._option_string_actions)
+        command.error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
+    if overrides and not options.takes_overrides:
+        raise StageError(f"'{words[0]}' takes no stage options", found=overrides[0].flag)
+    options.command, options.arguments = words[0], list(arguments)
+    options.overrides, options.is_program = overrides, is_program
+    return options
+
+
+class _OneScreen(argparse.HelpFormatter):
+    """Show only required arguments in usage, and ``--[no-]flag`` for both ways of a switch."""
+
+    def _format_usage(self, usage, actions, groups, prefix):
+        """Format usage with the required arguments."""
+        needed = [action for action in actions if action.required or not action.option_strings]
+        return super()._format_usage(usage, needed, [], prefix)
+
+    def _format_action_invocation(self, action):
+        """Format a flag as it stands before its help."""
+        if isinstance(action, argparse.BooleanOptionalAction):
+            return f"--[no-]{action.option_strings[0][2:]}"
+        return super()._format_action_invocation(action)
+
+
+class Parser(argparse.ArgumentParser):
+    """Suggest similar choices, add commands, and keep their help to one screen."""
+
+    #: Arguments that only ``--help-all`` shows.
+    rare: Sequence[str] = ()
+
+    def _get_formatter(self) -> _OneScreen:
+        return _OneScreen(f"{self.prog} [options]", max_help_position=24)
+
+    def format_help(self) -> str:
+        """Return what ``--help`` prints."""
+        hidden = {action: action.help for action in self._actions if action.dest in self.rare}
+        for action in hidden:
+            action.help = argparse.SUPPRESS
+        text = super().format_help() + "\n--help-all shows all options.\n" * bool(hidden)
+        for action, help in hidden.items():
+            action.help = help
+        return text
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and a message with the nearest choice, and exit."""
+        if choice := _INVALID_CHOICE.search(message):
+            message += f". {suggest(choice[1], _WORD.findall(choice[2]))}".rstrip(". ")
+        super().error(message)
+
+    @property
+    def commands(self) -> dict[str, Parser]:
+        """The commands by name."""
+        if self._subparsers is None:
+            self.add_subparsers(prog=self.prog, dest="command", required=True, metavar="COMMAND")
+        return self._subparsers._group_actions[0].choices  # type: ignore
+
+    def command(
+        self,
+        name: str,
+        run: Callable[[argparse.Namespace], Any],
+        help: str,
+        *,
+        overrides: bool = False,
+        progress: bool = False,
+        rare: Sequence[str] = (),
+    ) -> Callable:
+        """Add a command; return the function that adds its arguments.
+
+        Parameters
+        ----------
+        name, run, help : str, callable, str
+            `run` is called with the parsed arguments and returns the exit code, or None for 0.
+        overrides : bool
+            Whether it takes options of stages, ``--filters.name.option=value``.
+        progress : bool
+            Whether it has the flag ``--progress``.
+        rare : sequence of str
+            Arguments that only ``--help-all`` shows.
+        """
+        assert self.commands is not None
+        parser = self._subparsers._group_actions[0].add_parser(  # type: ignore
+            name, help=help, description=f"{help}.", epilog=OVERRIDES if overrides else None
+        )
+        parser.set_defaults(run=run, takes_overrides=overrides)
+        parser.rare = [*rare, *(("progress",) if progress else ())]
+        if progress:
+            parser.add_argument(
+                "--progress", action=argparse.BooleanOptionalAction, help="Show progress"
+            )
+        return parser.add_argument
+
+
+def add_stage_options(add: Callable, stage: str, *names: str) -> None:
+    """Add flags for options of a stage, with their declared help and defaults."""
+    from ..stages.registry import stage_type
+
+    types = {"integer": int, "number": float}
+    for option in stage_type(stage).all_options():
+        if option.name not in names:
+            continue
+        default, choices = option.shown_default.replace(",", ", "), option.choices or None
+        help = (option.help + f" (default: {default})" * bool(default)).replace("%", "%%")
+        wide = choices is not None and len(", ".join(choices)) > _CHOICES_WIDTH
+        help += f" (one of: {', '.join(choices)})" if choices and wide else ""
+        add(
+            f"--{option.name.replace('_', '-')}",
+            type=types.get(option.kind),
+            choices=choices,
+            help=help,
+            metavar=None if choices and not wide else option.name.split("_")[-1].upper(),
+        )
+
+
+def stage_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the options of a stage that were set by flags of :func:`add_stage_options`."""
+    return {name: value for name in names if (value := getattr(options, name)) is not None}
