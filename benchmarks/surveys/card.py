@@ -1,6 +1,6 @@
-"""Print the card of the shipped model: how it travels, class by class, where it fails, what it was trained on.
+"""Write the card of the shipped model and its tables by survey: docs/models.md, docs/results/surveys.md.
 
-    python benchmarks/surveys/card.py > docs/models.md
+    python benchmarks/surveys/card.py
 
 It reads the model and the figures in benchmarks/results, which leave_one_out.py and build.py wrote.
 """
@@ -54,8 +54,8 @@ def list_tests(tests: list[dict[str, Any]]) -> str:
     """Return the scores of the shipped model on test parts, as a sentence."""
     found = " and ".join(f"{run['cloud']} {run['oa']:.1f} %" for run in tests)
     return (
-        "On test parts of two towns whose other parts it was trained on, the shipped model is right in "
-        f"{found} (scored once). Elsewhere expect the figures of the groups."
+        "On test parts of two towns whose other parts it was trained on, it is right in "
+        f"{found} (scored once).\nElsewhere expect the figures of the groups."
     )
 
 
@@ -75,36 +75,43 @@ def survey_list(runs: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def pages() -> dict[Path, str]:
+    """Return the pages by their files."""
     scores, tests = (
         json.loads((RESULTS / f"{name}.json").read_text()) for name in ("surveys", "surveys-tests")
     )
     runs = scores["surveys"]
-    text = Path(__file__).with_suffix(".md").read_text()
-    print(
-        text.format(
-            stage=as_json(PREPARATION),
-            passes=OPTIONS.passes,
-            trees=OPTIONS.trees,
-            fewer=scores["trees"],
-            voxel=OPTIONS.voxel,
-            size=MODEL.stat().st_size / 1e6,
-            digest=hashlib.sha256(MODEL.read_bytes()).hexdigest()[:16],
-            known=len(SURVEYS),
-            groups=len(GROUPS),
-            means=group_table(runs),
-            scores=survey_table(runs),
-            classes=class_table(at(runs, None)),
-            tests=list_tests(tests),
-            surveys=survey_list(runs),
-            count=OPTIONS.count,
-            most=MOST,
-            below=BELOW,
-            densities=", ".join(f"{density:g}" for density in DENSITIES),
-            one_return=" and ".join(f"{density:g}" for density in ONE_RETURN),
-        ),
-        end="",
-    )
+    values = {
+        "stage": as_json(PREPARATION),
+        "passes": OPTIONS.passes,
+        "trees": OPTIONS.trees,
+        "fewer": scores["trees"],
+        "voxel": OPTIONS.voxel,
+        "size": MODEL.stat().st_size / 1e6,
+        "digest": hashlib.sha256(MODEL.read_bytes()).hexdigest()[:16],
+        "known": len(SURVEYS),
+        "groups": len(GROUPS),
+        "means": group_table(runs),
+        "scores": survey_table(runs),
+        "classes": class_table(at(runs, None)),
+        "tests": list_tests(tests),
+        "surveys": survey_list(runs),
+        "count": OPTIONS.count,
+        "most": MOST,
+        "below": BELOW,
+        "densities": ", ".join(f"{density:g}" for density in DENSITIES),
+        "one_return": " and ".join(f"{density:g}" for density in ONE_RETURN),
+    }
+    templates = {"card.md": "models.md", "survey_tables.md": "results/surveys.md"}
+    return {
+        ROOT / "docs" / page: (Path(__file__).parent / template).read_text().format(**values)
+        for template, page in templates.items()
+    }
+
+
+def main() -> None:
+    for path, text in pages().items():
+        path.write_text(text)
 
 
 if __name__ == "__main__":
