@@ -28,7 +28,7 @@ from .fitted_features import CloudFeatures, Features
 from .interface import Block, InputPlan, PredictRequest, weigh
 
 #: Points of a band at most, but for a band of one strip.
-BAND = 75_000
+BAND = 150_000
 
 
 def plan_of(passes: Sequence[Any]) -> FeaturePlan | InputPlan:
