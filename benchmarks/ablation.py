@@ -1,11 +1,16 @@
-"""What each rule and parameter of the ground filter does to real labeled clouds: error with it, and without or with another.
+"""What each rule and parameter of ground, noise, decks, wires and towers does to real labeled clouds.
 
-    python benchmarks/ablation.py --data FOLDER [--only NAME ...] [--json FILE]
+    python benchmarks/ablation.py --data FOLDER [--of ground noise ...] [--only ROW ...] [--json FILE]
 
 FOLDER holds the surveys of `surveys/sources.csv`, the ISPRS filter samples, and bridge/pont.laz; what is missing is left
-out and named. Each cloud is classified into ground and the rest. Errors are counted over ground, vegetation (4, 5) and
-buildings, over all points of the ISPRS samples; low vegetation and unclassified points are not scored. From twelve surveys
-clips of 160 m are cut, and a basement, a pit or a canal is dug into the middle of each: points of the hole are not scored.
+out and named. Each row switches one rule off, or gives a parameter another value; an error is the share of scored points, in
+percent, that are wrong:
+
+- ground: ground against vegetation (4, 5) and buildings, all points of the ISPRS samples. From twelve surveys clips of 160 m
+  are cut, and a basement, a pit or a canal is dug into the middle of each: points of the hole are not scored.
+- noise: 1 % of points put into each survey as `noise.py` does, and the published noise of surveys that have it.
+- decks, wires, towers: points of that class missed, and others taken for it, on all surveys. Unclassified points are not
+  scored, as cars and poles are among them.
 
 A rule stays only if, on clouds it was not made for, it lowers the mean error of a kind of clouds by 0.05 points or more, or
 rescues a cloud by a whole point, and harms none by more than 0.3. What a row changes by more than 0.15 is listed.
@@ -21,7 +26,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import laspy
 import numpy as np
@@ -29,12 +34,36 @@ from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "surveys"))
 from clouds import mislabeled, published
+from noise import injected
 from surveys import GROUND, SURVEYS, VEGETATION
 
-from pdal_stages.terrain import filtered_ground, smrf
+from pdal_stages.structures import decks, towers, wires
+from pdal_stages.terrain import (
+    detached_noise,
+    filtered_ground,
+    low_outliers,
+    noise,
+    openings,
+    smrf,
+)
 
-#: A cloud: its kind, (n, 3) coordinates in meters, (n,) 2 ground, 5 and 6 objects, 0 not scored.
-Cloud = tuple[str, np.ndarray, np.ndarray]
+
+class Cloud(NamedTuple):
+    """A labeled cloud without points that are not scored in any table."""
+
+    kind: str  #: the column of the ground's table
+    xyz: np.ndarray  #: (n, 3) meters
+    truth: np.ndarray  #: (n,) 2 ground, 5 and 6 objects, 0 not scored
+    codes: np.ndarray  #: (n,) as published; 17 decks, 14 wires, 15 towers, 7 and 18 noise
+
+    def take(self, rows: np.ndarray) -> Cloud:
+        return self._replace(xyz=self.xyz[rows], truth=self.truth[rows], codes=self.codes[rows])
+
+
+#: Codes of noise.
+NOISE = (7, 18)
+#: Surveys whose decks have another code than 17.
+DECKS = {"Delft": 26}
 #: Surveys into which holes are dug: of every landscape, country and density.
 DUG = (
     "meadows", "Montpellier", "hamlet", "Delft", "town's edge", "river", "pines", "Amsterdam", "firs", "suburb",
@@ -50,11 +79,13 @@ TALL = 2.0
 LISTED = 0.15
 
 
-def labeled_survey(data: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a survey's coordinates and truth. Heights come from its labeled ground, never from the filter."""
+def labeled_survey(data: Path, name: str) -> Cloud:
+    """Return a survey with its truth. Heights come from its labeled ground, never from the filter."""
     known = SURVEYS[name]
     xyz, codes, _ = published(data, known)
-    kept = ~np.isin(codes, known.dropped)
+    if name in DECKS:
+        codes = np.where(codes == DECKS[name], 17, codes)
+    kept = ~np.isin(codes, [code for code in known.dropped if code not in NOISE])
     xyz, codes = xyz[kept], codes[kept]
     truth = np.zeros(len(xyz), np.uint8)
     for code, ours in known.labels.items():
@@ -65,49 +96,48 @@ def labeled_survey(data: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
         height = xyz[:, 2] - xyz[ground, 2][nearest]
         for code, least in known.tall.items():
             truth[(codes == code) & (height >= max(least, TALL))] = VEGETATION
-    truth[mislabeled(known, *xyz[:, :2].T)] = 0
-    return xyz, truth
+    truth[mislabeled(known, *xyz[:, :2].T) | np.isin(codes, NOISE)] = 0
+    return Cloud("survey", xyz, truth, codes)
 
 
-def dug(xyz: np.ndarray, truth: np.ndarray, hole: str) -> tuple[np.ndarray, np.ndarray]:
+def dug(cloud: Cloud, hole: str) -> Cloud:
     """Return a clip of a cloud with a hole dug into its middle."""
-    away = np.abs(xyz[:, :2] - np.median(xyz[:, :2], axis=0))
+    away = np.abs(cloud.xyz[:, :2] - np.median(cloud.xyz[:, :2], axis=0))
     near = (away < CLIP).all(axis=1)
-    xyz, truth, away = xyz[near].copy(), truth[near].copy(), away[near]
+    clip, away = cloud.take(near), away[near]
     west, south, depth = HOLES[hole]
     inside = (away[:, 0] < west) & (away[:, 1] < south)
-    xyz[inside, 2] -= depth
-    truth[inside] = 0
-    return xyz, truth
+    xyz = clip.xyz - np.outer(inside, [0, 0, depth])
+    return Cloud("dug", xyz, np.where(inside, 0, clip.truth), clip.codes)
 
 
-def read_labeled(path: Path, classes: dict[int, int], other: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a file's coordinates and truth; codes that `classes` does not name become `other`."""
+def read_labeled(path: Path, kind: str, classes: dict[int, int], other: int) -> Cloud:
+    """Return a file's points; codes that `classes` does not name have the truth `other`."""
     las = laspy.read(path)
     codes = np.asarray(las.classification)
     truth = np.full(len(codes), other, np.uint8)
     for code, ours in classes.items():
         truth[codes == code] = ours
-    return np.column_stack([las.x, las.y, las.z]).astype(float), truth
+    return Cloud(kind, np.column_stack([las.x, las.y, las.z]).astype(float), truth, codes)
 
 
 def clouds(data: Path) -> Iterator[tuple[str, Cloud]]:
     """Yield the name and the cloud of each that is there and has labeled ground."""
     for name in SURVEYS:
         try:
-            xyz, truth = labeled_survey(data, name)
+            cloud = labeled_survey(data, name)
         except FileNotFoundError as error:
             print(f"left out: {error.filename} is missing", file=sys.stderr)
             continue
-        if (truth == GROUND).any():
-            yield name, ("survey", xyz, truth)
+        if (cloud.truth == GROUND).any():
+            yield name, cloud
             if name in DUG:
                 for hole in HOLES:
-                    yield f"{name} + {hole}", ("dug", *dug(xyz, truth, hole))
+                    yield f"{name} + {hole}", dug(cloud, hole)
     if (path := data / "bridge" / "pont.laz").exists():
-        yield "pont", ("survey", *read_labeled(path, {2: 2, 4: 5, 5: 5, 6: 6}, 0))
+        yield "pont", read_labeled(path, "survey", {2: 2, 4: 5, 5: 5, 6: 6}, 0)
     for path in sorted(data.glob("isprs_filter/*.laz")):
-        yield path.stem, ("ISPRS", *read_labeled(path, {2: 2}, 5))
+        yield path.stem, read_labeled(path, "ISPRS", {2: 2}, 5)
 
 
 @contextmanager
@@ -121,50 +151,203 @@ def changed(module: Any, name: str, value: Any) -> Iterator[None]:
         setattr(module, name, before)
 
 
+def percent(wrong: np.ndarray) -> float:
+    """Return the share of true values in percent."""
+    return 100.0 * float(np.mean(wrong))
+
+
+def ground_error(cloud: Cloud, **options: float) -> float:
+    """Return the error of the ground filter."""
+    cloud = cloud.take(~np.isin(cloud.codes, NOISE))
+    scored = cloud.truth > 0
+    ground = filtered_ground(cloud.xyz, **options)["Ground"][scored] == 1
+    return percent(ground != (cloud.truth[scored] == GROUND))
+
+
+def with_noise(cloud: Cloud) -> Cloud:
+    """Return the cloud with 1 % of noise put into it, where it has none of its own."""
+    if np.isin(cloud.codes, NOISE).any():
+        return cloud
+    xyz, codes = injected(cloud.xyz, cloud.truth, 0.01, 0)
+    return cloud._replace(
+        xyz=np.vstack([cloud.xyz, xyz]), codes=np.append(cloud.codes, codes).astype(np.uint8)
+    )
+
+
+def noise_error(cloud: Cloud) -> float:
+    """Return the error of noise: low and high are not told apart."""
+    marked = detached_noise(cloud.xyz) > 0
+    return percent(marked != np.isin(cloud.codes, NOISE))
+
+
+class Heights(NamedTuple):
+    """A cloud without noise, and what detectors of structures read."""
+
+    cloud: Cloud
+    height: np.ndarray
+    ground: np.ndarray
+    wire: np.ndarray
+
+    @classmethod
+    def above(cls, cloud: Cloud) -> Heights:
+        """Return the heights that the ground filter finds."""
+        cloud = cloud.take(~np.isin(cloud.codes, NOISE))
+        values = filtered_ground(cloud.xyz)
+        height, ground = values["HeightAboveGround"], values["Ground"] > 0
+        use = np.ones(len(height), bool)
+        return cls(cloud, height, ground, wires.find_wires(cloud.xyz, height, use))
+
+    def error(self, detected: np.ndarray, code: int) -> float:
+        """Return the error of a class; unclassified points are not scored."""
+        scored = self.cloud.codes != 1
+        return percent(detected[scored] != (self.cloud.codes[scored] == code))
+
+
+def deck_error(heights: Heights) -> float:
+    """Return the error of bridge decks."""
+    xyz, use = heights.cloud.xyz, np.ones(len(heights.height), bool)
+    return heights.error(decks.find_decks(*xyz.T.copy(), use, heights.ground, decks.RULES), 17)
+
+
+def wire_error(heights: Heights) -> float:
+    """Return the error of wires."""
+    xyz, use = heights.cloud.xyz, np.ones(len(heights.height), bool)
+    return heights.error(wires.find_wires(xyz, heights.height, use, wires.RULES), 14)
+
+
+def tower_error(heights: Heights) -> float:
+    """Return the error of towers, with the wires as they are."""
+    xyz, use = heights.cloud.xyz, np.ones(len(heights.height), bool)
+    found = towers.find_towers(xyz, heights.height, heights.wire, use, towers.RULES)
+    return heights.error(found, 15)
+
+
 def no_outliers(raster: np.ndarray, highest: np.ndarray, cell: float) -> np.ndarray:
     """Find no low outliers."""
     return np.zeros(raster.shape, bool)
 
 
-def option(**values: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a filter with other options."""
-    return lambda xyz: filtered_ground(xyz, **values)["Ground"] == 1
+def unchanged(values: np.ndarray) -> np.ndarray:
+    """Return what came in."""
+    return values
 
 
-def without(name: str, value: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the filter with another value of a name in `terrain.smrf`."""
+class Row(NamedTuple):
+    """What a row of a table changes."""
 
-    def found(xyz: np.ndarray) -> np.ndarray:
-        with changed(smrf, name, value):
-            return filtered_ground(xyz)["Ground"] == 1
+    module: Any = None
+    name: str = "RULES"
+    value: Any = None
+    options: dict[str, float] = {}
 
-    return found
+
+def rule(module: Any, **values: Any) -> Row:
+    """Return the row of other thresholds of a detector."""
+    return Row(module, "RULES", module.RULES._replace(**values))
 
 
-#: By the words of the table: the ground (n,) bool of coordinates.
-ROWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "as it is": option(),
-    "without low outliers": without("pits", no_outliers),
-    "without regaining ground": without("ROUNDS", 0),
-    "regained once": without("ROUNDS", 1),
-    "surface of 8 m blocks": without("NEAR", 8.0),
-    "window 75": option(window=75.0),
-    "window 40": option(window=40.0),
-    "window 25": option(window=25.0),
-    "window 14": option(window=14.0),
-    "slope 0.1": option(slope=0.1),
-    "slope 0.2": option(slope=0.2),
-    "threshold 0.4": option(threshold=0.4),
-    "threshold 0.6": option(threshold=0.6),
-    "scalar 0.9": option(scalar=0.9),
-    "cell 0.5": option(cell=0.5),
+def option(**values: float) -> Row:
+    """Return the row of other options."""
+    return Row(options=values)
+
+
+#: By table and the words of its row; the first row is what is shipped.
+ROWS: dict[str, dict[str, Row]] = {
+    "ground": {
+        "as it is": Row(),
+        "without low outliers": Row(smrf, "pits", no_outliers),
+        "outliers: no ground as deep is looked for": rule(low_outliers, min_company=10**6),
+        "outliers: no support for deep ground": rule(
+            low_outliers, min_support=-1, min_support_share=0.0
+        ),
+        "outliers: covered islands are small": rule(low_outliers, covered=2.0),
+        "holes stay holes": Row(openings, "fill_holes", unchanged),
+        "without regaining ground": Row(smrf, "ROUNDS", 0),
+        "regained once": Row(smrf, "ROUNDS", 1),
+        "surface of 8 m blocks": Row(smrf, "NEAR", 8.0),
+        "window 75": option(window=75.0),
+        "window 40": option(window=40.0),
+        "window 25": option(window=25.0),
+        "window 14": option(window=14.0),
+        "slope 0.1": option(slope=0.1),
+        "slope 0.15": option(slope=0.15),
+        "slope 0.2": option(slope=0.2),
+        "threshold 0.4": option(threshold=0.4),
+        "threshold 0.6": option(threshold=0.6),
+        "scalar 0.9": option(scalar=0.9),
+        "cell 0.5": option(cell=0.5),
+    },
+    "noise": {
+        "as it is": Row(),
+        "extent does not grow with density": rule(noise, extent_growth=0.0),
+        "voxels are not widened in thin clouds": rule(noise, scales=0),
+        "gap does not grow in thin clouds": rule(noise, gap_growth=0.0),
+        "looks no farther in thin clouds": rule(noise, spacings_aside=0.0),
+        "what hangs in line is noise": rule(noise, strung=99),
+        "single points of wires are noise": rule(noise, strung_share=9.0),
+        "large covered clusters are good": rule(noise, covered=2.0),
+        "tall covered clusters are good": rule(noise, steep=1e9),
+        "low: no ground as deep is looked for": rule(low_outliers, min_company=10**6),
+        "low: that needs no support": rule(low_outliers, min_support=-1, min_support_share=0.0),
+        "low: scatter does not matter": rule(low_outliers, scatters=0.0),
+    },
+    "decks": {
+        "as it is": Row(),
+        "no clearance over what is in sight": rule(decks, sight=0),
+        "water without points is a wall": rule(decks, max_water=0),
+        "narrow layers are not grown": rule(decks, grown=0),
+        "ends need not lead on": rule(decks, min_end_ratio=0.0),
+        "sides need no drop": rule(decks, min_side_ratio=0.0),
+        "walls do not matter": rule(decks, max_wall_ratio=9.0),
+        "drops may be gentle": rule(decks, min_wall_slope=0.0),
+        "layers need not be solid": rule(decks, min_neighbors=0),
+        "leaves above an edge are walls": rule(decks, headroom_m=99.0),
+    },
+    "wires": {
+        "as it is": Row(),
+        "any neighbors": rule(wires, max_neighbors=10**6),
+        "ends are not lengthened": rule(wires, min_filled_side=99),
+        "the air around may be full": rule(wires, max_around_ratio=1e9),
+        "less may be seen below": rule(wires, min_seen_ratio=0.0),
+        "sides may differ": rule(wires, min_side_ratio=0.0),
+        "lines may hide": rule(wires, min_clear_share=0.0),
+        "any length": rule(wires, min_length_m=0.0),
+        "no gaps": rule(wires, hop_m=1.0),
+    },
+    "towers": {
+        "as it is": Row(),
+        "rings around may be full": rule(towers, max_clear_ratio=1e9),
+        "trees may widen a body": rule(towers, max_aside_ratio=9.0),
+        "slim bodies need clear rings": rule(towers, max_crowd_ratio=0.0),
+        "slim bodies may stand in a crowd": rule(towers, max_crowd_ratio=1e9),
+        "wires need not rise": rule(towers, min_rise=-9.0),
+        "bodies need not be filled": rule(towers, min_filled=0.0),
+        "one size": rule(towers, max_scale=1.0),
+    },
 }
 
 
-def error(ground: np.ndarray, truth: np.ndarray) -> float:
-    """Return the share of scored points, in percent, that are wrongly called ground or not."""
-    scored = truth > 0
-    return 100.0 * float(np.mean(ground[scored] != (truth[scored] == GROUND)))
+def errors_of(what: str, every: dict[str, Cloud], only: list[str]) -> dict[str, dict[str, float]]:
+    """Return row -> cloud -> error of a table."""
+    score: Callable[..., float]
+    if what == "ground":
+        inputs, score = every, ground_error
+    elif what == "noise":
+        inputs = {name: with_noise(cloud) for name, cloud in every.items()}
+        score = noise_error
+    else:
+        inputs = {name: Heights.above(cloud) for name, cloud in every.items()}
+        score = {"decks": deck_error, "wires": wire_error, "towers": tower_error}[what]
+    errors: dict[str, dict[str, float]] = {}
+    for words, row in ROWS[what].items():
+        if only and words not in (*only, "as it is"):
+            continue
+        began = time.process_time()
+        module, value = (row.module, row.value) if row.module else (smrf, smrf.ROUNDS)
+        with changed(module, row.name if row.module else "ROUNDS", value):
+            errors[words] = {name: score(at, **row.options) for name, at in inputs.items()}
+        print(f"{words}: {time.process_time() - began:.0f} CPU s", file=sys.stderr, flush=True)
+    return errors
 
 
 def table(errors: dict[str, dict[str, float]], kinds: dict[str, str]) -> str:
@@ -185,23 +368,23 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=os.environ.get("PDAL_STAGES_DATA"))
-    parser.add_argument("--only", nargs="+", choices=list(ROWS), help="rows beside the first")
+    parser.add_argument("--of", nargs="+", choices=list(ROWS), default=list(ROWS), help="tables")
+    parser.add_argument("--only", nargs="+", help="rows beside the first")
     parser.add_argument("--json", type=Path, help="write every cloud's error here")
     options = parser.parse_args()
     if options.data is None:
         parser.error("name the folder of the clouds with --data or PDAL_STAGES_DATA")
     every = dict(clouds(Path(options.data)))
-    kinds = {name: kind for name, (kind, _, _) in every.items()}
-    errors: dict[str, dict[str, float]] = {}
-    for row, found in ROWS.items():
-        if options.only and row not in (*options.only, "as it is"):
-            continue
-        began = time.process_time()
-        errors[row] = {name: error(found(xyz), truth) for name, (_, xyz, truth) in every.items()}
-        print(f"{row}: {time.process_time() - began:.0f} CPU s", file=sys.stderr, flush=True)
-    print(table(errors, kinds))
+    tables = {}
+    for what in options.of:
+        chosen = every
+        if what != "ground":
+            chosen = {name: cloud for name, cloud in every.items() if cloud.kind == "survey"}
+        errors = tables[what] = errors_of(what, chosen, options.only)
+        kinds = {name: cloud.kind for name, cloud in chosen.items()}
+        print(f"\n{what}\n\n{table(errors, kinds)}", flush=True)
     if options.json:
-        options.json.write_text(json.dumps(errors, indent=1) + "\n")
+        options.json.write_text(json.dumps(tables, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ class DetachedRules(NamedTuple):
     spacings: float = 1.6  #: of points, which a voxel is wide then
     gap_growth: float = 10.0  #: meters that the gap of high noise grows per meter of spacing
     dense_m: float = 0.55  #: beyond this spacing: about 3 points/m2
+    min_columns: int = 12  #: around high noise that hold what it lies above
     aside: int = 3  #: columns around within which nothing is as high as high noise, at least
     spacings_aside: float = 2.5  #: and so many spacings of points
     hanging_m: float = 5.0  #: height above the lowest point of a column from which points hang
@@ -155,7 +156,7 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     hung[place[hangs]], hung_suspect[place[hangs]] = highest[hangs], suspect[hangs]
     verdict = np.zeros(len(place), np.uint8)
     rasters = (a.reshape(h, w) for a in (top, hung, hung_suspect))
-    _high(place, lowest, suspect, spacing, *rasters, gap, verdict)
+    _high(place, lowest, suspect, spacing, *rasters, gap, RULES, verdict)
     suspect = (suspect | large) & (verdict == 0)
     np.minimum.at(low, place[suspect], lowest[suspect])
     limit = below_ground(low.reshape(h, w), base.reshape(h, w), SIDE, depth)
@@ -298,16 +299,16 @@ def _covered(voxels, number, spacing, columns, most):
 
 
 @njit
-def _high(place, lowest, suspect, spacing, top, hung, hung_suspect, gap, verdict):
+def _high(place, lowest, suspect, spacing, top, hung, hung_suspect, gap, rules, verdict):
     """Say which suspects are above all that is near, and not of a line."""
     h, w = top.shape
-    u, v, dz = np.empty((3, (2 * RULES.far + 1) ** 2))
+    u, v, dz = np.empty((3, (2 * rules.far + 1) ** 2))
     for k in range(len(place)):
         if not suspect[k]:
             continue
         j, i = place[k] // w, place[k] % w
-        least = gap + RULES.gap_growth * max(0.0, spacing[k] - RULES.dense_m)
-        r = min(max(RULES.aside, int(np.ceil(RULES.spacings_aside * spacing[k] / SIDE))), RULES.far)
+        least = gap + rules.gap_growth * max(0.0, spacing[k] - rules.dense_m)
+        r = min(max(rules.aside, int(np.ceil(rules.spacings_aside * spacing[k] / SIDE))), rules.far)
         while True:
             seen, highest = 0, -np.inf
             for b in range(max(j - r, 0), min(j + r + 1, h)):
@@ -315,22 +316,22 @@ def _high(place, lowest, suspect, spacing, top, hung, hung_suspect, gap, verdict
                     if (b - j) ** 2 + (a - i) ** 2 <= r * r and top[b, a] > -np.inf:
                         seen += 1
                         highest = max(highest, top[b, a])
-            if seen >= LOW_RULES.min_columns or r == RULES.far:
+            if seen >= rules.min_columns or r == rules.far:
                 break
-            r = min(2 * r, RULES.far)
-        if seen >= LOW_RULES.min_columns and lowest[k] - highest >= least:
-            verdict[k] = 0 if _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz) else HIGH
+            r = min(2 * r, rules.far)
+        if seen >= rules.min_columns and lowest[k] - highest >= least:
+            verdict[k] = 0 if _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz, rules) else HIGH
 
 
 @device
-def _in_line(hung, hung_suspect, j, i, z, u, v, dz):
+def _in_line(hung, hung_suspect, j, i, z, u, v, dz, rules):
     """Whether others that hang are strung along a line through a place, as wires are, or single points of them."""
     h, w = hung.shape
     n = suspects = 0
-    for b in range(max(j - RULES.far, 0), min(j + RULES.far + 1, h)):
-        for a in range(max(i - RULES.far, 0), min(i + RULES.far + 1, w)):
+    for b in range(max(j - rules.far, 0), min(j + rules.far + 1, h)):
+        for a in range(max(i - rules.far, 0), min(i + rules.far + 1, w)):
             square = (b - j) ** 2 + (a - i) ** 2
-            if 4 < square <= RULES.far * RULES.far and abs(
+            if 4 < square <= rules.far * rules.far and abs(
                 hung[b, a] - z
             ) <= 1.0 + 0.3 * SIDE * np.sqrt(square):
                 u[n], v[n], dz[n] = a - i, b - j, hung[b, a] - z
@@ -344,11 +345,11 @@ def _in_line(hung, hung_suspect, j, i, z, u, v, dz):
             aside = abs(u[a] * v[b] - v[a] * u[b]) / far
             if aside <= 1.0 and abs(dz[b] - part / far * dz[a]) <= 2.0:
                 along += 1
-                places |= 1 << int((part + RULES.far) / 3.0)
+                places |= 1 << int((part + rules.far) / 3.0)
         number = 0
         while places > 0:
             number += places & 1
             places >>= 1
-        if number >= RULES.strung and along > RULES.strung_share * suspects:
+        if number >= rules.strung and along > rules.strung_share * suspects:
             return True
     return False
