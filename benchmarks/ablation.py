@@ -1,19 +1,26 @@
-"""What each rule and parameter of ground, noise, decks, wires and towers does to real labeled clouds.
+"""What each rule and parameter of ground, noise, decks, wires and towers does to real labeled
+clouds.
 
-    python benchmarks/ablation.py --data FOLDER [--of ground noise ...] [--only ROW ...] [--json FILE]
+    python benchmarks/ablation.py --data FOLDER [--of ground noise ...] [--only ROW ...] [--json
+    FILE]
 
-FOLDER holds the surveys of `surveys/sources.csv`, the ISPRS filter samples, and bridge/pont.laz; what is missing is left
-out and named. Each row switches one rule off, or gives a parameter another value; an error is the share of scored points, in
-percent, that are wrong:
+FOLDER holds the surveys of `surveys/sources.csv`, the ISPRS filter samples, and bridge/pont.laz;
+what is missing is left out and named. Each row switches one rule off, or gives a parameter another
+value; an error is the share of scored points, in percent, that are wrong:
 
-- ground: ground against vegetation (4, 5) and buildings, all points of the ISPRS samples. From twelve surveys clips of 160 m
-  are cut, and a basement, a pit or a canal is dug into the middle of each: points of the hole are not scored.
-- noise: 1 % of points put into each survey as `noise.py` does, and the published noise of surveys that have it.
-- decks, wires, towers: points of that class missed, and others taken for it, on all surveys. Unclassified points are not
+- ground: ground against vegetation (4, 5) and buildings, all points of the ISPRS samples. From
+twelve surveys clips of 160 m
+  are cut, and a basement, a pit or a canal is dug into the middle of each: points of the hole are
+  not scored.
+- noise: 1 % of points put into each survey as `noise.py` does, and the published noise of surveys
+that have it.
+- decks, wires, towers: points of that class missed, and others taken for it, on all surveys.
+Unclassified points are not
   scored, as cars and poles are among them.
 
-A rule stays only if, on clouds it was not made for, it lowers the mean error of a kind of clouds by 0.05 points or more, or
-rescues a cloud by a whole point, and harms none by more than 0.3. What a row changes by more than 0.15 is listed.
+A rule stays only if, on clouds it was not made for, it lowers the mean error of a kind of clouds by
+0.05 points or more, or rescues a cloud by a whole point, and harms none by more than 0.3. What a
+row changes by more than 0.15 is listed.
 """
 
 from __future__ import annotations
@@ -73,14 +80,16 @@ DUG = (
 HOLES = {"basement": (12.5, 7.5, 3.5), "pit": (12.0, 12.0, 8.0), "canal": (np.inf, 4.0, 3.0)}
 #: Half the side of a clip in meters.
 CLIP = 80.0
-#: Height in meters above the nearest labeled ground from which a point of "everything else" is vegetation.
+#: Height in meters above the nearest labeled ground from which a point of "everything else" is
+#: vegetation.
 TALL = 2.0
 #: Changes of a cloud's error, in points, that are listed.
 LISTED = 0.15
 
 
 def labeled_survey(data: Path, name: str) -> Cloud:
-    """Return a survey with its truth. Heights come from its labeled ground, never from the filter."""
+    """Return a survey with its truth. Heights come from its labeled ground, never from the
+    filter."""
     known = SURVEYS[name]
     xyz, codes, _ = published(data, known)
     if name in DECKS:

@@ -1,21 +1,25 @@
 """Detect bridge decks: narrow surfaces that drop at both sides and lead on to ground at both ends.
 
-After the profiles of Sithole and Vosselman [S06], on a raster of vertical layers in cells of a meter:
+After the profiles of Sithole and Vosselman [S06], on a raster of vertical layers in cells of a
+meter:
 
-1. A layer is solid if most of the cells around hold a layer that one can step on to.
-2. In eight directions one walks from a solid layer to the next until there is none ahead. Such an edge is a drop (something
-   lies lower ahead), open (nothing lies ahead, as over water without returns), or a wall. What lies beyond the survey is not
-   known, and counts as a wall.
-3. Layers with drops or open edges at two opposite sides, close together, are narrow. Layers beside them that are not ground
+1. A layer is solid if most of the cells around hold a layer that one can step on to. 2. In eight
+directions one walks from a solid layer to the next until there is none ahead. Such an edge is a
+drop (something
+   lies lower ahead), open (nothing lies ahead, as over water without returns), or a wall. What lies
+   beyond the survey is not known, and counts as a wall.
+3. Layers with drops or open edges at two opposite sides, close together, are narrow. Layers beside
+them that are not ground
    belong to them.
-4. Narrow layers that hang together are a deck if they lead on to ground at two opposite ends, across their width, and drop
+4. Narrow layers that hang together are a deck if they lead on to ground at two opposite ends,
+across their width, and drop
    at both sides between these.
 
-Decks that leave the cloud, that are longer or wider than :class:`DeckRules` has it, and bridges hardly above what they cross
-are not detected. Below 2 points/m2 cells are too empty.
+Decks that leave the cloud, that are longer or wider than :class:`DeckRules` has it, and bridges
+hardly above what they cross are not detected. Below 2 points/m2 cells are too empty.
 
-[S06] Sithole, Vosselman (2006): Bridge detection in airborne laser scanner data. ISPRS Journal of Photogrammetry and
-Remote Sensing 61(1), 33-46.
+[S06] Sithole, Vosselman (2006): Bridge detection in airborne laser scanner data. ISPRS Journal of
+Photogrammetry and Remote Sensing 61(1), 33-46.
 """
 
 from __future__ import annotations
@@ -36,8 +40,9 @@ CELL_M = 1.0
 
 
 class DeckRules(NamedTuple):
-    """Thresholds of the detector; kernels take them as they are. Most were set on a bridge of 57 points/m2 (LiDAR HD)
-    and hold from half to twice their value there; none marks anything but a bridge in 30 labeled surveys."""
+    """Thresholds of the detector; kernels take them as they are. Most were set on a bridge of 57
+    points/m2 (LiDAR HD) and hold from half to twice their value there; none marks anything but a
+    bridge in 30 labeled surveys."""
 
     max_step_m: float = 0.35  #: from one cell to another: a curb
     max_grade: float = 0.25  #: and so much more per meter: ramps of footbridges
@@ -56,7 +61,8 @@ class DeckRules(NamedTuple):
         1.2  #: to something lower in sight, such as water in a canal or the other bank
     )
     headroom_m: float = 1.5  #: leaves and lamps higher than that beside an edge hide nothing
-    max_water: int = 60  #: cells from a place without points to others in all four quadrants; else the survey ends there
+    #: cells from a place without points to others in all four quadrants; else the survey ends there
+    max_water: int = 60
     sight: int = 30  #: cells within which something lower is looked for, 45 degrees to either side
     grown: int = (
         3  #: times that layers beside become narrow, up to `link` cells on: abutments under leaves
@@ -111,8 +117,8 @@ def find_decks(
 ) -> NDArray[np.bool_]:
     """Return which points (n,) are of bridge decks.
 
-    Coordinates in meters, finite; `ground` is what a ground filter calls ground, decks among it or not; points that are not
-    to `use` are not seen.
+    Coordinates in meters, finite; `ground` is what a ground filter calls ground, decks among it or
+    not; points that are not to `use` are not seen.
     """
     out, used = np.zeros(len(x), bool), np.flatnonzero(use)
     if not len(used):
@@ -182,7 +188,8 @@ def _are_decks(part, row, column, leads, edge, rules) -> NDArray[np.bool_]:
         return np.bincount(part, values, len(size))
 
     drop = edge == _DROP
-    # The deck runs across its drops. Places from its middle, times the size: whole numbers, wherever the raster begins.
+    # The deck runs across its drops. Places from its middle, times the size: whole numbers,
+    # wherever the raster begins.
     xx, xy, yy = (
         sums((drop * by).sum(axis=1)) for by in (_EAST * _EAST, _EAST * _NORTH, _NORTH * _NORTH)
     )
@@ -233,7 +240,8 @@ def _solid(layers, rules):
 
 @njit
 def _within_survey(held, reach):
-    """Find the cells (h, w) that have held ones in all four quadrants, `reach` cells away at most along either axis."""
+    """Find the cells (h, w) that have held ones in all four quadrants, `reach` cells away at most
+    along either axis."""
     h, w = held.shape
     out = np.ones((h, w), np.bool_)
     for up in range(2):
@@ -252,7 +260,8 @@ def _within_survey(held, reach):
 
 @njit
 def _walks(layers, solid, within, rules):
-    """Walk from each layer in eight directions: how far it is to an edge and which (n, 8); and the layer's own edges (n, 8).
+    """Walk from each layer in eight directions: how far it is to an edge and which (n, 8); and the
+    layer's own edges (n, 8).
 
     Where an edge is farther than the widest deck, the distance is endless.
     """
@@ -329,7 +338,8 @@ def _edge(layers, solid, within, j, i, di, dj, level, rules):
 
 @njit
 def _steps(layers, solid, some, rules):
-    """Pairs (k,), (k,) of some layers and of solid ones up to `link` cells away that one can step on to."""
+    """Pairs (k,), (k,) of some layers and of solid ones up to `link` cells away that one can step
+    on to."""
     z, start, h, w = layers
     one, other, count = np.empty(1024, np.int64), np.empty(1024, np.int64), 0
     for j in range(h):

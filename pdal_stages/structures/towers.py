@@ -1,8 +1,9 @@
 """Detect towers: what stands upright where spans of wires end.
 
-An axis is a cell around which points fill the height up to the wires near it, in a body that is clear of anything else below
-its arms. It is a tower where the wires say so: towards it they rise from both sides, as a wire is highest at its ends. Sums
-are whole numbers and reaches are bounded, so neither the order of points nor the tile matters.
+An axis is a cell around which points fill the height up to the wires near it, in a body that is
+clear of anything else below its arms. It is a tower where the wires say so: towards it they rise
+from both sides, as a wire is highest at its ends. Sums are whole numbers and reaches are bounded,
+so neither the order of points nor the tile matters.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ CELL_M = 1.0
 
 
 class TowerRules(NamedTuple):
-    """Thresholds of the tower detector, which kernels take as they are; set on a power line of 14 points/m2 (AHN4)."""
+    """Thresholds of the tower detector, which kernels take as they are; set on a power line of 14
+    points/m2 (AHN4)."""
 
     foot_m: float = 0.7  #: points lower above the ground are of none
     from_m: float = 2.0  #: the height is looked at from there: bushes are at feet
@@ -90,8 +92,8 @@ def find_towers(
 ) -> NDArray[np.bool_]:
     """Return which points (n,) are of towers.
 
-    Coordinates (n, 3) and heights above ground in meters, finite; `wire` tells the points of wires; points that are not to
-    `use` are not seen.
+    Coordinates (n, 3) and heights above ground in meters, finite; `wire` tells the points of wires;
+    points that are not to `use` are not seen.
     """
     out = np.zeros(len(xyz), bool)
     wires = np.flatnonzero(wire & use)
@@ -146,8 +148,8 @@ def _around(cloud, j, i, reach):
 
 @njit
 def _axes(cloud, rules):
-    """Find cells that may be the axis of a tower (m, 8): row, column, how high its wires hang, score, its middle, the
-    direction of its wires as an angle, and half its width in cells.
+    """Find cells that may be the axis of a tower (m, 8): row, column, how high its wires hang,
+    score, its middle, the direction of its wires as an angle, and half its width in cells.
     """
     top, there = np.full((cloud.h, cloud.w), -1.0), np.zeros((cloud.h, cloud.w), np.bool_)
     for p in range(len(cloud.x)):
@@ -181,7 +183,8 @@ def _axes(cloud, rules):
 
 @device(_nrt=True)
 def _half_width(cloud, j, i, high, rules):
-    """Return how many cells a body reaches from its axis, below the arms; 0 where it stands among other things."""
+    """Return how many cells a body reaches from its axis, below the arms; 0 where it stands among
+    other things."""
     rings = np.zeros((rules.max_half + rules.clear_rings + 1, 3), np.int64)
     for p in _around(cloud, j, i, len(rings) - 1):
         if (
@@ -213,7 +216,8 @@ def _half_width(cloud, j, i, high, rules):
 
 @device(_nrt=True)
 def _upright(cloud, j, i, half, high, rules):
-    """Score how well the points around a cell fill a body up to the wires, 0 where they do not; and its middle (x, y)."""
+    """Score how well the points around a cell fill a body up to the wires, 0 where they do not; and
+    its middle (x, y)."""
     first, last = int(rules.from_m), int(high)
     filled, sums = np.zeros(last + 2, np.bool_), np.zeros(3, np.int64)
     for p in _around(cloud, j, i, half):
@@ -242,7 +246,8 @@ def _upright(cloud, j, i, half, high, rules):
 
 @device(_nrt=True)
 def _rise(cloud, j, i, x, y, rules):
-    """Return how wires rise towards an axis, from both sides together, and their direction there as an angle.
+    """Return how wires rise towards an axis, from both sides together, and their direction there as
+    an angle.
 
     Of pairs of points, as of pieces of one wire: wires may lie far apart.
     """

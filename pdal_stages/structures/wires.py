@@ -1,11 +1,13 @@
 """Detect wires: long thin lines that hang in the air.
 
-1. A cell's points above the ground are parted into vertical layers. Thin layers with few others beside them may be of a
+1. A cell's points above the ground are parted into vertical layers. Thin layers with few others
+beside them may be of a
    wire.
-2. A straight line through such a layer is filled by others for `half_m` to both sides, or to one where the wire ends, and
+2. A straight line through such a layer is filled by others for `half_m` to both sides, or to one
+where the wire ends, and
    the air around it is empty.
-3. A line hides nothing: below it as much is seen as on either side. This parts wires from eaves, cornices and balconies.
-4. Lines that hang together are wires if they are long.
+3. A line hides nothing: below it as much is seen as on either side. This parts wires from eaves,
+cornices and balconies. 4. Lines that hang together are wires if they are long.
 
 Sums are whole numbers and reaches are bounded, so neither the order of points nor the tile matters.
 """
@@ -28,8 +30,8 @@ CELL_M = 1.0
 
 
 class WireRules(NamedTuple):
-    """Thresholds of the wire detector, which kernels take as they are; set on a power line of 14 points/m2 (AHN4) and on
-    roof edges of 13 surveys without one."""
+    """Thresholds of the wire detector, which kernels take as they are; set on a power line of 14
+    points/m2 (AHN4) and on roof edges of 13 surveys without one."""
 
     min_height_m: float = 4.0  #: above the ground: hedges and fences are lower
     max_thickness_m: float = 0.9  #: of a layer in a cell: a bundle of wires
@@ -93,7 +95,8 @@ def find_wires(
 ) -> NDArray[np.bool_]:
     """Return which points (n,) are of wires.
 
-    Coordinates (n, 3) and heights above ground in meters, finite; points that are not to `use` are not seen.
+    Coordinates (n, 3) and heights above ground in meters, finite; points that are not to `use` are
+    not seen.
     """
     out = np.zeros(len(xyz), bool)
     high = np.flatnonzero(use & (height > rules.min_height_m))
@@ -180,7 +183,8 @@ def _thin(layers, thick, rules):
 
 @njit
 def _lines(layers, thin, line, rules):
-    """Fill `line` (n, 3) with the direction (x, y; rise over run) of each layer's best line; return which have one."""
+    """Fill `line` (n, 3) with the direction (x, y; rise over run) of each layer's best line; return
+    which have one."""
     place, cells, start, h, w = layers
     good = np.zeros(len(thin), np.bool_)
     length = rules.half_m
@@ -239,8 +243,8 @@ def _lines(layers, thin, line, rules):
 def _hide_nothing(layers, good, line, x, y, z, begin, on, rules):
     """Find the layers (n,) with lines below which as much is seen as on either side.
 
-    Of all points in the order of their cells, which begin at `begin`: places in these (x, y), heights, and whether they are
-    `on` such lines.
+    Of all points in the order of their cells, which begin at `begin`: places in these (x, y),
+    heights, and whether they are `on` such lines.
     """
     place, cells, _, _, w = layers
     out, margin = good.copy(), _margin(rules)
@@ -272,7 +276,8 @@ def _hide_nothing(layers, good, line, x, y, z, begin, on, rules):
 
 @njit
 def _on_lines(layers, good, line, rules):
-    """Pair (k,) layers with lines and (k,) those on them, themselves included; (k,) how far away these are, meters."""
+    """Pair (k,) layers with lines and (k,) those on them, themselves included; (k,) how far away
+    these are, meters."""
     place, cells, start, h, w = layers
     one, other, far = np.empty(1024, np.int64), np.empty(1024, np.int64), np.empty(1024)
     count, reach = 0, int(rules.half_m / CELL_M)

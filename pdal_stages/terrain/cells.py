@@ -1,6 +1,8 @@
-"""Cells of grids anchored to absolute coordinates: what lies lowest in them, which belong together, sums around them.
+"""Cells of grids anchored to absolute coordinates: what lies lowest in them, which belong together,
+sums around them.
 
-Points are cut into pieces whose rasters are small wherever points lie: groups far apart, and squares with surroundings.
+Points are cut into pieces whose rasters are small wherever points lie: groups far apart, and
+squares with surroundings.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ GAP = 1.0
 
 
 def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
-    """Sums of whole numbers (h, w, ...) over the square that goes `reach` cells to every side of each cell."""
+    """Sums of whole numbers (h, w, ...) over the square that goes `reach` cells to every side of
+    each cell."""
     sums = np.asarray(values)
     for axis in (0, 1):
         total = np.moveaxis(np.cumsum(sums, axis, np.int64), axis, 0)
@@ -32,7 +35,8 @@ def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
 
 
 def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDArray[np.float64]]:
-    """Three arrays of one length, from three or from one of shape (n, 3); StageError where shapes differ."""
+    """Three arrays of one length, from three or from one of shape (n, 3); StageError where shapes
+    differ."""
     if y is None and z is None:
         xyz = np.asarray(x, np.float64)
         if xyz.ndim != 2 or xyz.shape[1] != 3:
@@ -50,7 +54,8 @@ def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDAr
 
 
 def usable(*axes: NDArray[np.float64], mask: ArrayLike | None = None) -> NDArray[np.bool_]:
-    """Which points (n,) have finite coordinates, and are of the mask where one is given; StageError where that differs."""
+    """Which points (n,) have finite coordinates, and are of the mask where one is given; StageError
+    where that differs."""
     use = np.logical_and.reduce([np.isfinite(axis) for axis in axes])
     if mask is None:
         return use
@@ -69,7 +74,8 @@ def lowest_points(
     cell: NDArray[np.int64],
     count: int,
 ) -> NDArray[np.int64]:
-    """Numbers of the points that are the lowest of each of `count` cells, by the numbers of these; -1 where there is none.
+    """Numbers of the points that are the lowest of each of `count` cells, by the numbers of these;
+    -1 where there is none.
 
     Of points of one height the first by x, then y, is taken, so that order does not matter.
     """
@@ -90,7 +96,8 @@ def lowest_of_cells(
     use: NDArray[np.bool_],
     cell: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Numbers of the points that are the lowest usable ones of their cells, and the heights of the highest ones there.
+    """Numbers of the points that are the lowest usable ones of their cells, and the heights of the
+    highest ones there.
 
     In meters, finite coordinates.
     """
@@ -106,10 +113,12 @@ def lowest_of_cells(
 def levels(
     z: NDArray[np.float64], cell: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Points (n,) in the order of their cells' numbers (small ones) and of their heights, and which begin a level of a cell.
+    """Points (n,) in the order of their cells' numbers (small ones) and of their heights, and which
+    begin a level of a cell.
 
-    A cell's points are parted where a gap is wide: the ground and the deck over it, a roof and what it stands on. The lowest
-    points of levels are levels again, each by itself, so they stand for all points of places far away.
+    A cell's points are parted where a gap is wide: the ground and the deck over it, a roof and what
+    it stands on. The lowest points of levels are levels again, each by itself, so they stand for
+    all points of places far away.
     """
     rank = np.empty(len(z), np.int64)
     rank[np.argsort(z)] = np.arange(len(z))

@@ -28,7 +28,8 @@ from .surface import reach as planes_reach
 
 
 def reach_of_given(options: FilterOptions) -> int:
-    """Return how far away, in cells, points can change a point's height above given ground, or an opening's."""
+    """Return how far away, in cells, points can change a point's height above given ground, or an
+    opening's."""
     surfaces = sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
     if not options.opening_radii:
         return surfaces + 4
@@ -41,7 +42,8 @@ def given_pieces(
 ) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans]]:
     """Yield pieces of the cloud with the raster of the points (n,) that are `ground`.
 
-    Numbers of the piece's points, which of them are its own, the raster, and the means of its ground points by cell.
+    Numbers of the piece's points, which of them are its own, the raster, and the means of its
+    ground points by cell.
     """
     margin = 2 + FILL_RINGS + max([0, *options.opening_radii])
     for of, own in patches(points.column, points.row, reach_of_given(options), options.link):
@@ -62,7 +64,8 @@ def given_pieces(
 def _openings(
     points: GroundPoints, options: FilterOptions, window: GridWindow
 ) -> dict[int, NDArray[np.float32]]:
-    """Return radius in cells -> opening (h, w) of the minimum grid of all points, low outliers left out; meters."""
+    """Return radius in cells -> opening (h, w) of the minimum grid of all points, low outliers left
+    out; meters."""
     if not options.opening_radii:
         return {}
     _, raster, _ = minimum_grid(points, window, options.cell)

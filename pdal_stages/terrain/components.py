@@ -13,7 +13,8 @@ from .cells import HOLE
 
 @device
 def root_of(parent, member):
-    """The member that stands for a set, in sets that are joined one by one; the way to it gets shorter for who asks next."""
+    """The member that stands for a set, in sets that are joined one by one; the way to it gets
+    shorter for who asks next."""
     while parent[member] != member:
         parent[member] = parent[parent[member]]
         member = parent[member]
@@ -22,7 +23,8 @@ def root_of(parent, member):
 
 @njit
 def number_sets(one, other, number):
-    """Number alike the members (n,) of each set that the pairs join, in the order of first members; how many sets there are.
+    """Number alike the members (n,) of each set that the pairs join, in the order of first members;
+    how many sets there are.
 
     By hand: scipy.sparse.csgraph takes 0.4 s to be imported.
     """
@@ -74,9 +76,11 @@ def linked_cells(
     reach: float,
     step: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and their :func:`longest_sides`.
+    """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and their
+    :func:`longest_sides`.
 
-    Cells at most `reach` away from each other are linked across a `step` of meters, by the distance in cells.
+    Cells at most `reach` away from each other are linked across a `step` of meters, by the distance
+    in cells.
     """
     side = int(reach)
     j, i = np.mgrid[: side + 1, -side : side + 1]
@@ -95,7 +99,8 @@ def linked_cells(
 def longest_sides(
     label: NDArray[np.int64], places: Sequence[NDArray[np.int64]], count: int
 ) -> NDArray[np.int64]:
-    """Of each of `count` sets of places, the difference of its last and first along each axis: the largest one."""
+    """Of each of `count` sets of places, the difference of its last and first along each axis: the
+    largest one."""
     sides = np.zeros((len(places), count), np.int64)
     for side, at in zip(sides, places, strict=True):
         first, last = np.full((2, count), at[0] if len(at) else 0)

@@ -1,5 +1,5 @@
-"""Blocks of the ground's raster: made once of the lowest points far around and of all points inside; tiles put them
-together."""
+"""Blocks of the ground's raster: made once of the lowest points far around and of all points
+inside; tiles put them together."""
 
 from __future__ import annotations
 
@@ -34,12 +34,14 @@ def reach_of_block(options: FilterOptions) -> int:
 
 
 def _beside(options: FilterOptions) -> int:
-    """How far around a block, in cells, it must be known which cells are ground: points are told from a surface."""
+    """How far around a block, in cells, it must be known which cells are ground: points are told
+    from a surface."""
     return planes_reach(options.levels(NEAR)) + 4
 
 
 class GroundCells(NamedTuple):
-    """Cells of a :class:`.surface.GroundRaster`, one by one: all with a height, an opening, or ground points."""
+    """Cells of a :class:`.surface.GroundRaster`, one by one: all with a height, an opening, or
+    ground points."""
 
     cells: NDArray[np.void]  #: (n,) records, see `_record`
 
@@ -51,7 +53,8 @@ class GroundCells(NamedTuple):
 
     @staticmethod
     def names_within(side: int, west: int, south: int, east: int, north: int) -> set[str]:
-        """Names of the arrays of :meth:`in_parts` that are needed for the cells of these columns and rows."""
+        """Names of the arrays of :meth:`in_parts` that are needed for the cells of these columns
+        and rows."""
         columns, rows = (
             range(low // side, high // side + 1) for low, high in ((west, east), (south, north))
         )
@@ -87,7 +90,8 @@ class GroundCells(NamedTuple):
 
 
 def _record(openings: int) -> np.dtype:
-    """Of a cell: as in a :class:`.surface.GroundRaster`; whether it holds ground points, and their mean place."""
+    """Of a cell: as in a :class:`.surface.GroundRaster`; whether it holds ground points, and their
+    mean place."""
     return np.dtype(
         [
             *((name, np.int32) for name in ("column", "row")),
@@ -106,7 +110,8 @@ def by_block(
     use: NDArray[np.bool_],
     cell: float,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them; meters."""
+    """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them;
+    meters."""
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
     parts = group_by_key(cell_keys(column, row))
@@ -123,8 +128,8 @@ def around_blocks(
     use: NDArray[np.bool_],
     options: FilterOptions,
 ) -> NDArray[np.float64]:
-    """What of points must be known around blocks (n, 4), meters: the lowest of each cell and how high the highest one there
-    is."""
+    """What of points must be known around blocks (n, 4), meters: the lowest of each cell and how
+    high the highest one there is."""
     low, top = lowest_of_cells(x, y, z, use, options.cell)
     return np.column_stack([*(axis[low] for axis in (x, y, z)), top])
 
@@ -137,8 +142,8 @@ def cells_of_block(
 ) -> GroundCells:
     """The cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
 
-    `outer` is (n, 4) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the block, and few more.
-    `points` are all that may be ground in the block, in parts (n, 3).
+    `outer` is (n, 4) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the
+    block, and few more. `points` are all that may be ground in the block, in parts (n, 3).
     """
     x, y, z, top = np.ascontiguousarray(outer.T)
     own = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)

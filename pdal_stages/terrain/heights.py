@@ -1,23 +1,28 @@
 """Height above filtered ground: a progressive morphological filter with identical results in tiles.
 
-After SMRF [P13]: the grid of lowest points is opened with growing windows; a cell that an opening lowers by more
-than `slope` times the window's radius is an object; what is left is ground, a surface is fitted through it, and a
-point is ground if it lies within `threshold` plus `scalar` times the terrain's slope of the surface. Unlike there:
+After SMRF [P13]: the grid of lowest points is opened with growing windows; a cell that an opening
+lowers by more than `slope` times the window's radius is an object; what is left is ground, a
+surface is fitted through it, and a point is ground if it lies within `threshold` plus `scalar`
+times the terrain's slope of the surface. Unlike there:
 
-* the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile with its halo gets the
+* the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile
+with its halo gets the
   bits of the whole cloud, and so does any order of the points;
-* holes are filled near measured cells only, and for the openings only; a pyramid of planes carries the surface across
+* holes are filled near measured cells only, and for the openings only; a pyramid of planes carries
+the surface across
   them (:mod:`.surface`);
-* ground that openings took from ridges, dams and the upper side of walls is regained where it continues the surface;
+* ground that openings took from ridges, dams and the upper side of walls is regained where it
+continues the surface;
 * low outliers are told from ground under a canopy (:mod:`.low_outliers`).
 
-Parameters have SMRF's defaults but for `slope`, 0.15 there: 0.12 lowers the mean error of 27 surveys
-from 0.67 to 0.61 and that of the ISPRS samples from 3.58 to 3.45 (`benchmarks/ablation.py`). What
-lies beyond the cloud's end or in a hole is unknown, and no evidence for an object. Roofs wider than
-the window stay ground: a classifier tells them by heights above openings of other widths.
+Parameters have SMRF's defaults but for `slope`, 0.15 there: 0.12 lowers the mean error of 27
+surveys from 0.67 to 0.61 and that of the ISPRS samples from 3.58 to 3.45
+(`benchmarks/ablation.py`). What lies beyond the cloud's end or in a hole is unknown, and no
+evidence for an object. Roofs wider than the window stay ground: a classifier tells them by heights
+above openings of other widths.
 
-[P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain classification of
-airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30.
+[P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain
+classification of airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30.
 """
 
 from __future__ import annotations
@@ -84,7 +89,8 @@ def filtered_ground(
     window : float, default 18
         Radius of the largest window, meters: half the width of the largest object that is removed.
     threshold, scalar : float, default 0.5 and 1.25
-        A point is ground within `threshold` + `scalar` times the terrain's slope of the surface, meters.
+        A point is ground within `threshold` + `scalar` times the terrain's slope of the surface,
+        meters.
     openings : sequence of float
         Windows, in meters, of openings of the minimum grid above which heights are wanted too.
     slope_too : bool
@@ -93,19 +99,22 @@ def filtered_ground(
         None or 0: every available core.
     figures : dict, optional
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
-        ``without_terrain`` (points with no usable point near; their height is 0), ``unused_points``.
+        ``without_terrain`` (points with no usable point near; their height is 0),
+        ``unused_points``.
     cells : GroundCells, optional
-        Cells whose ground was found before (:func:`.ground_blocks.cells_of_block`), all within the `reach_of_cells` of
-        :class:`.FilterOptions` of the points, which then need no others around them.
+        Cells whose ground was found before (:func:`.ground_blocks.cells_of_block`), all within the
+        `reach_of_cells` of :class:`.FilterOptions` of the points, which then need no others around
+        them.
     given : array_like of bool, shape (n,), optional
-        Points that are the ground: nothing is filtered, they alone form the surface. They are ``Ground``, and so are
-        others within the tolerance of the surface.
+        Points that are the ground: nothing is filtered, they alone form the surface. They are
+        ``Ground``, and so are others within the tolerance of the surface.
 
     Returns
     -------
     dict of str to ndarray, shape (n,)
-        ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 where the filter calls a point ground), ``Slope``
-        (float64, degrees), ``HeightAboveOpening_<window>`` (float32) on request. NaN where a coordinate is not finite.
+        ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 where the filter calls a point
+        ground), ``Slope`` (float64, degrees), ``HeightAboveOpening_<window>`` (float32) on request.
+        NaN where a coordinate is not finite.
 
     Raises
     ------
@@ -189,7 +198,8 @@ def _measured(
     threads: int | None,
     counts: dict[str, int],
 ) -> dict[str, NDArray]:
-    """Heights of points above the ground of a raster, and what they say of that themselves, where no `means` say it."""
+    """Heights of points above the ground of a raster, and what they say of that themselves, where
+    no `means` say it."""
     x, y, z, _, use, column, row = points
     cell, (left, bottom, _, _) = options.cell, raster.window
     needed = around(raster.window, column, row)

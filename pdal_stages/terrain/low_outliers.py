@@ -1,7 +1,7 @@
 """Tell low outliers, as of multiple reflections, from ground that is deep.
 
-A low place is below the ground if it lies below the plane through its surroundings by more than these scatter about it, and
-if no ground as deep is near, as a street is to a courtyard.
+A low place is below the ground if it lies below the plane through its surroundings by more than
+these scatter about it, and if no ground as deep is near, as a street is to a courtyard.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from .openings import highest_around
 
 
 class LowRules(NamedTuple):
-    """Thresholds of low outliers, which kernels take as they are; columns are those of the raster that is looked at."""
+    """Thresholds of low outliers, which kernels take as they are; columns are those of the raster
+    that is looked at."""
 
     near: int = 9  #: columns to each side through which the plane is fitted
     min_columns: int = 12  #: that a plane needs
@@ -47,13 +48,15 @@ RULES = LowRules()
 
 
 def reach(side: float) -> int:
-    """Return how far away, in columns of a `side` in meters, points change what is below the ground."""
+    """Return how far away, in columns of a `side` in meters, points change what is below the
+    ground."""
     return RULES.near + math.ceil(RULES.far_m / side + 2)
 
 
 @device(_nrt=True, fastmath=set(FAST))
 def _plane_under(low, j, i, rules):
-    """Fit a plane under the columns around one: its height there, per column across, along; and the scatter below it.
+    """Fit a plane under the columns around one: its height there, per column across, along; and the
+    scatter below it.
 
     The height is -inf where there are too few columns.
     """
@@ -127,7 +130,8 @@ def _supported(base, rules):
 
 @device
 def _has_company(base, supported, side, j, i, z, plane, rules):
-    """Tell whether enough other columns are about as deep as z, and at least half as far below the plane."""
+    """Tell whether enough other columns are about as deep as z, and at least half as far below the
+    plane."""
     h, w = base.shape
     far, half, company = int(np.ceil(rules.far_m / side)), 0.5 * (plane[0] - z), 0
     for b in range(max(j - far, 0), min(j + far + 1, h)):
@@ -142,7 +146,8 @@ def _has_company(base, supported, side, j, i, z, plane, rules):
 
 @njit
 def _limits(low, base, supported, side, depth, limit, rules):
-    """Fill `limit` with the height below which each low place is deep, -inf where it is not or may be ground."""
+    """Fill `limit` with the height below which each low place is deep, -inf where it is not or may
+    be ground."""
     for j in range(low.shape[0]):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:
@@ -158,10 +163,12 @@ def _limits(low, base, supported, side, depth, limit, rules):
 def below_ground(
     low: NDArray, base: NDArray, side: float, depth: float = 1.0
 ) -> NDArray[np.float64]:
-    """Return the heights (h, w) below which low places are below the ground; -inf where they are not.
+    """Return the heights (h, w) below which low places are below the ground; -inf where they are
+    not.
 
-    `low` (h, w) has the lowest of what may be in each column, `base` that of what is not, both ``inf`` where there is none;
-    `side` is that of a column, and what is below the ground is so by `depth` at least; meters.
+    `low` (h, w) has the lowest of what may be in each column, `base` that of what is not, both
+    ``inf`` where there is none; `side` is that of a column, and what is below the ground is so by
+    `depth` at least; meters.
     """
     limit = np.full(low.shape, -np.inf)
     # Where all around lies lower, no plane through it runs above.
@@ -174,9 +181,11 @@ def below_ground(
 def pits(
     raster: NDArray[np.float32], highest: NDArray[np.floating], cell: float
 ) -> NDArray[np.bool_]:
-    """Find the cells (h, w) of a minimum grid whose lowest point is a low outlier: of islands from which one walks nowhere.
+    """Find the cells (h, w) of a minimum grid whose lowest point is a low outlier: of islands from
+    which one walks nowhere.
 
-    `raster` has heights, holes ``inf``; `highest` those of the highest points; `cell` is a cell's side; meters.
+    `raster` has heights, holes ``inf``; `highest` those of the highest points; `cell` is a cell's
+    side; meters.
     """
     rules = RULES
     number, size, side = linked_cells(

@@ -1,8 +1,9 @@
 """Height above a coarse terrain: the minima of a grid, interpolated [W18 section 3.2].
 
-The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell centers and evaluated on
-a fine grid; a point's height is its z minus the value of the fine cell it falls in. Both grids are anchored to absolute
-coordinates, so every tile of a survey sees the same cells. No raster is held: one stray coordinate costs one cell.
+The terrain is the lowest point of each cell of a coarse grid, interpolated bilinearly between cell
+centers and evaluated on a fine grid; a point's height is its z minus the value of the fine cell it
+falls in. Both grids are anchored to absolute coordinates, so every tile of a survey sees the same
+cells. No raster is held: one stray coordinate costs one cell.
 
 [W18] Weinmann, Blomley, Weinmann, Jutzi (2018), Investigations on the potential of binary and
 multi-class classification for object extraction from airborne laser scanning point clouds, DGPF.
@@ -24,8 +25,9 @@ from .cells import columns, usable
 class MinimaTerrain:
     """The coarse terrain of a cloud, read with :meth:`at`; parameters as of :func:`hag_minima`.
 
-    Its `figures` count ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed), ``farthest_fill``
-    (distance to the nearest filled cell, the worst case), ``unused_points`` (not finite, or excluded by the mask).
+    Its `figures` count ``cells`` (with points), ``interpolated_cells`` (empty ones that were
+    needed), ``farthest_fill`` (distance to the nearest filled cell, the worst case),
+    ``unused_points`` (not finite, or excluded by the mask).
     """
 
     def __init__(
@@ -54,7 +56,8 @@ class MinimaTerrain:
         }
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Terrain height where points fall: bilinear, at the center of their fine cell; NaN for those not finite.
+        """Terrain height where points fall: bilinear, at the center of their fine cell; NaN for
+        those not finite.
 
         NoTerrainError if no point formed a terrain.
         """
@@ -80,8 +83,8 @@ class MinimaTerrain:
     def _filled(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
         """Values of the cells `keys`; empty ones from the filled ones about as near as the nearest.
 
-        Weights are one over the fourth power of the distance between cell centers. [W18] does not say what becomes
-        of empty cells.
+        Weights are one over the fourth power of the distance between cell centers. [W18] does not
+        say what becomes of empty cells.
         """
         place, there = places_among(self.keys, keys)
         values, empty = self.minima[place], np.flatnonzero(~there)
@@ -107,7 +110,8 @@ _FILL = 1.5
 
 
 def _corners(x, y, cell: float, resolution: float):
-    """Keys of the four coarse cells round the middle of each point's fine cell (4, n), and where between them it lies."""
+    """Keys of the four coarse cells round the middle of each point's fine cell (4, n), and where
+    between them it lies."""
     u, v = ((np.floor(axis / resolution) + 0.5) * (resolution / cell) - 0.5 for axis in (x, y))
     i, j = cell_numbers(u, 1.0), cell_numbers(v, 1.0)
     return np.array([cell_keys(i + a, j + b) for b in (0, 1) for a in (0, 1)]), u - i, v - j
@@ -132,7 +136,8 @@ def hag_minima(
     Parameters
     ----------
     x, y, z : array_like, shape (n,)
-        Coordinates in meters (or any one unit, with `cell` and `resolution` in it too); or `x` alone, of shape (n, 3).
+        Coordinates in meters (or any one unit, with `cell` and `resolution` in it too); or `x`
+        alone, of shape (n, 3).
     cell : float, default 20
         Side of the coarse cells whose lowest points form the terrain.
     resolution : float, default 0.5
@@ -172,10 +177,11 @@ def terrain_reach(
 ) -> float:
     """How far around a box lies all that decides the terrain under the wanted points.
 
-    A height takes the four coarse cells around a point; an empty one is filled from all cells within its
-    nearest filled one's distance and 1.5 cells. All of these must be known whole. What is found with too few
-    points bounds the true reach from above. `forms` and `wanted` (n,) are the points that form the terrain, and those
-    whose heights matter; the box is (min x, min y, max x, max y). In the unit of x and y; 0 where the box suffices.
+    A height takes the four coarse cells around a point; an empty one is filled from all cells
+    within its nearest filled one's distance and 1.5 cells. All of these must be known whole. What
+    is found with too few points bounds the true reach from above. `forms` and `wanted` (n,) are the
+    points that form the terrain, and those whose heights matter; the box is (min x, min y, max x,
+    max y). In the unit of x and y; 0 where the box suffices.
     """
     from scipy.spatial import cKDTree
 

@@ -1,15 +1,19 @@
-"""Noise: points and small clusters detached from everything, below the ground or above all there is.
+"""Noise: points and small clusters detached from everything, below the ground or above all there
+is.
 
-Echoes from below (multiple reflections), birds, clouds, the sun. All is decided on an absolute grid, by counts and
-extremes, so that no order of points and no tile matters:
+Echoes from below (multiple reflections), birds, clouds, the sun. All is decided on an absolute
+grid, by counts and extremes, so that no order of points and no tile matters:
 
-1. A point is suspect if it is of a small cluster that nothing joins to the rest: a component of voxels that touch, by a
-   corner at least, with few points and little extent. In thin clouds voxels are widened until they hold several spacings
-   of points. A cluster that lies under others in nearly
-   all of its columns may have any number of points, or be taller. What is not suspect gives every column of the grid its
-   lowest and its highest point.
-2. A suspect is high noise if it lies above all that is near, by a gap. The thinner the cloud, the wider the gap and the
-   way looked: a tree, or a mast, may be a single point there. What hangs in line with others, as wires do, stays.
+1. A point is suspect if it is of a small cluster that nothing joins to the rest: a component of
+voxels that touch, by a
+   corner at least, with few points and little extent. In thin clouds voxels are widened until they
+   hold several spacings of points. A cluster that lies under others in nearly all of its columns
+   may have any number of points, or be taller. What is not suspect gives every column of the grid
+   its lowest and its highest point.
+2. A suspect is high noise if it lies above all that is near, by a gap. The thinner the cloud, the
+wider the gap and the
+   way looked: a tree, or a mast, may be a single point there. What hangs in line with others, as
+   wires do, stays.
 3. A suspect is low noise if it lies below the ground (:mod:`.low_outliers`).
 """
 
@@ -66,7 +70,8 @@ class DetachedRules(NamedTuple):
 
 
 RULES = DetachedRules()
-#: How far away, in meters, points can decide whether a point is of a small cluster: a component in full and its density.
+#: How far away, in meters, points can decide whether a point is of a small cluster: a component in
+#: full and its density.
 CLUSTER_REACH = (RULES.max_extent + 3 * BLOCK + 2) * SIDE
 #: How far away, in meters, points can change what a point is: the halo a tile needs.
 REACH = (below_reach(SIDE) + RULES.far + 2) * SIDE + CLUSTER_REACH
@@ -93,7 +98,8 @@ def detached_noise(
     cluster : int, default 60
         The most points of a cluster of noise; one that others lie above may have more.
     gap : float, default 2.5
-        How far above everything near high noise lies at least, meters; more in clouds below 3 points/m2.
+        How far above everything near high noise lies at least, meters; more in clouds below 3
+        points/m2.
     depth : float, default 1.0
         How far below the ground low noise lies at least, meters; more where that is rough.
 
@@ -174,7 +180,8 @@ class Voxels(NamedTuple):
 
     @classmethod
     def of(cls, row, column, level, width: int, counts=None) -> tuple[Voxels, NDArray[np.int64]]:
-        """Voxels of points, or of others with `counts` of them; and the number of each one's voxel."""
+        """Voxels of points, or of others with `counts` of them; and the number of each one's
+        voxel."""
         keys, voxel = np.unique(
             ((row * width + column) << BITS) + level + LEVELS, return_inverse=True
         )
@@ -187,7 +194,8 @@ class Voxels(NamedTuple):
 
 
 def surroundings(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Around each voxel the usual number of points in a column, and their spacing in meters, over 3 x 3 blocks."""
+    """Around each voxel the usual number of points in a column, and their spacing in meters, over 3
+    x 3 blocks."""
     row, column, _ = voxels.places
     wide = voxels.width // BLOCK
     block = (row // BLOCK) * wide + column // BLOCK
@@ -226,7 +234,8 @@ def _small(
 
 @njit
 def _touching(keys, spans, pairs):
-    """Fill `pairs` (2, n), where there is room, with numbers of voxels and of those whose keys are in the spans beyond.
+    """Fill `pairs` (2, n), where there is room, with numbers of voxels and of those whose keys are
+    in the spans beyond.
 
     How many there are.
     """
@@ -250,8 +259,8 @@ def small_clusters(
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Find the voxels (n,) of clusters of at most `most` points that nothing joins to the rest.
 
-    Also number (n,) the clusters that are not wide, whatever their size; -1 for none. `usual` and `spacing` (n,) are of
-    :func:`surroundings`.
+    Also number (n,) the clusters that are not wide, whatever their size; -1 for none. `usual` and
+    `spacing` (n,) are of :func:`surroundings`.
     """
     small, number = _small(voxels, usual, most, RULES.max_extent)
     row, column, level = voxels.places
@@ -271,8 +280,8 @@ def small_clusters(
 
 
 def _covered(voxels, number, spacing, columns, most):
-    """Voxels of clusters that others lie above in nearly all of their columns: of more than `most` points, or taller than
-    small ones and steeper than ground is."""
+    """Voxels of clusters that others lie above in nearly all of their columns: of more than `most`
+    points, or taller than small ones and steeper than ground is."""
     place = voxels.keys >> BITS
     top = np.full(columns, -1)
     top[place] = np.arange(len(place))  # the last of a column is its highest
@@ -320,12 +329,15 @@ def _high(place, lowest, suspect, spacing, top, hung, hung_suspect, gap, rules, 
                 break
             r = min(2 * r, rules.far)
         if seen >= rules.min_columns and lowest[k] - highest >= least:
-            verdict[k] = 0 if _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz, rules) else HIGH
+            verdict[k] = (
+                0 if _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz, rules) else HIGH
+            )
 
 
 @device
 def _in_line(hung, hung_suspect, j, i, z, u, v, dz, rules):
-    """Whether others that hang are strung along a line through a place, as wires are, or single points of them."""
+    """Whether others that hang are strung along a line through a place, as wires are, or single
+    points of them."""
     h, w = hung.shape
     n = suspects = 0
     for b in range(max(j - rules.far, 0), min(j + rules.far + 1, h)):

@@ -1,4 +1,5 @@
-"""Morphological openings of a minimum grid by octagons, and the objects that growing openings show [P13].
+"""Morphological openings of a minimum grid by octagons, and the objects that growing openings show
+[P13].
 
 Holes near measured cells are filled first, as SMRF inpaints them: between scattered points of a
 slope, an opening would lower each to its lowest neighbor in the window. Other holes are ``+inf``:
@@ -19,8 +20,9 @@ from numpy.typing import NDArray
 from ..base.jit import njit
 from .cells import HOLE
 
-#: Cells beyond measured ones, along both axes and diagonals, up to which holes are filled. On 27 surveys, 36 clips with
-#: holes and the ISPRS samples, 2 to 8 give the same errors within 0.03 points, 0 more by 0.05 to 0.1.
+#: Cells beyond measured ones, along both axes and diagonals, up to which holes are filled. On 27
+#: surveys, 36 clips with holes and the ISPRS samples, 2 to 8 give the same errors within 0.03
+#: points, 0 more by 0.05 to 0.1.
 FILL_RINGS = 3
 
 
@@ -30,7 +32,8 @@ def opening_radius(window: float, cell: float) -> int:
 
 
 def opening_radii(largest: int) -> list[int]:
-    """Radii in cells: each is larger than the one before by a fifth, by 1 or 2 cells: or slopes would drop as objects do."""
+    """Radii in cells: each is larger than the one before by a fifth, by 1 or 2 cells: or slopes
+    would drop as objects do."""
     radii = [1]
     while (radius := radii[-1] + min(max(1, radii[-1] // 5), 2)) < largest:
         radii.append(radius)
@@ -38,7 +41,8 @@ def opening_radii(largest: int) -> list[int]:
 
 
 def _steps(radius: int) -> tuple[int, int]:
-    """How many squares and diamonds of radius 1 add up to an octagon: tan(22.5 degrees) of them are squares."""
+    """How many squares and diamonds of radius 1 add up to an octagon: tan(22.5 degrees) of them are
+    squares."""
     squares = int(0.41421356 * radius)
     return squares, radius - squares
 
@@ -46,8 +50,9 @@ def _steps(radius: int) -> tuple[int, int]:
 def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray[Any]:
     """Maximum (h, w) over so many squares and diamonds round each cell.
 
-    Each line of an octagon is a running maximum on the flat raster with a margin round it, by doubling: a maximum of 2m
-    cells is that of two of m. Two diagonals and a cross of five cells make a diamond.
+    Each line of an octagon is a running maximum on the flat raster with a margin round it, by
+    doubling: a maximum of 2m cells is that of two of m. Two diagonals and a cross of five cells
+    make a diamond.
     """
     pad = squares + diamonds + 1
     h, w = raster.shape
@@ -81,7 +86,8 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
 
 @njit
 def _fill_ring(heights):
-    """Fill holes that touch known cells with their mean (h, w); those at an edge count twice those at a corner."""
+    """Fill holes that touch known cells with their mean (h, w); those at an edge count twice those
+    at a corner."""
     h, w = heights.shape
     out = heights.copy()
     for j in range(h):
@@ -101,7 +107,8 @@ def _fill_ring(heights):
 
 
 def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the raster (h, w) with the holes up to `FILL_RINGS` cells from measured ones filled, ring by ring; meters."""
+    """Return the raster (h, w) with the holes up to `FILL_RINGS` cells from measured ones filled,
+    ring by ring; meters."""
     for _ in range(FILL_RINGS):
         raster = _fill_ring(raster)
     return raster
@@ -110,7 +117,8 @@ def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
 def openings_of(
     raster: NDArray[np.float32], radii: Iterable[int]
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield radii in cells, ascending, and the openings (h, w) of a minimum grid by octagons of them; meters."""
+    """Yield radii in cells, ascending, and the openings (h, w) of a minimum grid by octagons of
+    them; meters."""
     # Erosion is the maximum of what is upended. The ceiling keeps windows from holes.
     ceiling = np.where(raster != HOLE, HOLE, -HOLE)
     lowest_upended = np.where(raster != HOLE, -raster, -HOLE)
@@ -172,7 +180,8 @@ def opening_names(windows: Sequence[float]) -> list[str]:
 
 @njit
 def above_opening(x, y, z, cell, left, bottom, opening, fallback, out):
-    """z minus the opening, bilinear between the centers of measured cells; `fallback` where there is none."""
+    """z minus the opening, bilinear between the centers of measured cells; `fallback` where there
+    is none."""
     h, w = opening.shape
     for p in range(len(x)):
         u, v = x[p] / cell - 0.5, y[p] / cell - 0.5

@@ -1,4 +1,5 @@
-"""Cut points into pieces whose rasters are small wherever points lie: groups far apart, and squares with surroundings."""
+"""Cut points into pieces whose rasters are small wherever points lie: groups far apart, and squares
+with surroundings."""
 
 from __future__ import annotations
 
@@ -27,11 +28,12 @@ BLOCKS_PER_LINK = 4
 def patches(
     column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int
 ) -> Iterator[tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]]:
-    """Yield (points, own): the points of a piece and those round it that matter, and which of them are its own.
+    """Yield (points, own): the points of a piece and those round it that matter, and which of them
+    are its own.
 
-    Every point is some piece's own. Points more than `reach` cells away, along either axis, do not matter; nor do
-    points that no chain of others connects with steps of at most `link` cells. One piece, all points, where the whole
-    is small enough.
+    Every point is some piece's own. Points more than `reach` cells away, along either axis, do not
+    matter; nor do points that no chain of others connects with steps of at most `link` cells. One
+    piece, all points, where the whole is small enough.
     """
     window = GridWindow.enclosing(column, row)
     if window.width * window.height <= min(
@@ -57,7 +59,8 @@ def patches(
 
 
 def refuse_scattered(counts: Collection[int]) -> None:
-    """Refuse points that are alone in most of their places: each would take milliseconds, and none tells anything.
+    """Refuse points that are alone in most of their places: each would take milliseconds, and none
+    tells anything.
 
     `counts` are the points of each place.
     """
@@ -66,14 +69,16 @@ def refuse_scattered(counts: Collection[int]) -> None:
         raise StageError(
             "thousands of points lie alone, far from any other",
             found=f"{alone:,} of {sum(counts):,} points",
-            cure=f"Look whether the file's scale and unit are right: pdal info --summary FILE. {DAMAGED}",
+            cure="Look whether the file's scale and unit are right: pdal info --summary FILE. "
+            f"{DAMAGED}",
         )
 
 
 def _groups(
     column: NDArray[np.int64], row: NDArray[np.int64], link: int
 ) -> list[NDArray[np.int64]]:
-    """Points that belong together: all within `link` cells of each other, and few that are a little farther apart."""
+    """Points that belong together: all within `link` cells of each other, and few that are a little
+    farther apart."""
     side = -(-link // BLOCKS_PER_LINK)
     rings = -(-link // side)
     blocks, of = np.unique(cell_keys(column // side, row // side), return_inverse=True)

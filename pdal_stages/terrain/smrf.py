@@ -1,7 +1,9 @@
-"""Which cells of a minimum grid are ground: of all the points there are, or of a block of cells and what lies around it.
+"""Which cells of a minimum grid are ground: of all the points there are, or of a block of cells and
+what lies around it.
 
-All of a progressive morphological filter that looks far away is done here, on a raster; see :mod:`.heights`. In tiles
-it is done once for each block of a grid of blocks, out of the lowest points of cells, and tiles put the blocks together.
+All of a progressive morphological filter that looks far away is done here, on a raster; see
+:mod:`.heights`. In tiles it is done once for each block of a grid of blocks, out of the lowest
+points of cells, and tiles put the blocks together.
 """
 
 from __future__ import annotations
@@ -24,20 +26,23 @@ from .openings import FILL_RINGS, objects_of, opening_radius
 from .surface import GroundRaster, from_parents, planes_of_blocks
 from .surface import reach as planes_reach
 
-#: Side in meters of the coarsest blocks of the surface from which points are told to be ground or not.
+#: Side in meters of the coarsest blocks of the surface from which points are told to be ground or
+#: not.
 NEAR = 16.0
 #: The same of the surface that heights are measured from: it spans the holes under large buildings.
 FAR = 32.0
 #: Largest radius of a window in cells: beyond it memory and halo of a tile become too large.
 _MOST_CELLS = 300
-#: How often ground that openings took from ridges and dams is regained from the surface through the rest.
-#: Without it the mean error of the ISPRS samples is 0.5 points higher (`benchmarks/ablation.py`).
+#: How often ground that openings took from ridges and dams is regained from the surface through the
+#: rest. Without it the mean error of the ISPRS samples is 0.5 points higher
+#: (`benchmarks/ablation.py`).
 ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """Of :func:`.heights.filtered_ground`; lengths in meters. Wrong ones raise an :class:`OptionError`."""
+    """Of :func:`.heights.filtered_ground`; lengths in meters. Wrong ones raise an
+    :class:`OptionError`."""
 
     cell: float = 1.0
     slope: float = 0.12
@@ -87,14 +92,17 @@ class FilterOptions:
         height: NDArray[np.float64],
         gradient: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Which of the points to `use` are ground, by their heights above the surface and its slope there; NaN is not."""
+        """Which of the points to `use` are ground, by their heights above the surface and its slope
+        there; NaN is not."""
         return use & (np.abs(height) <= self.threshold + self.scalar * gradient)
 
     @property
     def reach(self) -> int:
-        """Distance in cells within which lowest points can change which cells are ground, and how high.
+        """Distance in cells within which lowest points can change which cells are ground, and how
+        high.
 
-        An opening looks twice its radius away; low outliers are judged before, and surfaces fitted through ground after.
+        An opening looks twice its radius away; low outliers are judged before, and surfaces fitted
+        through ground after.
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
         openings = 2 * self.largest_radius + 2 * FILL_RINGS
@@ -104,7 +112,8 @@ class FilterOptions:
     def reach_of_points(self) -> int:
         """How far away, in cells, points can change a point's results.
 
-        Beyond what decides which cells are ground come the surfaces through it: that for telling ground, and the last.
+        Beyond what decides which cells are ground come the surfaces through it: that for telling
+        ground, and the last.
         """
         return self.reach + sum(planes_reach(self.levels(block)) for block in (NEAR, FAR))
 
@@ -115,14 +124,16 @@ class FilterOptions:
 
     @property
     def link(self) -> int:
-        """How far one step looks, in cells: no step of the filter sees from a point to another across more empty land."""
+        """How far one step looks, in cells: no step of the filter sees from a point to another
+        across more empty land."""
         openings = self.largest_radius + 2 * FILL_RINGS
         return max(pits_reach(self.cell), openings, planes_reach(self.levels(FAR))) + 2
 
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
 _PARTS = 2.0**20
-#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as :attr:`.surface.GroundRaster.place`.
+#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as
+#: :attr:`.surface.GroundRaster.place`.
 CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
@@ -155,8 +166,9 @@ def ground_raster(
 ) -> tuple[GroundRaster, NDArray[np.int64]]:
     """Classify the cells of the minimum grid round points into ground and objects.
 
-    The steps are those of SMRF [P13]: minimum grid, low outliers, openings with growing windows; ground that the openings
-    took from ridges is then regained where it lies near the surface through the rest.
+    The steps are those of SMRF [P13]: minimum grid, low outliers, openings with growing windows;
+    ground that the openings took from ridges is then regained where it lies near the surface
+    through the rest.
 
     Parameters
     ----------
@@ -234,7 +246,8 @@ def minimum_grid(
 
 @njit
 def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar):
-    """Find the cells (n,), numbered row by row, that lie near the surface through the ground (see :mod:`.surface`)."""
+    """Find the cells (n,), numbered row by row, that lie near the surface through the ground (see
+    :mod:`.surface`)."""
     w = place.shape[1]
     out = np.zeros(len(cells), np.bool_)
     for k in range(len(cells)):
@@ -250,7 +263,8 @@ def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, 
 
 @njit
 def add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, place):
-    """Add points that are ground to their cells: number (h, w) and places (h, w, 3); in whole numbers, so order is free."""
+    """Add points that are ground to their cells: number (h, w) and places (h, w, 3); in whole
+    numbers, so order is free."""
     for p in range(len(x)):
         if is_ground[p]:
             j, i = row[p] - bottom, column[p] - left
@@ -261,7 +275,8 @@ def add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, place
 
 
 def means_of(count: NDArray[np.int64], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Make such sums means: from the cell's center, in cells, and its height; which cells (h, w) hold ground."""
+    """Make such sums means: from the cell's center, in cells, and its height; which cells (h, w)
+    hold ground."""
     held = count > 0
     place[held] /= (_PARTS * count[held])[:, None]
     return held

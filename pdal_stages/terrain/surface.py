@@ -1,11 +1,11 @@
 """A surface through scattered ground heights: planes on a pyramid of blocks, coarse to fine.
 
-Every block of the pyramid (a cell, 2 x 2 cells, 4 x 4, ...; anchored to absolute coordinates) has a plane at
-its center: a least squares fit to the ground of the 3 x 3 blocks round it, held by what the planes of the
-four nearest blocks of the next coarser level say there; the coarsest planes lie at the mean of what is below objects.
-Where ground is dense the finest level decides; across a hole the finest level that sees its rim does. The reach
-is bounded (:func:`reach`), sums are taken in a fixed tree, so the same ground gives the same bits whatever lies
-further away.
+Every block of the pyramid (a cell, 2 x 2 cells, 4 x 4, ...; anchored to absolute coordinates) has a
+plane at its center: a least squares fit to the ground of the 3 x 3 blocks round it, held by what
+the planes of the four nearest blocks of the next coarser level say there; the coarsest planes lie
+at the mean of what is below objects. Where ground is dense the finest level decides; across a hole
+the finest level that sees its rim does. The reach is bounded (:func:`reach`), sums are taken in a
+fixed tree, so the same ground gives the same bits whatever lies further away.
 """
 
 from __future__ import annotations
@@ -70,16 +70,18 @@ class Planes(NamedTuple):
 
 def reach(levels: int) -> int:
     """How far ground changes the surface, in cells."""
-    # A block's parents lie up to 1.5 blocks away, level by level; the coarsest sees 3 x 3 of its blocks.
+    # A block's parents lie up to 1.5 blocks away, level by level; the coarsest sees 3 x 3 of its
+    # blocks.
     return 3 * 2**levels
 
 
 @device
 def blend(planes, i, j, s, t, size):
-    """Height and gradient of the four planes round a place, weighted by nearness; NaN where none is known.
+    """Height and gradient of the four planes round a place, weighted by nearness; NaN where none is
+    known.
 
-    The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the center of block (j, i): given apart, so that
-    rounding does not depend on where the array begins.
+    The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the center of block (j, i):
+    given apart, so that rounding does not depend on where the array begins.
     """
     height, across, along, total = 0.0, 0.0, 0.0, 0.0
     for b in range(2):
@@ -106,7 +108,8 @@ def blend(planes, i, j, s, t, size):
 @device
 def from_parents(parents, parents_left, parents_bottom, column, row, size):
     """What the planes of blocks of twice the `size` say at the center of a block of `size`."""
-    # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond its parent.
+    # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond
+    # its parent.
     s, t = 0.25 + 0.5 * (1 - (column & 1)), 0.25 + 0.5 * (1 - (row & 1))
     before, below = ((column + 1) >> 1) - 1 - parents_left, ((row + 1) >> 1) - 1 - parents_bottom
     return blend(parents, before, below, s, t, 2.0 * size)
@@ -129,7 +132,8 @@ def _add(total, m, dx, dy, weight):
 
 @device
 def _sum_around(moments, j, i, size, sums):
-    """Sums of the moments of the 3 x 3 blocks round one, about its center: nearer ones weigh more."""
+    """Sums of the moments of the 3 x 3 blocks round one, about its center: nearer ones weigh
+    more."""
     sums[:] = 0.0
     for b in range(max(j - 1, 0), min(j + 2, moments.shape[0])):
         for a in range(max(i - 1, 0), min(i + 2, moments.shape[1])):
@@ -140,7 +144,8 @@ def _sum_around(moments, j, i, size, sums):
 
 @njit
 def _moments_of_cells(held, place, height, level, left, bottom, out, out_left, out_bottom):
-    """Add up moments of the held cells (n,), numbered row by row, of each block of a level, about its center."""
+    """Add up moments of the held cells (n,), numbered row by row, of each block of a level, about
+    its center."""
     size, width = 1 << level, height.shape[1]
     for cell in held:
         j, i = cell // width, cell % width
@@ -166,7 +171,8 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
 
 @njit
 def _mark_parents(needed, left, bottom, parents, parents_left, parents_bottom):
-    """Mark the blocks (h, w) of the next coarser level whose planes `from_parents` blends for needed ones."""
+    """Mark the blocks (h, w) of the next coarser level whose planes `from_parents` blends for
+    needed ones."""
     for j in range(needed.shape[0]):
         for i in range(needed.shape[1]):
             if needed[j, i]:
@@ -193,7 +199,8 @@ def _coarsest(moments, size, needed, planes):
 
 @njit
 def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, planes):
-    """What the planes of blocks of twice the `size` say at the centers of the needed blocks of `size`."""
+    """What the planes of blocks of twice the `size` say at the centers of the needed blocks of
+    `size`."""
     for j in range(needed.shape[0]):
         for i in range(needed.shape[1]):
             if needed[j, i]:
@@ -204,7 +211,8 @@ def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, pl
 
 @njit
 def _fit(moments, size, needed, planes):
-    """Correct the needed planes (given: what the coarser level says) by the ground of 3 x 3 blocks."""
+    """Correct the needed planes (given: what the coarser level says) by the ground of 3 x 3
+    blocks."""
     h, w = moments.shape[:2]
     sums = np.empty(9)
     for j in range(h):
@@ -236,8 +244,8 @@ def _fit(moments, size, needed, planes):
 def planes_of_blocks(raster: GroundRaster, levels: int, needed: NDArray[np.bool_]) -> Planes:
     """Fit planes of blocks of 2 x 2 cells through the ground of a raster.
 
-    There are `levels` coarser levels, at least 1. Only the planes that cells `needed` (h, w) blend have values: a thin cloud
-    costs what its points do, not what its area does.
+    There are `levels` coarser levels, at least 1. Only the planes that cells `needed` (h, w) blend
+    have values: a thin cloud costs what its points do, not what its area does.
     """
     moments: list[np.ndarray] = []
     spans, wanted = [raster.window[:2]], [needed]
@@ -276,10 +284,12 @@ def surface(
     needed: NDArray[np.bool_],
     planes: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach of all measured cells.
+    """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach
+    of all measured cells.
 
-    There are `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are wanted; elsewhere stands
-    none. They are put into `planes` where that is given: those at the same cells, made before.
+    There are `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are
+    wanted; elsewhere stands none. They are put into `planes` where that is given: those at the same
+    cells, made before.
     """
     ground, place = raster.ground, raster.place
     blocks = planes_of_blocks(raster, levels, needed)
@@ -305,7 +315,8 @@ def heights_above(x, y, z, cell, left, bottom, planes, height, gradient):
 
 
 def around(window: GridWindow, column: NDArray, row: NDArray) -> NDArray[np.bool_]:
-    """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose planes points blend."""
+    """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose
+    planes points blend."""
     held = np.zeros((window.height, window.width), bool)
     held.ravel()[window.flat_index(column, row)] = True
     return highest_around(held, 1, 0)
