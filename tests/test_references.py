@@ -209,7 +209,9 @@ def test_commands_and_stages_take_the_same_units(
     found = reference_of_file(str(path))
     assert (found.units.horizontal, found.units.vertical) == pytest.approx(units)
     seen = []
-    monkeypatch.setattr(HagMinima, "run", lambda self, points, context: seen.append(points.units) or {})
+    monkeypatch.setattr(
+        HagMinima, "run", lambda self, points, context: seen.append(points.units) or {}
+    )
     ps.run_pipeline([str(path), {"type": "filters.hag_minima"}])
     assert seen == [found.units]
     part = horizontal_part(found.wkt)
