@@ -111,7 +111,7 @@ def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage])
         for writer in filter(writes_las, stages[one.index + 1 :]):
             if (limit := _code_limit(writer, stages[: one.index])) is not None:
                 one.update_context(code_limit=limit if stage in last else None)
-                if (largest := stage.largest_class()) > LEGACY_LIMIT:
+                if (largest := max(stage.written_classes(), default=0)) > LEGACY_LIMIT:
                     raise OptionError(
                         limit[0], where=stage.place, found=f"code {largest}", cure=limit[1]
                     )

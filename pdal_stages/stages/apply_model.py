@@ -223,9 +223,11 @@ class ApplyModel(Stage):
         more = self._of_ground.halo_m() if self.made_from_ground else 0.0
         return self.model.halo_m + more
 
-    def largest_class(self) -> int:
-        """Return the largest class code that may be written."""
-        return max([code for code, _ in self.model.classes] + [self._rejected or 0])
+    def written_classes(self) -> set[int]:
+        """Return the class codes that may be written."""
+        rejected = set() if self._rejected is None else {self._rejected}
+        heights = {LOW, MEDIUM} if self.vegetation_heights else set()
+        return {code for code, _ in self.model.classes} | rejected | heights
 
     @property
     def _rejected(self) -> int | None:

@@ -184,9 +184,16 @@ class Stage(ABC):
         """Return how far around a tile points change its results, in meters."""
         return 0.0
 
-    def largest_class(self) -> int:
-        """Return the largest class code that may be written to `Classification`; 0 for none."""
-        return 0
+    def written_classes(self) -> set[int]:
+        """Return the class codes that the stage may write to `Classification`."""
+        return set()
+
+    def sees_results_of(self, earlier: Stage) -> bool:
+        """Return whether an earlier stage's results at neighbors can change this stage's result at a point.
+
+        Where they cannot, tiles do not compute them in their halo.
+        """
+        return True
 
     def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:
         """Return how far around a tile the points lie that decide its results (`open_ended`).
@@ -278,10 +285,23 @@ class ClassStage(Stage):
     """Base of stages that change the class of points, and nothing else."""
 
     where_chooses = True
+    #: Dimensions that it reads of a point's neighbors.
+    reads_around: ClassVar[frozenset[str]] = frozenset()
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
         return ["Classification"]
+
+    def sees_results_of(self, earlier: Stage) -> bool:
+        """Neighbors matter by :attr:`reads_around` and by the selection `ignore`, but not by other classes."""
+        ignored = self.options["ignore"]
+        read = {
+            name.lower() for name in (*self.reads_around, *(s.dimension for s in ignored.spans))
+        }
+        return bool(
+            read & {name.lower() for name in earlier.creates()}
+            or earlier.written_classes() & set(ignored.codes)
+        )
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""

@@ -33,6 +33,7 @@ class Bridges(ClassStage):
         "Points that are left out, even as neighbors, and keep their class"
     )
     keep: Selection = keep_option()
+    reads_around = frozenset({"Ground"})
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
@@ -42,9 +43,9 @@ class Bridges(ClassStage):
         """Return how far around a tile points change its results, in meters."""
         return RULES.reach_m
 
-    def largest_class(self) -> int:
-        """Return the largest class code that may be written."""
-        return self.code
+    def written_classes(self) -> set[int]:
+        """Return the class codes that may be written."""
+        return {self.code}
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Give points of bridge decks their class."""

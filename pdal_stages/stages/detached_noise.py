@@ -56,9 +56,9 @@ class DetachedNoise(ClassStage):
         """Return how far around a tile points change its results, in meters."""
         return REACH
 
-    def largest_class(self) -> int:
-        """Return the largest class code that may be written."""
-        return max(self.low_class, self.high_class)
+    def written_classes(self) -> set[int]:
+        """Return the class codes that may be written."""
+        return {self.low_class, self.high_class}
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Mark noise."""

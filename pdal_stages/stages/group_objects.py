@@ -167,9 +167,9 @@ class GroupObjects(ObjectOptions, Stage):
             out["Classification"] = "uint8_t"
         return out
 
-    def largest_class(self) -> int:
-        """Return the largest class code that may be written."""
-        return self.refused_class if self.refuse else 0
+    def written_classes(self) -> set[int]:
+        """Return the class codes that may be written."""
+        return {self.refused_class} if self.refuse else set()
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""

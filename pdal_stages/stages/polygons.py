@@ -43,9 +43,9 @@ class Polygons(ClassStage):
         """Return the files that are read."""
         return [overlay.file for overlay in self.overlays if "://" not in overlay.file]
 
-    def largest_class(self) -> int:
-        """Return the largest class code that may be written."""
-        return max((overlay.code for overlay in self.overlays), default=0)
+    def written_classes(self) -> set[int]:
+        """Return the class codes that may be written."""
+        return {overlay.code for overlay in self.overlays}
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Give points inside polygons their class."""

@@ -32,6 +32,7 @@ class Wires(ClassStage):
         "Points that are left out, even as neighbors, and keep their class"
     )
     keep: Selection = keep_option()
+    reads_around = frozenset({"HeightAboveGround"})
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
@@ -41,9 +42,9 @@ class Wires(ClassStage):
         """Return how far around a tile points change its results, in meters."""
         return RULES.reach_m + (towers.RULES.reach_m if self.towers else 0.0)
 
-    def largest_class(self) -> int:
-        """Return the largest class code that may be written."""
-        return max(self.code, self.tower_code) if self.towers else self.code
+    def written_classes(self) -> set[int]:
+        """Return the class codes that may be written."""
+        return {self.code, self.tower_code} if self.towers else {self.code}
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Give points of wires and towers their class."""

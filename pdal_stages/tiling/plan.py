@@ -116,6 +116,10 @@ class _Step:
     def sees_neighbors(self) -> bool:
         return self.ours is not None or self.type.removeprefix("filters.") not in _PER_POINT.split()
 
+    def sees_results_of(self, earlier: _Step) -> bool:
+        """Return whether results of an earlier step at neighbors can change a point's; PDAL's do not say."""
+        return self.ours is None or earlier.ours is None or self.ours.sees_results_of(earlier.ours)
+
     def reach(self, buffer: float | None) -> float:
         """Meters around a point within which others affect its result."""
         if self.ours is not None:
@@ -143,17 +147,18 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         _check_local(step, number < end, buffer)
     head, tail = filters[:end], filters[end:]
     reaches = [step.reach(buffer) for step in head]
-    sees_m = sum(reaches)  # before _first_round reduces some
+    _, sees_m = _distances(head, reaches)  # before _first_round reduces some
     first = _first_round(readers, head, reaches)
+    later, halo_m = _distances(head, reaches)
     stages = [step.ours for step in head if step.ours is not None]
     makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
     return TilePlan(
         readers=[step.given for step in readers],
         head=[_for_workers(step) for step in head],
-        later=[sum(reaches[n + 1 :]) for n in range(len(head))],
+        later=later,
         tail=[step.given for step in [*tail, *writers]],
-        halo_m=sum(reaches),
+        halo_m=halo_m,
         sees_m=sees_m,
         first=first,
         creates=None if foreign else list(makes),
@@ -188,6 +193,16 @@ def plan_of_files(
     for settled, reader in zip(plan.readers, readers, strict=True):
         settled["filename"] = reader["filename"]
     return plan, pipeline
+
+
+def _distances(head: list[_Step], reaches: list[float]) -> tuple[list[float], float]:
+    """Return how far outside a tile results of each step are used, and how wide the halo is; meters."""
+    used = [0.0] * len(head)
+    for n in range(len(head) - 1, -1, -1):
+        for m in range(n + 1, len(head)):
+            around = reaches[m] if head[m].sees_results_of(head[n]) else 0.0
+            used[n] = max(used[n], used[m] + around)
+    return used, max((u + reach for u, reach in zip(used, reaches, strict=True)), default=0.0)
 
 
 def _first_round(
