@@ -94,7 +94,7 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
     assert np.array_equal(piece.index, expected)
     assert las.points.array.tobytes() == all_.points.array[expected].tobytes()
     core = ((xyz[expected, :2] >= (25, 50)) & (xyz[expected, :2] < (50, 75))).all(axis=1)
-    assert np.array_equal(piece.own, np.flatnonzero(core))
+    assert np.array_equal(piece.own_rows, np.flatnonzero(core))
     assert [v.record_id for v in las.header.vlrs] == [
         v.record_id for v in all_.header.vlrs if v.record_id != 22204
     ]

@@ -104,14 +104,14 @@ def test_where_and_units_reach_the_first_round(tmp_path, survey):
 
 def break_a_tile(patch):
     """One tile fails in its own turn, when the rounds before are done."""
-    real = tile.from_before
+    real = tile.load_first_round
 
     def failing(context, at, *rest):
         if at == (1, 1):
             raise ps.StageError("no luck")
         return real(context, at, *rest)
 
-    patch.setattr(tile, "from_before", failing)
+    patch.setattr(tile, "load_first_round", failing)
 
 
 @pytest.mark.pdal

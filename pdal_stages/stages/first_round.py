@@ -64,3 +64,8 @@ class FarReaching(Stage):
     @abstractmethod
     def join_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
         """Join these arrays of the blocks that a box touches to :attr:`StageContext.blocks`."""
+
+
+def first_round_of(stage: Stage | None) -> Blocks | None:
+    """Return the blocks that a stage needs before the tiles; None where it does without."""
+    return stage.blocks() if isinstance(stage, FarReaching) else None

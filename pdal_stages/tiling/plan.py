@@ -17,7 +17,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import MOVING
 from ..pipeline.stage_files import writes_las
 from ..stages.base import Stage
-from ..stages.first_round import Blocks, FarReaching
+from ..stages.first_round import Blocks, first_round_of
 from .tile_grid import Box, TileGrid
 
 #: Dimensions that follow a point through a tile's pipeline.
@@ -52,7 +52,10 @@ class TilePlan:
 
     readers: list[dict[str, Any]]  #: as given
     head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its halo
-    later: list[float]  #: meters outside the tile within which each one's results are still used
+    #: Of each stage of the head, meters outside the tile within which later stages use its results.
+    used_m: list[float]
+    #: Of each, how far around the points that it reads they must lie for stages before it to be right.
+    upstream_m: list[float]
     #: Stages that process single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
     halo_m: float  #: of each tile, meters
@@ -149,14 +152,19 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     reaches = [step.reach(buffer) for step in head]
     _, sees_m = _distances(head, reaches)  # before _first_round reduces some
     first = _first_round(readers, head, reaches)
-    later, halo_m = _distances(head, reaches)
+    used_m, halo_m = _distances(head, reaches)
+    upstream_m: list[float] = []
+    for n, step in enumerate(head):
+        seen = [k for k in range(n) if step.sees_results_of(head[k])]
+        upstream_m.append(max((reaches[k] + upstream_m[k] for k in seen), default=0.0))
     stages = [step.ours for step in head if step.ours is not None]
     makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
     return TilePlan(
         readers=[step.given for step in readers],
         head=[_for_workers(step) for step in head],
-        later=later,
+        used_m=used_m,
+        upstream_m=upstream_m,
         tail=[step.given for step in [*tail, *writers]],
         halo_m=halo_m,
         sees_m=sees_m,
@@ -210,7 +218,7 @@ def _first_round(
 ) -> FirstRound | None:
     """Find the far-reaching stage whose raster is computed first; it then needs no halo."""
     for at, step in enumerate(head):
-        blocks = step.ours.blocks() if isinstance(step.ours, FarReaching) else None
+        blocks = first_round_of(step.ours)
         if blocks is not None:
             kept = _kept(readers, head[:at])
             found = FirstRound(at, sum(reaches[:at]), blocks, kept)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -16,14 +16,14 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
 from ..pipeline.las_output import REPLACED, check_writers
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import Callbacks, Function, points_of
+from ..pipeline.runtime import Callbacks, ExpandedStage, Function, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
 from ..stages.context import WHOLE_CLOUD
-from ..stages.first_round import FarReaching
+from ..stages.first_round import first_round_of
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
 from ..stages.registry import stage_types
 from .checkpoint import save_arrays, written
-from .first_round import Changed, FromBefore, from_before, stage_of
+from .first_round import ChangedValues, FirstRoundResults, load_first_round, stage_of
 from .inputs import IndexedSource
 from .plan import INPUT, OUTSIDE, ROW, RunContext
 from .sorted_points import Piece, cut_all
@@ -38,93 +38,108 @@ from .write_outputs import (
 )
 
 #: How many times a tile is read again with a wider halo.
-_WIDENINGS = 3
+_MOST_WIDENINGS = 3
 _MARKS = (ROW, INPUT, OUTSIDE)
 
 
-class HeadRun(NamedTuple):
-    """The result of running the head."""
+class HeadResult(NamedTuple):
+    """What the head of a pipeline did with a tile."""
 
     results: list[PieceResults]
-    need: float = 0.0  #: the halo that was needed, meters
+    halo_needed_m: float = 0.0
     messages: Sequence[str] = ()  #: warnings and notes
     left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.jobs`
 
 
-def run_head(
-    context: RunContext,
-    tile: tuple[int, int],
-    cuts: list[Piece],
-    everything: bool,
-    before: FromBefore | None = None,
-    last: Function | None = None,
-) -> HeadRun:
-    """Run the head once. `everything`: all points are read, so none lies farther away; `last` gets its result."""
-    plan, first = context.plan, context.plan.first
-    if not plan.head and last is None:
-        return HeadRun([PieceResults(piece, piece.own, {}) for piece in cuts])
-    begin, changed = 0, [Changed()] * len(cuts)
-    if before is not None and first is not None and first.kept is not None:
-        begin, changed = first.at, before.changed
-    new = [_marked(n, piece, context.unit, changed[n]) for n, piece in enumerate(cuts)]
-    flags = [flags_in_classes(piece.path) for piece in cuts]
-    needs = [0.0]
-    views: list[dict[str, NDArray]] = []  # of the tile's own points only, to save memory
+@dataclass
+class _HeadRun:
+    """One run of the head on a tile and what was read around it."""
 
-    def reach(
-        number: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
+    context: RunContext
+    tile: tuple[int, int]
+    pieces: list[Piece]
+    complete: bool  #: all points of the inputs were read, so none lies farther away
+    earlier: FirstRoundResults | None = None
+    callbacks: Callbacks = field(default_factory=Callbacks)
+    needs_m: list[float] = field(default_factory=lambda: [0.0])  #: halos that stages need
+    #: Dimensions of the tile's own points alone, to save memory; one for each view.
+    views: list[dict[str, NDArray]] = field(default_factory=list)
+    expanded: dict[int, ExpandedStage] = field(default_factory=dict)  #: by place in the pipeline
+    #: Place in the pipeline -> how far outside results of a stage are used, and how far around its own input matters.
+    distances_m: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+    def run(self, last: Function | None = None) -> HeadResult:
+        """Run the head; `last` gets its result."""
+        plan = self.context.plan
+        pipeline = Pipeline(self._stages(last), whole=False)
+        self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
+        check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
+        for number, stage in self.expanded.items():
+            stage.update_context(outside=OUTSIDE, used_m=self.distances_m[number][0])
+        if self.earlier is not None:  # of the first one alone
+            needs_rounds = (
+                s for s in self.expanded.values() if first_round_of(s.stage) is not None
+            )
+            next(needs_rounds).update_context(blocks=self.earlier.blocks)
+        pipeline.execute(arrays=False)
+        if not self.complete:
+            for number, stage in self.expanded.items():
+                reaches = [report.reach for report in stage.reports if report.beyond_halo]
+                self.needs_m += [sum(self.distances_m[number]) + reach for reach in reaches]
+        messages = _messages(pipeline, self.context.scratch)
+        results = _collect(self.views, self.pieces)
+        return HeadResult(results, max(self.needs_m), messages, pipeline.left_alone)
+
+    def _stages(self, last: Function | None) -> list[dict[str, Any]]:
+        """Return the pipeline: readers, the head, and functions that take its result."""
+        plan, first = self.context.plan, self.context.plan.first
+        begin, changed = 0, [ChangedValues()] * len(self.pieces)
+        if self.earlier is not None and first is not None and first.kept is not None:
+            begin, changed = first.at, self.earlier.changed
+        marked = [
+            _marked(number, piece, self.context.unit, changed[number])
+            for number, piece in enumerate(self.pieces)
+        ]
+        flags = [flags_in_classes(piece.path) for piece in self.pieces]
+        readers = [{**piece.reader, "filename": piece.path} for piece in self.pieces]
+        mixed = flags if len(set(flags)) > 1 else []
+        stages, last_read = read_with(self.callbacks, readers, marked, mixed)
+        apart = len(self.pieces) > 1 and begin < len(plan.head) and not _merges(plan.head[begin])
+        if apart:  # PDAL's own filters see one file at a time, until a stage merges them
+            stages.append({"type": "filters.groupby", "dimension": INPUT, "inputs": [last_read]})
+            last_read = stages[-1]["tag"] = "apart"
+        head_begins = len(stages)
+        for number, step in enumerate(plan.head[begin:], begin):
+            if apart and _merges(step):
+                stages.append({"type": "filters.merge"})
+                apart = False
+            place = len(stages)
+            self.distances_m[place] = plan.used_m[number], plan.upstream_m[number]
+            stages.append(_with_threads(step, self.context.threads))
+            kind = stage_types().get(step["type"])
+            if kind is not None and kind.open_ended and not self.complete:
+                stages.append(self.callbacks.filter(partial(self._measure_reach, place)))
+        functions = [self._take] if last is None else [self._take, last]
+        stages += [self.callbacks.filter(function) for function in functions]
+        stages[head_begins]["inputs"] = [last_read]
+        return stages
+
+    def _measure_reach(
+        self, place: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
     ) -> None:
-        one = ours[number]
-        points = points_of(one.stage, one.context, module, ins)
-        box = [side * points.units.horizontal for side in context.grid.box(tile)]
-        needs.append(one.stage.reach_of(points, one.context, box))
+        """Ask an open-ended stage which halo it needs."""
+        expanded = self.expanded[place]
+        points = points_of(expanded.stage, expanded.context, module, ins)
+        box = [side * points.units.horizontal for side in self.context.grid.box(self.tile)]
+        self.needs_m.append(expanded.stage.reach_of(points, expanded.context, box))
 
-    def take(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        wanted = ins if plan.creates is None else plan.creates
+    def _take(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        """Take the results of the tile's own points."""
+        creates = self.context.plan.creates
+        wanted = ins if creates is None else creates
         names = [name for name in wanted if name in ins and name not in _MARKS]
-        mine = np.flatnonzero(ins[OUTSIDE] < 0)
-        views.append({name: ins[name][mine] for name in (ROW, INPUT, *names)})
-
-    callbacks = Callbacks()
-    readers = [{**piece.reader, "filename": piece.path} for piece in cuts]
-    stages, last_read = read_with(callbacks, readers, new, flags if len(set(flags)) > 1 else [])
-    apart = bool(len(cuts) > 1 and begin < len(plan.head)) and not _merges(plan.head[begin])
-    if apart:  # PDAL's own filters see one file at a time, until a stage merges them
-        stages.append({"type": "filters.groupby", "dimension": INPUT, "inputs": [last_read]})
-        last_read = stages[-1]["tag"] = "apart"
-    begins, used = len(stages), {}
-    for given, used_m in zip(plan.head[begin:], plan.later[begin:], strict=False):
-        if apart and _merges(given):
-            stages.append({"type": "filters.merge"})
-            apart = False
-        used[len(stages)] = used_m
-        stages.append(_with_threads(given, context.threads))
-        kind = stage_types().get(given["type"])
-        if kind is not None and kind.open_ended and not everything:
-            stages.append(callbacks.filter(partial(reach, len(stages) - 1)))
-    stages += [callbacks.filter(function) for function in (take, last) if function is not None]
-    stages[begins]["inputs"] = [last_read]
-    pipeline = Pipeline(stages, whole=False)
-    ours = {one.number: one for one in pipeline.expanded.ours}
-    check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
-    for one in ours.values():
-        one.update_context(outside=OUTSIDE, used_m=used[one.number])
-    if before is not None:  # of the first one alone
-        far = next(
-            one
-            for one in ours.values()
-            if isinstance(one.stage, FarReaching) and one.stage.blocks() is not None
-        )
-        far.update_context(blocks=before.blocks)
-    pipeline.execute(arrays=False)
-    reports = [
-        report for _, reports in pipeline.reports for report in reports if report.beyond_halo
-    ]
-    if reports and not everything:
-        needs += [plan.halo_m + report.reach for report in reports]
-    return HeadRun(
-        _collect(views, cuts), max(needs), _messages(pipeline, context.scratch), pipeline.left_alone
-    )
+        rows = np.flatnonzero(ins[OUTSIDE] < 0)
+        self.views.append({name: ins[name][rows] for name in (ROW, INPUT, *names)})
 
 
 def _merges(stage: Mapping[str, Any]) -> bool:
@@ -144,33 +159,33 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     return lines
 
 
-def _marked(number: int, piece: Piece, unit: float, changed: Changed) -> NewValues:
-    """New values that number a piece's points, and those of the first round."""
+def _marked(number: int, piece: Piece, unit: float, changed: ChangedValues) -> NewValues:
+    """Return new values that number a piece's points, with those of the first round."""
     count = len(piece.index)
     marks = {
         ROW: np.arange(count, dtype=np.uint32),
         INPUT: np.full(count, number, np.uint32),
         OUTSIDE: np.where(piece.away < 0, -1.0, piece.away * unit),
     }
-    return NewValues(
-        np.ones(count, bool), {name: (None, values) for name, values in marks.items()} | changed
-    )
+    every = {name: (None, values) for name, values in marks.items()}
+    return NewValues(np.ones(count, bool), every | changed)
 
 
-def _with_threads(given: dict[str, Any], threads: int) -> dict[str, Any]:
-    if given["type"] not in stage_types():
-        return dict(given)
-    asked = int(given.get("threads") or 0)
-    return {**given, "threads": min(asked, threads) if asked else threads}
+def _with_threads(step: dict[str, Any], threads: int) -> dict[str, Any]:
+    """Return a stage that uses no more threads than its worker has."""
+    if step["type"] not in stage_types():
+        return dict(step)
+    wanted = int(step.get("threads") or 0)
+    return {**step, "threads": min(wanted, threads) if wanted else threads}
 
 
-def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceResults]:
-    """Results of the tile's own points, in the order of their pieces."""
+def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[PieceResults]:
+    """Return results of the tile's own points, in the order of their pieces."""
     names = [name for view in views[:1] for name in view if name not in _MARKS]
     results = []
-    for number, piece in enumerate(cuts):
-        mine = [(view, np.flatnonzero(view[INPUT] == number)) for view in views]
-        rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in mine)])
+    for number, piece in enumerate(pieces):
+        parts = [(view, np.flatnonzero(view[INPUT] == number)) for view in views]
+        rows = np.concatenate([np.empty(0, np.int64), *(view[ROW][at] for view, at in parts)])
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
         if (np.diff(rows) == 0).any():
@@ -179,136 +194,161 @@ def _collect(views: list[dict[str, NDArray]], cuts: list[Piece]) -> list[PieceRe
                 cure="Run the pipeline without --tile",
             )
         values = {
-            name: np.concatenate([view[name][at] for view, at in mine])[order] for name in names
+            name: np.concatenate([view[name][at] for view, at in parts])[order] for name in names
         }
-        if (
-            flags_in_classes(piece.path) and "Classification" in values
-        ):  # which old PDAL reads as bits of it
+        # Old PDAL reads flags as bits of the class.
+        if flags_in_classes(piece.path) and "Classification" in values:
             values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
         results.append(PieceResults(piece, rows, values))
     return results
 
 
-# ---- a tile ---------------------------------------------------------------------------------------------------
+# ---- tasks of workers ------------------------------------------------------------------------------
 
 
 def run_first_round(
     context: RunContext, square: tuple[int, int], sources: Sequence[IndexedSource], target: str
 ) -> dict[str, Any]:
-    """Save what the raster needs of a square's own points, and the changes by earlier stages; returns a record.
+    """Save what blocks need of a square's own points, and changes by earlier stages.
 
-    `sources` may have points in the square or its halo.
+    Parameters
+    ----------
+    context : RunContext
+    square : (int, int)
+        Column and row in the grid of squares.
+    sources : sequence of IndexedSource
+        Inputs that may have points in the square or its halo.
+    target : str
+        The file to write.
+
+    Returns
+    -------
+    dict
+        The record of the job.
     """
-    plan, first = context.plan, context.plan.first
+    first = context.plan.first
     assert first is not None
-    stage, left = stage_of(plan), [{"around": np.empty((0, 4))}]
+    stage, left = stage_of(context.plan), [{"around": np.empty((0, 4))}]
 
     def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        mine = ins[OUTSIDE] < 0
-        if mine.any():
-            own = {name: ins[name][mine] for name in ins}
-            left.append(stage.reduce_points(points_of(stage, WHOLE_CLOUD, module, own)))
+        inside = ins[OUTSIDE] < 0
+        if inside.any():
+            arrays = {name: values[inside] for name, values in ins.items()}
+            left.append(stage.reduce_points(points_of(stage, WHOLE_CLOUD, module, arrays)))
 
     # Class codes that do not fit the writers may still be changed by the stages after these: no tail.
-    before = replace(
-        plan, head=plan.head[: first.at], tail=[], creates=first.kept or [], first=None
-    )
+    head = context.plan.head[: first.at]
+    before = replace(context.plan, head=head, tail=[], creates=first.kept or [], first=None)
     context = replace(context, plan=before, grid=context.squares)
-    head = HeadRun([])
-    with TemporaryDirectory(
-        prefix="first-", dir=context.scratch, ignore_cleanup_errors=True
-    ) as folder:
-        cuts = cut_all(context.grid, square, sources, first.halo_m / context.unit, folder)
-        if cuts:
-            head = run_head(context, square, cuts, True, last=leave)
+    result = HeadResult([])
+    folder = TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True)
+    with folder as name:
+        pieces = cut_all(context.grid, square, sources, first.halo_m / context.unit, name)
+        if pieces:
+            result = _HeadRun(context, square, pieces, complete=True).run(leave)
     arrays = {
-        name: np.concatenate([one[name] for one in left if name in one])
-        for name in {name for one in left for name in one}
+        name: np.concatenate([part[name] for part in left if name in part])
+        for name in {name for part in left for name in part}
     }
     if first.kept:
-        arrays |= arrays_of(head.results)
+        arrays |= arrays_of(result.results)
     save_arrays(target, arrays)
-    return {"outputs": written([target]), "messages": head.messages}
+    return {"outputs": written([target]), "messages": result.messages}
 
 
 def run_tile(
     context: RunContext,
     tile: tuple[int, int],
     sources: Sequence[IndexedSource],
-    complete: float,
+    complete_m: float,
     result: str,
     outputs: list[str] | None,
 ) -> dict[str, Any]:
-    """Run the head on a tile; save the results in the file `result`, or write the `outputs`; returns a record.
+    """Run the head on a tile; save the results or write the outputs.
 
-    `sources` may have points in the tile or its halo; they are all inputs within `complete` meters around it.
+    Parameters
+    ----------
+    context : RunContext
+    tile : (int, int)
+        Column and row.
+    sources : sequence of IndexedSource
+        All inputs within `complete_m` meters around the tile.
+    complete_m : float
+    result : str
+        The file for the results, where tiles are not outputs.
+    outputs : list of str, optional
+        The files of the writers, where tiles are outputs.
+
+    Returns
+    -------
+    dict
+        The record of the job.
     """
-    with TemporaryDirectory(
-        prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True
-    ) as folder:
-        results, record = _settled(context, tile, sources, complete, folder)
+    folder = TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True)
+    with folder as name:
+        results, record = _run_with_halo(context, tile, sources, complete_m, name)
         if outputs is not None:
-            wrote = write_tile(results, context.plan, outputs, context.scratch)
-            return record | wrote | {"messages": [*record["messages"], *wrote.get("messages", [])]}
+            output = write_tile(results, context.plan, outputs, context.scratch)
+            messages = [*record["messages"], *output.get("messages", [])]
+            return record | output | {"messages": messages}
         save_arrays(result, arrays_of(results))
     return record | {"outputs": written([result])}
 
 
-def _settled(
+def _run_with_halo(
     context: RunContext,
     tile: tuple[int, int],
     sources: Sequence[IndexedSource],
-    complete: float,
+    complete_m: float,
     folder: str,
 ) -> tuple[list[PieceResults], dict[str, Any]]:
-    """Run the head with a sufficient halo; returns results and a record.
+    """Run the head with a sufficient halo; return results and a record.
 
-    It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that did not
-    suffice (``short``).
+    It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that was too
+    ``short``.
     """
     grid, least_m = context.grid, context.plan.halo_m
-    side, halo_m, short = grid.size * context.unit, least_m, False
-    head: HeadRun | None = None
-    for attempt in range(_WIDENINGS + 1):
-        cuts = cut_all(grid, tile, sources, halo_m / context.unit, folder)
-        read = sum(len(piece.index) for piece in cuts)
-        own = sum(len(piece.own) for piece in cuts)
-        if not own:
-            head = HeadRun([PieceResults(piece, np.empty(0, np.int64), {}) for piece in cuts])
+    side_m, halo_m, short = grid.size * context.unit, least_m, False
+    head: HeadResult | None = None
+    for attempt in range(_MOST_WIDENINGS + 1):
+        pieces = cut_all(grid, tile, sources, halo_m / context.unit, folder)
+        read = sum(len(piece.index) for piece in pieces)
+        points = sum(len(piece.own_rows) for piece in pieces)
+        if not points or not context.plan.head:
+            head = HeadResult([PieceResults(piece, piece.own_rows, {}) for piece in pieces])
             break
-        everything = inside(context.bounds, grid.box(tile, halo_m / context.unit))
-        given = from_before(context, tile, halo_m, cuts) if context.rasters else None
+        complete = inside(context.bounds, grid.box(tile, halo_m / context.unit))
+        earlier = load_first_round(context, tile, halo_m, pieces) if context.rasters else None
         try:
-            head = run_head(context, tile, cuts, everything, given)
-            need = head.need
+            head = _HeadRun(context, tile, pieces, complete, earlier).run()
+            needed_m = head.halo_needed_m
         except NoTerrainError:
-            if everything:
+            if complete:
                 raise
-            head, need = None, side + 2 * least_m  # look farther away
-        if everything or need <= halo_m:
+            head, needed_m = None, side_m + 2 * least_m  # look farther away
+        if complete or needed_m <= halo_m:
             break
         short = True
-        if math.isinf(need):  # there are too few points
-            need = halo_m + 2 * side
-        estimate = read * ((side + 2 * need) / (side + 2 * halo_m)) ** 2
-        if attempt == _WIDENINGS or estimate > context.most_points or need > complete:
+        if math.isinf(needed_m):  # there are too few points
+            needed_m = halo_m + 2 * side_m
+        estimate = read * ((side_m + 2 * needed_m) / (side_m + 2 * halo_m)) ** 2
+        if attempt == _MOST_WIDENINGS or estimate > context.most_points or needed_m > complete_m:
             break
-        halo_m, short = need + 1e-6, False
+        halo_m, short = needed_m + 1e-6, False
     if head is None:
         raise NoTerrainError(
             "no terrain: no point near the tile can be part of it", found=f"within {halo_m:.0f} m"
         )
-    classes = (
-        one.values["Classification"] for one in head.results if "Classification" in one.values
-    )
+    classes = [np.zeros(0, np.uint8)]
+    classes += [r.values["Classification"] for r in head.results if "Classification" in r.values]
     return head.results, {
-        "points": own,
+        "points": points,
         "read": read,
         "halo_m": halo_m,
         "short": short,
         "widened": halo_m > least_m,
-        "dropped": own - sum(len(result.rows) for result in head.results),
-        "classes": class_counts(np.concatenate([np.zeros(0, np.uint8), *classes])),
+        "dropped": points - sum(len(result.rows) for result in head.results),
+        "classes": class_counts(np.concatenate(classes)),
         "messages": head.messages,
         "left_alone": head.left_alone,
     }

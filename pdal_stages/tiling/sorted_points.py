@@ -167,7 +167,7 @@ class Piece:
     away: NDArray[np.float64]
 
     @cached_property
-    def own(self) -> NDArray[np.int64]:
+    def own_rows(self) -> NDArray[np.int64]:
         """Rows of the tile's own points."""
         return np.flatnonzero(self.away < 0)
 

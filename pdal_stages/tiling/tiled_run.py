@@ -25,7 +25,7 @@ from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .checkpoint import Store, fingerprint
-from .first_round import block_name, blocks_around, left_name, make_block
+from .first_round import block_name, blocks_around, make_block, square_name
 from .inputs import CloudIndex, IndexedSource, Survey
 from .jobs import (
     InterruptedRun,
@@ -427,7 +427,7 @@ class _Run:
         places = {b for box in boxes.values() for b in blocks_around(context, box, spill)}
         # Blocks and tiles left by an earlier run with other inputs must not be used.
         store.remove(".block.npz", [f"{block_name(block)}.npz" for block in places])
-        store.remove(".first.npz", [f"{left_name(squares, each)}.npz" for each in points])
+        store.remove(".first.npz", [f"{square_name(squares, each)}.npz" for each in points])
         around = self.farthest * unit + first.blocks.margin
         wanted = {
             job.name: places.intersection(blocks_around(context, boxes[tile], around))
@@ -463,7 +463,7 @@ class _Run:
         firsts: dict[tuple[int, int], Job] = {}
         for square in sorted({square for each in near.values() for square in each}):
             mark = fingerprint(common, square, survey.seen([s for s, _ in sources(square)]))
-            firsts[square] = Job(left_name(squares, square), points[square], square, mark=mark)
+            firsts[square] = Job(square_name(squares, square), points[square], square, mark=mark)
         for job in self._do("lowest points of cells", self._unkept(firsts.values()), first_task):
             self.messages_before.append(job.record.get("messages", []))
 

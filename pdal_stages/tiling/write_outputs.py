@@ -97,7 +97,7 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
     own: list[tuple[str, int]] = []
     for result in results:
         piece = result.piece
-        if not len(piece.own):
+        if not len(piece.own_rows):
             continue
         columns = {f"dim/{name}": values for name, values in result.values.items()}
         columns = {"index": piece.index[result.rows], **columns}
@@ -105,7 +105,7 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
         for name, column in columns.items():
             records[name] = column
         content[piece.source.key] = records
-        own.append((piece.source.key, len(piece.own)))
+        own.append((piece.source.key, len(piece.own_rows)))
     return {**content, "own": np.array(own, [("key", "<U12"), ("count", "<i8")])}
 
 
@@ -365,7 +365,7 @@ def write_tile(
     results: list[PieceResults], plan: TilePlan, outputs: list[str], scratch: str
 ) -> dict[str, Any]:
     """Write one tile's own points, from the files that were cut for it; the record."""
-    mine = [result for result in results if result.piece.own.size]
+    mine = [result for result in results if result.piece.own_rows.size]
     if not mine:
         return {"outputs": []}
     if plan.takes is not None:
