@@ -240,7 +240,7 @@ def test_the_side_of_tiles_keeps_to_the_memory(density, memory, halo):
     found = Density.of(extents)
     options = TilingOptions(memory=int(memory), workers=None)
     try:
-        chosen = settled(options, found, halo, True)
+        chosen, _ = settled(options, found, halo, True)
     except OptionError:
         least = worker_bytes(found.read_by(1.0, halo), found.largest) + PARENT
         assert least > memory  # nothing would have fitted

@@ -183,8 +183,10 @@ def settled(
         return worker_bytes(density.read_by(side, halo_units), largest, block)
 
     # A small survey in one tile needs neither surroundings nor rounds before.
-    alone = density.grid_around() if 0 < density.points <= _MOST_OF_A_TILE else None
-    if options.tile is None and not options.scheduler and alone:
+    may_be_alone = options.tile is None and not options.scheduler
+    small = 0 < density.points <= _MOST_OF_A_TILE
+    alone = density.grid_around() if may_be_alone and small else None
+    if alone is not None:
         free = whole - (PARENT if local else 0)
         if worker_bytes(density.points, density.largest if per_file else 0) <= free:
             workers = local if fixed else min(local, 1)
