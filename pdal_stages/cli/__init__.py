@@ -33,7 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     streams = sys.stdout, sys.stderr
     for stream in streams:
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
-            # Characters that the locale lacks are escaped; messages and results keep their order in a file as well.
+            # Characters that the locale lacks are escaped; messages and results keep their order in
+            # a file as well.
             stream.reconfigure(errors="backslashreplace", line_buffering=True)  # type: ignore[union-attr]
     sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
     progress_before = os.environ.get("PDAL_STAGES_PROGRESS")
@@ -73,7 +74,9 @@ def _tune_process() -> None:
 
 
 def _protect_names(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments without ``--``; after it, names with a leading dash become ``./-name``."""
+    """Return the arguments without ``--``; after it, names with a leading dash become
+    ``./-name``.
+    """
     before = list(itertools.takewhile(lambda word: word != "--", arguments))
     after = arguments[len(before) + 1 :]
     return before + [f"./{word}" if word.startswith("-") else word for word in after]
@@ -104,7 +107,8 @@ def _explain(error: Exception) -> StageError:
         return StageError(
             "a Python package cannot be imported",
             found=f"{sys.executable}: {reason.splitlines()[0]}",
-            cure="Install pdal-stages with its packages into one environment, e.g. with conda; packages built for "
+            cure="Install pdal-stages with its packages into one environment, e.g. with conda; "
+            "packages built for "
             "another NumPy or Python must be installed again",
         )
     return StageError(

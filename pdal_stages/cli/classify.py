@@ -41,8 +41,10 @@ def add_commands(parser: Parser) -> None:
     add(
         "--dimensions",
         metavar="LIST",
-        help="Extra dimensions to write besides the input's own, e.g. Reliability,Margin,Probability_6, or all, or none; "
-        "default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 (1.6 %%), which keeps files small",
+        help="Extra dimensions to write besides the input's own, e.g. "
+        "Reliability,Margin,Probability_6, or all, or none; "
+        "default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 (1.6 %%), which "
+        "keeps files small",
     )
     for flag, default, help in (
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
@@ -56,7 +58,8 @@ def add_commands(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="FILE=CODE",
-        help="Class for ground inside polygons, e.g. lakes.gpkg=9; for other classes: bridges.gpkg=17:2,6; may be repeated",
+        help="Class for ground inside polygons, e.g. lakes.gpkg=9; for other classes: "
+        "bridges.gpkg=17:2,6; may be repeated",
     )
     add("--objects", metavar="FILE", help="Also write buildings, trees and more to a vector file")
     add_stage_options(add, "filters.modelclassifier", *_CLASSIFIER_OPTIONS)

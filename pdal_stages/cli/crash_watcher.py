@@ -1,4 +1,6 @@
-"""A small process beside the command that reports when the command dies without a message of its own."""
+"""A small process beside the command that reports when the command dies without a message of its
+own.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +21,10 @@ INTERRUPTED = "interrupted; no partial output was left"
 def watch_for_crash(arguments: Sequence[str]) -> Callable[[], None]:
     """Watch this process from now on; return the function that ends the watch.
 
-    A crash inside PDAL, and the system's killing of a process without memory, end Python at once. The watching process
-    holds one end of a pipe, which closes when this process ends, however it ends. Where processes cannot be forked
-    nothing watches. `arguments` are the command's, for the message.
+    A crash inside PDAL, and the system's killing of a process without memory, end Python at once.
+    The watching process holds one end of a pipe, which closes when this process ends, however it
+    ends. Where processes cannot be forked nothing watches. `arguments` are the command's, for the
+    message.
     """
     if not hasattr(os, "fork"):
         return lambda: None
@@ -58,6 +61,7 @@ def _describe_death(arguments: Sequence[str]) -> StageError:
     return StageError(
         "the process died in the midst of its work, and no output was completed after that",
         found=one_line(shlex.join(["pdal-stages", *arguments])),
-        cure="Where memory ran out, the system killed it: work in tiles (classify --tile). Or PDAL crashed, as it does on "
+        cure="Where memory ran out, the system killed it: work in tiles (classify --tile). Or PDAL "
+        "crashed, as it does on "
         "damaged LAZ or COPC points: try the inputs one by one with 'pdal info --stats'",
     )

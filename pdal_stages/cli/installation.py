@@ -96,7 +96,8 @@ def _options(options: argparse.Namespace) -> None:
             theirs = [one["name"] for one in json.loads(ask_program("--drivers", "--showjson"))]
             raise PipelineError(
                 f"there is no stage '{name}', neither of ours nor of PDAL's",
-                cure=f"{suggest(name, [*stage_types(), *theirs])}List them with: pdal-stages drivers",
+                cure=f"{suggest(name, [*stage_types(), *theirs])}List them with: pdal-stages "
+                "drivers",
             )
         print(answer, end="")
         return
@@ -129,11 +130,12 @@ def _commands(parser: Parser, options: argparse.Namespace) -> None:
 
 
 def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
-    """Arguments of commands and stages, models and classes, as JSON, for programs that build dialogs (the QGIS plugin).
+    """Arguments of commands and stages, models and classes, as JSON, for programs that build
+    dialogs (the QGIS plugin).
 
-    An argument has ``name``, ``flag`` (empty for one without), ``kind`` (``number``, ``integer``, ``boolean``, ``string``),
-    ``help``, ``default``, ``choices``, ``required``, ``many`` (add several, or may be repeated) and ``value`` (what usage
-    calls its value).
+    An argument has ``name``, ``flag`` (empty for one without), ``kind`` (``number``, ``integer``,
+    ``boolean``, ``string``), ``help``, ``default``, ``choices``, ``required``, ``many`` (add
+    several, or may be repeated) and ``value`` (what usage calls its value).
     """
     from ..base.asprs import NAMES, class_color
     from ..base.version import __version__
@@ -225,7 +227,9 @@ def _plugin(options: argparse.Namespace) -> int:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    """Run the kernels of the demo, the default heights, training, classification and objects on a few points."""
+    """Run the kernels of the demo, the default heights, training, classification and objects on a
+    few points.
+    """
     import numpy as np
 
     from ..classifier.training import train

@@ -1,4 +1,6 @@
-"""The parser of the command line: commands of one screen of help each, and flags from options that stages declare."""
+"""The parser of the command line: commands of one screen of help each, and flags from options that
+stages declare.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from typing import Any, NoReturn
 from ..base.errors import StageError, suggest
 from ..base.version import __version__
 
-#: Modules and their commands. Only the module of the requested command is imported; all for ``commands``.
+#: Modules and their commands. Only the module of the requested command is imported; all for
+#: ``commands``.
 COMMANDS = {
     "classify": ("classify",),
     "models": ("models", "train", "adapt", "accuracy", "model"),

@@ -94,7 +94,8 @@ def _pipeline(options: argparse.Namespace) -> int:
     print_messages(*before)
     signals.end_at_ctrl_c(options.is_program)
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(options.verbose, logging.DEBUG))
-    # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot read to 0, say.
+    # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot
+    # read to 0, say.
     lines = pipeline.log_lines
     shown = lines if options.verbose > 1 else lines[:_LOG_LINES]
     print_messages(*(f"PDAL says: {line}" for line in shown))
@@ -145,7 +146,9 @@ def _expand(options: argparse.Namespace) -> None:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    """Print PDAL's verdict or ours as JSON, on standard output; an error goes to standard error too."""
+    """Print PDAL's verdict or ours as JSON, on standard output; an error goes to standard error
+    too.
+    """
     try:
         pipeline = _build(options)
         print(pipeline.validate())

@@ -1,4 +1,6 @@
-"""Flags of runs in tiles, which several commands share, and the records that they are parsed into."""
+"""Flags of runs in tiles, which several commands share, and the records that they are parsed
+into.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ def add_tile_sizes(
     command: argparse.ArgumentParser,
     what: str = "Points that do not fit in memory are read in tiles, which give the same model.",
 ) -> Callable:
-    """Add the flags of ``train``, whose only output is a model; return the function that adds more."""
+    """Add the flags of ``train``, whose only output is a model; return the function that adds
+    more.
+    """
     add = command.add_argument_group("large areas", what).add_argument
     side = "Side of the tiles in the cloud's unit (default: auto)"
     add("--tile", type=_tile_side, metavar="SIZE", help=side)

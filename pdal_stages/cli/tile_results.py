@@ -25,7 +25,8 @@ def print_classes(
 ) -> None:
     """Print the points of each class in all files together, and those without a class.
 
-    `classes` are numbers of points by code, `left_alone` by the name of the count; `names` are the model's by code.
+    `classes` are numbers of points by code, `left_alone` by the name of the count; `names` are the
+    model's by code.
     """
     for code, points in sorted((int(code), points) for code, points in classes.items()):
         print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
@@ -34,7 +35,9 @@ def print_classes(
 
 
 def print_output(job: Job, names: Mapping[int, str]) -> None:
-    """Print an output when it is finished: ``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %``."""
+    """Print an output when it is finished: ``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0
+    %``.
+    """
     assert job.outputs is not None
     classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
     total = sum(classes.values())
@@ -72,7 +75,8 @@ def print_plan(run: TiledRun) -> None:
     workers = processes.get(s["workers"], f"each of {s['workers']} workers")
     memory = f"{s['memory_mb_of_a_worker']:,.0f} MB for {workers}"
     print(
-        f"{count_of(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m around it",
+        f"{count_of(len(run.tiles), 'tile')} of {s['tile']:g}, each read with {s['halo_m']:g} m "
+        "around it",
         f"{count_of(s['inputs'], 'input')}, {s['points']:,} points; one output for each {s['per']}",
         f"about {s['points_read_by_a_tile']:,} points read for a tile",
         f"up to {memory} with {s['threads_per_worker']} threads",
@@ -103,7 +107,9 @@ def _print_failures(run: TiledRun) -> None:
 
 
 def end_run(files: RunFiles, run: TiledRun, again: str) -> int:
-    """Write metadata and reports; return the exit code. `again`: how to continue an interrupted run, else empty."""
+    """Write metadata and reports; return the exit code. `again`: how to continue an interrupted
+    run, else empty.
+    """
     content = run.to_dict()
     for name in filter(None, [files.metadata, *files.reports]):
         if name in files.reports and Path(name).suffix.lower() != ".json":

@@ -1,4 +1,6 @@
-"""The command ``accuracy``: two class dimensions of files, or files against reference files of the same points."""
+"""The command ``accuracy``: two class dimensions of files, or files against reference files of the
+same points.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ from .runtime import points_of_views
 
 #: What to do where the true classes are not known.
 WHAT_IS_TRUE = (
-    "Say where the true classes are: --reference FILE, of the same points, or --reference-dimension NAME, which "
+    "Say where the true classes are: --reference FILE, of the same points, or "
+    "--reference-dimension NAME, which "
     "filters.ferry may have kept before classifying"
 )
 
@@ -41,9 +44,9 @@ def compare_files(
 ) -> list[str]:
     """Compare files with others that hold the same points in the same order, paired by name.
 
-    Returns messages for the user. Both are files, folders or patterns; `outputs` are options of ``filters.accuracy``.
-    Without references the true classes are another dimension of the files; with a `model` its classes are judged, and the
-    files' own are the truth.
+    Returns messages for the user. Both are files, folders or patterns; `outputs` are options of
+    ``filters.accuracy``. Without references the true classes are another dimension of the files;
+    with a `model` its classes are judged, and the files' own are the truth.
     """
     files = input_files(sources)
     pairs = paired(files, input_files(references)) if references else [(file, "") for file in files]
@@ -99,7 +102,8 @@ _TRUTH = "TrueClass"
 
 
 def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str, str]]:
-    """Files with their references: of the same name, or the longest name inside theirs (c_town: town).
+    """Files with their references: of the same name, or the longest name inside theirs (c_town:
+    town).
 
     Names are looked for in the same folder (`in_folders`) where a name comes twice.
     """
@@ -167,5 +171,6 @@ def _refuse_other_points(mine: Points, true: Points, source: str, reference: str
         raise StageError(
             "the two files do not hold the same points in the same order",
             found=found,
-            cure="Compare files of the same points, or keep the labels with filters.ferry while classifying",
+            cure="Compare files of the same points, or keep the labels with filters.ferry while "
+            "classifying",
         )

@@ -28,7 +28,8 @@ _GROUND = preprocessing.GROUND_FILTER
 #: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
 
-#: How the names begin of dimensions that hold what the input has, while stages make others of the same names.
+#: How the names begin of dimensions that hold what the input has, while stages make others of the
+#: same names.
 _KEPT = "PdalStagesKept"
 
 
@@ -124,7 +125,8 @@ class ClassifyRequest:
         if not any(stage["type"] == _GROUND for stage in stages):
             raise OptionError(
                 f"--ground given needs a model whose heights come from {_GROUND}",
-                found=f"{self.model}: {', '.join(stage['type'] for stage in stages) or 'no heights'}",
+                found=f"{self.model}: "
+                f"{', '.join(stage['type'] for stage in stages) or 'no heights'}",
                 cure="Leave it out, or take another model",
             )
         return preprocessing.with_given_ground(stages)
@@ -135,7 +137,8 @@ class ClassifyRequest:
 
     @property
     def _corrections(self) -> list[dict[str, Any]]:
-        """Return the corrections after the classifier, for models with the classes they need, and polygons last.
+        """Return the corrections after the classifier, for models with the classes they need, and
+        polygons last.
 
         They take the points that the classifier marked: `where` would see its new classes by then.
         """
@@ -189,12 +192,15 @@ class ClassifyRequest:
         return {name: kind for name, kind in made.items() if name in self.dimensions}
 
     def pipeline(self, source: str, target: str) -> Pipeline:
-        """Read a file, compute heights where the model needs them, classify, and write with everything else kept."""
+        """Read a file, compute heights where the model needs them, classify, and write with
+        everything else kept.
+        """
         if Path(target).suffix.lower() in (".tif", ".tiff", ".gpkg", ".shp", ".geojson"):
             raise OptionError(
                 "classify writes points",
                 found=target,
-                cure="Name a .laz or .las file. Buildings, trees and more: --objects FILE; rasters: docs/large-areas.md",
+                cure="Name a .laz or .las file. Buildings, trees and more: --objects FILE; "
+                "rasters: docs/large-areas.md",
             )
         writer = writer_of(target)
         if writer.get("type") in LAS_WRITERS:

@@ -1,4 +1,5 @@
-"""From our pipeline JSON to plain PDAL JSON: each stage of ours becomes a ``filters.python`` in place.
+"""From our pipeline JSON to plain PDAL JSON: each stage of ours becomes a ``filters.python`` in
+place.
 
 The pipeline is never split, so the LAS header, metadata, spatial reference, tags and
 inputs work as in PDAL.
@@ -44,7 +45,9 @@ class Expanded:
 
 
 def expand(source: PipelineSource, whole: bool = True) -> Expanded:
-    """Expand a pipeline. Not `whole`: it will be run in tiles, which separate flags from classes themselves."""
+    """Expand a pipeline. Not `whole`: it will be run in tiles, which separate flags from classes
+    themselves.
+    """
     stages = copy.deepcopy(source.stages)
     places = [source.where(number) for number in range(len(stages))]
     _refuse_several_ends(stages, places)
@@ -80,7 +83,9 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
 
 
 def _each_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
-    """A reader for each file of a pattern, sorted by name: PDAL reads them in the order of the folder's listing."""
+    """A reader for each file of a pattern, sorted by name: PDAL reads them in the order of the
+    folder's listing.
+    """
     names = reader_files(reader)
     named = {name: value for name, value in reader.items() if name != "tag"}
     return [{**named, "filename": name} for name in names] if len(names) > 1 else [reader]
@@ -93,7 +98,8 @@ def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
     readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
     if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
         raise PipelineError(
-            "this PDAL carries the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into other files only where all "
+            "this PDAL carries the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into "
+            "other files only where all "
             "readers come first and no stage has 'inputs'",
             found=f"PDAL {pdal_env.dotted_version()}",
             cure="Leave 'inputs' out, write one file at a time, or use PDAL 2.6",
@@ -105,7 +111,9 @@ def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
 
 
 def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
-    """The numbers of the stages from which each takes points; None where a tag is unknown, which PDAL refuses."""
+    """The numbers of the stages from which each takes points; None where a tag is unknown, which
+    PDAL refuses.
+    """
     tagged: dict[str, int] = {}
     waiting: list[int] = []
     inputs: list[list[int]] = []
@@ -123,9 +131,11 @@ def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
 
 
 def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) -> bool:
-    """Whether points may reach a stage in several views, of several readers, and nobody wants them apart.
+    """Whether points may reach a stage in several views, of several readers, and nobody wants them
+    apart.
 
-    A stage that makes one thing of all points never wants them apart; filters.crop splits, too, where it has several areas.
+    A stage that makes one thing of all points never wants them apart; filters.crop splits, too,
+    where it has several areas.
     """
     kinds = [stage["type"] for stage in stages[:number]]
     split = not SPLITS.isdisjoint(kinds)
@@ -149,7 +159,8 @@ def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str])
             found=", ".join(
                 f"{name} ({where[n]})" for n, name in list(zip(ends, named, strict=True))[:5]
             ),
-            cure="Write one file after the other (a writer passes its points on, so leave its 'inputs' out), or add a last "
+            cure="Write one file after the other (a writer passes its points on, so leave its "
+            "'inputs' out), or add a last "
             'stage that takes all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}',
         )
 
@@ -160,10 +171,11 @@ def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str])
 def settle_upstream(
     stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]
 ) -> tuple[Stage, bool]:
-    """Return a stage placed after those that created what it reads, and whether any created what it creates.
+    """Return a stage placed after those that created what it reads, and whether any created what it
+    creates.
 
-    `before` are the earlier stages in order, as written, each with the dimensions it creates: :meth:`Stage.creates`, or
-    :func:`heights_of` for PDAL's own.
+    `before` are the earlier stages in order, as written, each with the dimensions it creates:
+    :meth:`Stage.creates`, or :func:`heights_of` for PDAL's own.
     """
     wanted = set(stage.reads()) - {
         "Classification"
@@ -210,7 +222,9 @@ _DEGREES = re.compile(
 
 
 def check_dimensions(expanded: Expanded) -> None:
-    """Refuse a stage that reads heights or labels that nothing provides, and one that would get degrees."""
+    """Refuse a stage that reads heights or labels that nothing provides, and one that would get
+    degrees.
+    """
     of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
     for ours in expanded.ours:
         before = list(enumerate(expanded.stages[: ours.index]))
@@ -221,7 +235,8 @@ def check_dimensions(expanded: Expanded) -> None:
                 "the points are in degrees here; neighborhoods and grids need meters",
                 where=ours.stage.place,
                 found=f"filters.reprojection to {moved[-1]}",
-                cure="Put the reprojection after the stages of pdal_stages, or reproject to a projected reference",
+                cure="Put the reprojection after the stages of pdal_stages, or reproject to a "
+                "projected reference",
             )
         for name in ours.stage.reads():
             if name.startswith(_MADE) and not any(
@@ -229,14 +244,17 @@ def check_dimensions(expanded: Expanded) -> None:
                 for index, stage in before
             ):
                 raise DimensionError(
-                    f"the dimension '{name}' is missing: no stage before creates it, and no input has it",
+                    f"the dimension '{name}' is missing: no stage before creates it, and no input "
+                    "has it",
                     where=ours.stage.place,
                     cure=ours.stage.hint or MAKERS.get(name),
                 )
 
 
 def _may_make(name: str, stage: Mapping[str, Any]) -> bool:
-    """Whether a stage of PDAL may create a dimension; readers of other formats than LAS may create any."""
+    """Whether a stage of PDAL may create a dimension; readers of other formats than LAS may create
+    any.
+    """
     kind = stage["type"]
     if is_reader(stage):
         files = reader_files(dict(stage), las=True)
@@ -248,7 +266,9 @@ def _may_make(name: str, stage: Mapping[str, Any]) -> bool:
 
 
 def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
-    """A warning for each file of LAS 1.0-1.3 with extra dimensions, which PDAL reads only on request."""
+    """A warning for each file of LAS 1.0-1.3 with extra dimensions, which PDAL reads only on
+    request.
+    """
     warnings = []
     for stage in stages:
         if str(stage.get("use_eb_vlr", "")).lower() == "true" or "extra_dims" in stage:
@@ -258,7 +278,8 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
             if header is not None and header.minor < 4 and names:
                 listed = ", ".join(names[:5]) + ", ..." * (len(names) > 5)
                 warnings.append(
-                    f"{path}: its extra dimensions are not read: {listed}. In LAS 1.{header.minor}, PDAL reads them "
+                    f"{path}: its extra dimensions are not read: {listed}. In LAS "
+                    f"1.{header.minor}, PDAL reads them "
                     'only if the reader has "use_eb_vlr": true'
                 )
     return warnings
@@ -282,10 +303,11 @@ def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> Expa
 
 
 def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """An expanded pipeline with one filter for stages of ours, and functions, that follow one another.
+    """An expanded pipeline with one filter for stages of ours, and functions, that follow one
+    another.
 
-    For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. What tags and inputs wire stays
-    as it is; a stage that forgets dimensions is the last of its filter.
+    For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. What
+    tags and inputs wire stays as it is; a stage that forgets dimensions is the last of its filter.
     """
     out: list[dict[str, Any]] = []
     for stage in stages:

@@ -26,7 +26,9 @@ _INDEXES = (".gpkg", ".sqlite", ".shp", ".geojson")
 
 
 def input_files(names: Sequence[str]) -> list[str]:
-    """The inputs behind files, folders, patterns, tile indexes and EPT sources: each once, sorted by name within each."""
+    """The inputs behind files, folders, patterns, tile indexes and EPT sources: each once, sorted
+    by name within each.
+    """
     found: list[str] = []
     for name in names:
         try:
@@ -73,7 +75,9 @@ def _inside(folder: Path) -> list[str]:
 
 
 def locations(path: str, column: str = "location") -> list[str]:
-    """The files a tile index names, made by ``pdal tindex create``; relative ones from its folder, then from here."""
+    """The files a tile index names, made by ``pdal tindex create``; relative ones from its folder,
+    then from here.
+    """
     from ..base.vector import reading
 
     refuse_pipe(path)
@@ -110,7 +114,9 @@ def is_las(name: str) -> bool:
 
 
 def is_folder(target: str) -> bool:
-    """Whether an output is a folder: one that is there, or a name that ends with a slash, or has neither suffix nor '#'."""
+    """Whether an output is a folder: one that is there, or a name that ends with a slash, or has
+    neither suffix nor '#'.
+    """
     path = Path(target)
     named = "#" not in path.name and not path.suffix and not path.exists()
     return path.is_dir() or target.endswith(("/", os.sep)) or named
@@ -123,7 +129,9 @@ def _output_name(source: str, copc: bool) -> str:
 
 
 def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
-    """The names of outputs in a folder; where two are equal, with the inputs' folders below their common one."""
+    """The names of outputs in a folder; where two are equal, with the inputs' folders below their
+    common one.
+    """
     if len(set(names)) == len(names) or any("://" in source for source in sources):
         return list(names)
     folders = [os.path.dirname(os.path.abspath(source)) for source in sources]
@@ -136,7 +144,8 @@ def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[str]:
-    """An output for each input, with its name in place of ``#``; for ``#`` alone, with its suffix (see :func:`in_folders`).
+    """An output for each input, with its name in place of ``#``; for ``#`` alone, with its suffix
+    (see :func:`in_folders`).
 
     `copc`: COPC inputs may be written as COPC, where this PDAL can.
     """
@@ -154,26 +163,32 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
             raise PipelineError(
                 "two inputs have the same name and would be written to one file",
                 found=f"{other} and {source}: {output}",
-                cure="Name a folder (with a slash at its end), which keeps the inputs' folders; or rename one",
+                cure="Name a folder (with a slash at its end), which keeps the inputs' folders; or "
+                "rename one",
             )
     return outputs
 
 
 def named_outputs(target: str, names: Sequence[str]) -> list[str]:
-    """A file's name with each name in place of ``#``; PipelineError where several would be written to one file."""
+    """A file's name with each name in place of ``#``; PipelineError where several would be written
+    to one file.
+    """
     path = Path(target)
     if "#" not in path.name and len(names) > 1:
         raise PipelineError(
             "several inputs or tiles would be written to one file",
             found=f"{len(names)} to {target}",
-            cure="Name a folder (with a slash at its end), or put '#' where the name of the input or tile should be, e.g. "
+            cure="Name a folder (with a slash at its end), or put '#' where the name of the input "
+            "or tile should be, e.g. "
             "classified_#.laz. To merge inputs into one file, use a pipeline",
         )
     return [str(path.with_name(path.name.replace("#", name))) for name in names]
 
 
 def reader_of(source: str, tag: str) -> dict[str, Any]:
-    """A reader; it also reads the extra dimensions of LAS 1.0-1.3, which PDAL leaves out by default."""
+    """A reader; it also reads the extra dimensions of LAS 1.0-1.3, which PDAL leaves out by
+    default.
+    """
     stage: dict[str, Any] = {"filename": str(source), "tag": tag}
     if named_las(source) and not named_copc(source):
         stage |= {"type": "readers.las", "use_eb_vlr": True}

@@ -1,4 +1,6 @@
-"""Read a pipeline as a user wrote it: JSON with comments, as PDAL reads it, and errors that name the line."""
+"""Read a pipeline as a user wrote it: JSON with comments, as PDAL reads it, and errors that name
+the line.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ class PipelineSource:
 
 
 def _with_plain_name(stage: Any) -> Any:
-    """A file name given as an object with only a path (PDAL 2.9), as text, which every PDAL takes."""
+    """A file name given as an object with only a path (PDAL 2.9), as text, which every PDAL
+    takes.
+    """
     name = stage.get("filename") if isinstance(stage, dict) else None
     if isinstance(name, dict) and set(name) == {"path"} and isinstance(name["path"], str):
         return {**stage, "filename": name["path"]}
@@ -99,7 +103,8 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             f"the pipeline is not valid JSON: {error.msg}",
             where=f"{name or 'pipeline'}, line {error.lineno}, column {error.colno}",
             found=repr(clean[max(0, error.pos - 20) : error.pos + 20].strip()),
-            cure="JSON is one list or object, with double quotes, a comma between values, and none before a closing bracket",
+            cure="JSON is one list or object, with double quotes, a comma between values, and none "
+            "before a closing bracket",
         ) from None
     except (ValueError, RecursionError) as error:
         found = str(error)[:200]
@@ -124,7 +129,9 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
 
 
 def _places(text: str, at: int) -> list[int]:
-    """Where the items of a list begin, or the keys and values of an object, whose bracket is there; it is valid JSON."""
+    """Where the items of a list begin, or the keys and values of an object, whose bracket is there;
+    it is valid JSON.
+    """
     places: list[int] = []
     while True:
         while text[(at := at + 1)] in " \t\r\n,:":
@@ -183,7 +190,8 @@ def _check_values(stage: Any, where: str) -> None:
         ) from None
 
 
-# The closing quote is optional, so that a match never fails: searching stays linear whatever the text.
+# The closing quote is optional, so that a match never fails: searching stays linear whatever the
+# text.
 _STRING_OR_COMMENT = re.compile(r'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?|//[^\n]*|/\*(?s:.*?)(\*/|\Z)')
 
 

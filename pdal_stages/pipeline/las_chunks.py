@@ -27,7 +27,8 @@ def can_read_chunks(path: str) -> bool:
 def read_columns(
     path: str, wanted: Sequence[str], only: Sequence[str] = ()
 ) -> Iterator[tuple[dict[str, NDArray], bool]]:
-    """Coordinates, classes, withheld flags and the `wanted` dimensions that exist; and whether classes hold flags.
+    """Coordinates, classes, withheld flags and the `wanted` dimensions that exist; and whether
+    classes hold flags.
 
     LAS and LAZ files are read in parts (`only`: see :func:`read_chunks`), others at once by PDAL.
     """
@@ -54,10 +55,12 @@ def read_columns(
 def read_chunks(
     path: str, start: int = 0, end: int | None = None, most: int = PART, only: Sequence[str] = ()
 ) -> Iterator[Any]:
-    """The points of a LAS or LAZ file from one number to another, `most` at a time, as laspy reads them.
+    """The points of a LAS or LAZ file from one number to another, `most` at a time, as laspy reads
+    them.
 
-    `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its selections (``Z``,
-    ``CLASSIFICATION``, ...): LAZ 1.4 compresses them separately, so skipping the others saves time. Those are zero then.
+    `only`: the dimensions that are needed beside X, Y and the returns, by laspy's names of its
+    selections (``Z``, ``CLASSIFICATION``, ...): LAZ 1.4 compresses them separately, so skipping the
+    others saves time. Those are zero then.
     """
     import laspy
 
@@ -108,7 +111,9 @@ def open_las(path: str, **more: Any) -> Any:
 
 
 def laspy_header(path: str) -> Any:
-    """The header of a file with its records, except those of COPC, which do not fit points in another order."""
+    """The header of a file with its records, except those of COPC, which do not fit points in
+    another order.
+    """
     import laspy
 
     try:

@@ -1,8 +1,8 @@
 """Limits of LAS outputs, and workarounds where old PDAL writes LAS files wrongly.
 
-PDAL before 2.3 cannot compress LAS 1.4 with class codes above 31. PDAL before 2.6 reads the flags of LAS 1.0-1.3
-(synthetic, key-point, withheld) as the upper bits of the class: written as LAS 1.4, a withheld point of class 2 would
-become one of class 130.
+PDAL before 2.3 cannot compress LAS 1.4 with class codes above 31. PDAL before 2.6 reads the flags
+of LAS 1.0-1.3 (synthetic, key-point, withheld) as the upper bits of the class: written as LAS 1.4,
+a withheld point of class 2 would become one of class 130.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ _AS_LAS_14 = '"minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with n
 
 
 def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) -> tuple[int, int]:
-    """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's defaults."""
+    """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's
+    defaults.
+    """
     found: list[int | None] = []
     forward, headers = str(writer.get("forward", "")), las_headers(before)
     forwards = any(word in forward for word in ("all", "header", "minor_version"))
@@ -57,7 +59,9 @@ def las_headers(readers: Iterable[Mapping[str, Any]]) -> list[LasHeader]:
 
 
 def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
-    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the inputs' own are not known."""
+    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the
+    inputs' own are not known.
+    """
     own: dict[str, str] = {}
     for source in sources:
         if not named_las(source):
@@ -71,7 +75,9 @@ REPLACED = "dimensions of the input get new values:"
 
 
 def replaced(sources: Iterable[str], made: Iterable[str]) -> list[str]:
-    """Return a message on extra dimensions of LAS files that stages make anew, such as those of an earlier run."""
+    """Return a message on extra dimensions of LAS files that stages make anew, such as those of an
+    earlier run.
+    """
     own = dict.fromkeys(name for source in sources for name in extra_dimensions(source))
     names = [name for name in own if name in set(made)]
     if not names:
@@ -104,7 +110,9 @@ def finish(made: Path, sources: Iterable[str], unit: float | None = None) -> Non
 
 
 def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage]) -> None:
-    """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS record."""
+    """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS
+    record.
+    """
     last = [one.stage for one in ours if "Classification" in one.stage.creates()][-1:]
     for one in ours:
         stage, extra = one.stage, len(one.stage.creates())
@@ -117,11 +125,14 @@ def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage])
                     )
             if extra > MOST_ENTRIES and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
-                    f"LAS cannot hold so many extra dimensions: one record describes {MOST_ENTRIES} of them",
+                    "LAS cannot hold so many extra dimensions: one record describes "
+                    f"{MOST_ENTRIES} of them",
                     where=stage.place,
                     found=f"{extra} features",
-                    cure="Take fewer neighborhoods or features, write to a format without the limit (writers.text, "
-                    "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, which need no "
+                    cure="Take fewer neighborhoods or features, write to a format without the "
+                    "limit (writers.text, "
+                    "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, "
+                    "which need no "
                     "dimensions",
                 )
 
@@ -177,10 +188,11 @@ def stage(ins, outs):
 def files_with_flags_to_split(
     stages: Sequence[dict[str, Any]], with_ours: bool = True
 ) -> list[bool]:
-    """For each input file, whether flags must be split from the class; empty where nothing is to be done.
+    """For each input file, whether flags must be split from the class; empty where nothing is to be
+    done.
 
-    A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: our stages are involved;
-    without them, text and rasters come out as PDAL makes them.
+    A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: our stages
+    are involved; without them, text and rasters come out as PDAL makes them.
     """
     if pdal_env.splits_class_flags():
         return []
@@ -198,7 +210,8 @@ def files_with_flags_to_split(
     together, apart = any(one <= 5 for one in written), any(one > 5 for one in written)
     if together and (apart or mixed):
         raise PipelineError(
-            "this PDAL cannot carry the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into a pipeline with LAS 1.4",
+            "this PDAL cannot carry the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into "
+            "a pipeline with LAS 1.4",
             found=f"PDAL {pdal_env.dotted_version()}",
             cure=f"Give all LAS writers {_AS_LAS_14}, or use PDAL 2.6",
         )
@@ -207,7 +220,9 @@ def files_with_flags_to_split(
 
 
 def flag_splitter(old: Sequence[bool], **wiring: Any) -> dict[str, Any]:
-    """A filter that moves flags to the dimension that they have in LAS 1.4; `old`: see :func:`files_with_flags_to_split`."""
+    """A filter that moves flags to the dimension that they have in LAS 1.4; `old`: see
+    :func:`files_with_flags_to_split`.
+    """
     adds = {"ClassFlags": "uint8_t"}
     return {**python_filter("pdal_stages_class_flags", _SPLIT, {"old": list(old)}, adds), **wiring}
 
@@ -219,7 +234,9 @@ _BLOCK = 1_000_000
 
 
 def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """The writer, or an uncompressed one followed by :func:`compress` where PDAL would fail to compress."""
+    """The writer, or an uncompressed one followed by :func:`compress` where PDAL would fail to
+    compress.
+    """
     named = str(writer.get("filename", "")).lower().endswith(".laz")
     compresses = named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
     if (

@@ -1,4 +1,6 @@
-"""Options set on the command line: ``--stage.TAG.option=value`` and ``--filters.name.option=value``, as in PDAL."""
+"""Options set on the command line: ``--stage.TAG.option=value`` and
+``--filters.name.option=value``, as in PDAL.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The only module that calls PDAL: running pipelines, versions, drivers, and differences between versions."""
+"""The only module that calls PDAL: running pipelines, versions, drivers, and differences between
+versions.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +30,13 @@ from ..base.las_repair import LARGEST_HEAD, corrected
 from .stage_files import reader_files, readers_files, writers_outputs
 
 INSTALL = (
-    "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; on Debian or "
+    "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; "
+    "on Debian or "
     "Ubuntu see docs/install.md"
 )
 _DRIVER_CURE = (
-    "filters.python comes with the package pdal-plugins. Install it for this Python (pip install pdal-plugins), and "
+    "filters.python comes with the package pdal-plugins. Install it for this Python (pip install "
+    "pdal-plugins), and "
     "set PDAL_DRIVER_PATH to the folder that holds libpdal_plugin_filter_python"
 )
 
@@ -125,10 +129,11 @@ def execute(
 
 @contextlib.contextmanager
 def readable(stages: list[dict[str, Any]], points: bool = True) -> Iterator[list[dict[str, Any]]]:
-    """Give the stages with readers of copies in place of LAS files that PDAL cannot read as they are.
+    """Give the stages with readers of copies in place of LAS files that PDAL cannot read as they
+    are.
 
-    See :mod:`..base.las_repair`. The copies lie beside what is written, and are removed on leaving. Without `points`
-    they hold what stands before the points.
+    See :mod:`..base.las_repair`. The copies lie beside what is written, and are removed on leaving.
+    Without `points` they hold what stands before the points.
     """
     beside = [os.path.dirname(output.path) for output in writers_outputs(stages)][:1]
     with contextlib.ExitStack() as stack:
@@ -157,7 +162,8 @@ def _is_las_14(path: str) -> bool:
 def _copied(
     folder: str, paths: list[str], streams: Sequence[BinaryIO | None], most: int | None
 ) -> str:
-    """Copy corrected files into a folder, with links to the others; return the name or pattern of all of them.
+    """Copy corrected files into a folder, with links to the others; return the name or pattern of
+    all of them.
 
     Of each file, `most` bytes are copied, and the rest is a hole.
     """
@@ -179,8 +185,9 @@ def _suffix(path: str) -> str:
     return ".laz" if path.lower().endswith("z") else ".las"
 
 
-#: PDAL puts its log in the place of sys.stdout while it runs and puts back what it found there, which in two threads is the
-#: other's log. It also holds Python still, so runs in threads gain nothing from each other.
+#: PDAL puts its log in the place of sys.stdout while it runs and puts back what it found there,
+#: which in two threads is the other's log. It also holds Python still, so runs in threads gain
+#: nothing from each other.
 _one_run = threading.RLock()
 
 
@@ -235,7 +242,9 @@ _kept: list[Any] = []
 
 
 def keep(stdout: Any) -> None:
-    """Keep a reference to sys.stdout after a script failed: PDAL holds a borrowed one until a run succeeds."""
+    """Keep a reference to sys.stdout after a script failed: PDAL holds a borrowed one until a run
+    succeeds.
+    """
     if not any(kept is stdout for kept in _kept):
         _kept.append(stdout)
 
@@ -256,9 +265,11 @@ def stages_of(thing: Any) -> list[dict[str, Any]] | None:
 
 
 def typed(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> list[dict[str, Any]]:
-    """Stages as objects with a type: the name of a file stands for the reader or writer that PDAL infers from it.
+    """Stages as objects with a type: the name of a file stands for the reader or writer that PDAL
+    infers from it.
 
-    A writer is meant by the last of several stages. PipelineError where PDAL infers none; `where` says where a stage stands.
+    A writer is meant by the last of several stages. PipelineError where PDAL infers none; `where`
+    says where a stage stands.
     """
     out = []
     for number, given in enumerate(stages):
@@ -278,7 +289,8 @@ def typed(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> l
                     else "a stage has neither a type nor the name of a file",
                     where=where(number) if where else None,
                     found=name,
-                    cure=f'Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "{kind}s.las"',
+                    cure="Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "
+                    f'"{kind}s.las"',
                 )
         out.append(stage)
     return out
@@ -301,7 +313,9 @@ def validate(stages: list[dict[str, Any]]) -> None:
 
 
 def translate(message: str, before: Sequence[str] = ()) -> PipelineError | DependencyError:
-    """PDAL's error text, and the log lines `before`, as one of our errors, with a cure where the cause is known."""
+    """PDAL's error text, and the log lines `before`, as one of our errors, with a cure where the
+    cause is known.
+    """
     text = message.strip()
     if re.search(r"(create|load|find).*filters\.python", text) or (
         "filters.python" in text and "driver" in text.lower()
@@ -311,7 +325,8 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         return DependencyError(
             "the Python that PDAL runs does not have pdal_stages",
             found=text.splitlines()[-1],
-            cure="Install pdal_stages into the Python that the plugin of filters.python was built for",
+            cure="Install pdal_stages into the Python that the plugin of filters.python was built "
+            "for",
         )
     if "convert spatial reference" in text:
         return PipelineError(BROKEN_REFERENCE, found=_one_line(text, before), cure=REFERENCE_CURE)
@@ -326,7 +341,9 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
 
 
 def _one_line(text: str, before: Sequence[str]) -> str:
-    """What PDAL says, which quotes names of files that may hold line breaks, and log lines before it."""
+    """What PDAL says, which quotes names of files that may hold line breaks, and log lines before
+    it.
+    """
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return "; ".join([*lines, *before])
 
@@ -343,8 +360,9 @@ def _log(pipeline) -> str:
 
 # ---- Ctrl-C while PDAL runs ----------------------------------------------------------------------
 
-# PDAL's plugins crash when KeyboardInterrupt comes up in Python code that PDAL called. So it is raised only inside
-# functions that `catches` marks, which hand it on as an error; otherwise it waits for `check_interrupt`.
+# PDAL's plugins crash when KeyboardInterrupt comes up in Python code that PDAL called. So it is
+# raised only inside functions that `catches` marks, which hand it on as an error; otherwise it
+# waits for `check_interrupt`.
 _Function = TypeVar("_Function", bound=Callable)
 _catching: set[CodeType] = set()
 _handling = False
@@ -400,8 +418,9 @@ def gentle() -> Iterator[None]:
 def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Stages that this PDAL knows: before 2.4 a COPC file is read as plain LAZ.
 
-    Options that old PDAL reads from uninitialized memory are set where the user does not: the file source id of
-    `writers.las` to 0, and the measure dimension of `writers.ogr`, which crashes otherwise, to Z.
+    Options that old PDAL reads from uninitialized memory are set where the user does not: the file
+    source id of `writers.las` to 0, and the measure dimension of `writers.ogr`, which crashes
+    otherwise, to Z.
     """
     if version() >= (2, 4, 0):
         return stages
@@ -433,7 +452,9 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _file_source(writer: dict[str, Any], before: list[dict[str, Any]]) -> int:
-    """The file source id that a writer forwards, 0 where it forwards none: inputs differ, or are of LAS 1.0."""
+    """The file source id that a writer forwards, 0 where it forwards none: inputs differ, or are of
+    LAS 1.0.
+    """
     forward = str(writer.get("forward", ""))
     forwards = any(word in forward for word in ("all", "header", "filesource_id"))
     ids = {source_id(path) for path in readers_files(before, las=True)} if forwards else set()
@@ -480,9 +501,11 @@ def flags_inside_classification(dimensions, metadata: Any) -> bool:
 
 
 def overlap_as_flag(dimensions, metadata: Any) -> bool:
-    """Whether class 12 (overlap) of LAS 1.0-1.3 is read as class 0 with the flag Overlap, as PDAL from 2.6 on does.
+    """Whether class 12 (overlap) of LAS 1.0-1.3 is read as class 0 with the flag Overlap, as PDAL
+    from 2.6 on does.
 
-    Files of LAS 1.4 have both the class and the flag: there class 0 with the flag is a point not yet classified.
+    Files of LAS 1.4 have both the class and the flag: there class 0 with the flag is a point not
+    yet classified.
     """
     return "Overlap" in dimensions and min(_point_formats(metadata), default=6) <= 5
 
@@ -493,7 +516,9 @@ def _point_formats(metadata: Any) -> list[int]:
 
 
 def overwritten_dimensions(metadata: Any) -> list[str]:
-    """Names of dimensions that a reader has overwritten with extra bytes, from metadata as filters.python has it."""
+    """Names of dimensions that a reader has overwritten with extra bytes, from metadata as
+    filters.python has it.
+    """
     nodes = metadata.get("children", []) if isinstance(metadata, dict) else []
     own = {node["name"]: node["value"] for node in nodes if isinstance(node, dict)}
     found = [name for node in nodes for name in overwritten_dimensions(node)]
@@ -506,7 +531,9 @@ def overwritten_dimensions(metadata: Any) -> list[str]:
 
 
 def _values(node: Any, name: str) -> list[Any]:
-    """All values of a name in metadata, as filters.python hands them over (nodes) or a pipeline gives them (a dict)."""
+    """All values of a name in metadata, as filters.python hands them over (nodes) or a pipeline
+    gives them (a dict).
+    """
     if isinstance(node, list):
         return [value for child in node for value in _values(child, name)]
     if not isinstance(node, dict):

@@ -89,7 +89,9 @@ def _help(kind: type[Stage]) -> str:
 
 
 def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.ExpandedStage):
-    """The filters that PDAL runs as one object, which joins others by ``|``; `made_from` is kept as long as they are."""
+    """The filters that PDAL runs as one object, which joins others by ``|``; `made_from` is kept as
+    long as they are.
+    """
     pdal = pdal_env.bindings()
 
     class Step(pdal.Filter):  # type: ignore[name-defined]
@@ -120,7 +122,8 @@ def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.Expande
     return made
 
 
-#: ``Filter.hag_minima(...)``, ``Filter.multiscalefeatures(...)``, ``Filter.modelclassifier(...)``, ...
+#: ``Filter.hag_minima(...)``, ``Filter.multiscalefeatures(...)``, ``Filter.modelclassifier(...)``,
+#: ...
 Filter = _Family("filters")
 #: ``Writer.classifiermodel(filename, ...)``
 Writer = _Family("writers")

@@ -1,4 +1,6 @@
-"""Run a pipeline: read, override, validate, expand, execute, report; outputs whole or not at all."""
+"""Run a pipeline: read, override, validate, expand, execute, report; outputs whole or not at
+all.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,9 @@ class Pipeline:
 
     @property
     def left_alone(self) -> dict[str, int]:
-        """Points that stages of the last run counted (:attr:`Stage.counts`): ``type.name`` -> number above 0."""
+        """Points that stages of the last run counted (:attr:`Stage.counts`): ``type.name`` ->
+        number above 0.
+        """
         return {
             f"{ours.stage.type}.{name}": number
             for ours in self.expanded.ours
@@ -97,7 +101,9 @@ class Pipeline:
 
     @property
     def messages(self) -> list[str]:
-        """Warnings of the pipeline, then warnings and notes of our stages; what several stages report comes once."""
+        """Warnings of the pipeline, then warnings and notes of our stages; what several stages
+        report comes once.
+        """
         places: dict[str, dict[str, None]] = {}
         for place, reports in self.reports:
             for text in [text for report in reports for text in report.messages]:
@@ -114,17 +120,22 @@ class Pipeline:
         return json.dumps({"pipeline": pdal_env.adapted(self.expanded.stages)}, indent=2)
 
     def validate(self) -> str:
-        """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's answer, as JSON."""
+        """Check outputs and let PDAL check its own stages' options, without reading points; PDAL's
+        answer, as JSON.
+        """
         self.check_outputs()
         self.prepare()
         return json.dumps({"valid": True, "error_detail": "", "streamable": False}, indent=2)
 
     def prepare(self) -> None:
-        """Let PDAL check its own stages' options and dimensions, without reading points; outputs are not looked at."""
+        """Let PDAL check its own stages' options and dimensions, without reading points; outputs
+        are not looked at.
+        """
         stages = self.expanded.stages
         try:
             self._check_inputs()
-            # Some of PDAL's writers open their file, and empty it, when they are prepared: theirs are in a folder of ours.
+            # Some of PDAL's writers open their file, and empty it, when they are prepared: theirs
+            # are in a folder of ours.
             with TemporaryDirectory(prefix="pdal-stages-") as folder:
                 names = [
                     os.path.basename(one.path).replace("#", "0") for one in writers_outputs(stages)
@@ -135,7 +146,8 @@ class Pipeline:
             raise self._located(error) from None
 
     def check_outputs(self, *more: Output, read: Iterable[str] = ()) -> None:
-        """Refuse outputs that cannot be written, that are inputs, or that replace files of another kind.
+        """Refuse outputs that cannot be written, that are inputs, or that replace files of another
+        kind.
 
         Parameters
         ----------
@@ -150,7 +162,9 @@ class Pipeline:
         )
 
     def inputs(self) -> list[str]:
-        """Local files that are read: by readers, also through tile indexes, by other stages, and the pipeline itself."""
+        """Local files that are read: by readers, also through tile indexes, by other stages, and
+        the pipeline itself.
+        """
         stages = self.expanded.stages
         indexed: list[str] = []
         for one in stages:
@@ -169,7 +183,9 @@ class Pipeline:
         ]
 
     def __or__(self, other: Any) -> Pipeline:
-        """The pipeline with more stages: objects of python-pdal, ours or PDAL's, or another pipeline's."""
+        """The pipeline with more stages: objects of python-pdal, ours or PDAL's, or another
+        pipeline's.
+        """
         stages = other.source.stages if isinstance(other, Pipeline) else pdal_env.stages_of(other)
         if stages is None:
             return NotImplemented
@@ -236,7 +252,9 @@ class Pipeline:
         return result.count
 
     def _check_inputs(self) -> None:
-        """Open all inputs and check the headers of LAS files: PDAL reads damaged ones as if whole, or crashes."""
+        """Open all inputs and check the headers of LAS files: PDAL reads damaged ones as if whole,
+        or crashes.
+        """
         for path in readers_files(self.expanded.stages):
             try:
                 refuse_pipe(path)
@@ -265,7 +283,9 @@ class Pipeline:
             self.warnings += check_readers(self.expanded.stages, next(filter(None, units), ""))
 
     def _located(self, error: StageError) -> StageError:
-        """PDAL's error, with the line of the stage that it names and the most similar stage name."""
+        """PDAL's error, with the line of the stage that it names and the most similar stage
+        name.
+        """
         if not isinstance(error, PipelineError) or error.where is not None:
             return error
         found = str(error.found or "")

@@ -3,9 +3,10 @@
 The script that PDAL executes is a few lines that call :func:`run_stage`; everything else
 lives here, in the installed package, where compiled code can be cached.
 
-No exception may reach ``filters.python``: it releases the exception, its type and its traceback twice,
-and Python dies of it then or minutes later. A stage that fails therefore returns normally and hands over
-one array under a name no dimension has, its message; PDAL refuses that with an error that holds the name.
+No exception may reach ``filters.python``: it releases the exception, its type and its traceback
+twice, and Python dies of it then or minutes later. A stage that fails therefore returns normally
+and hands over one array under a name no dimension has, its message; PDAL refuses that with an error
+that holds the name.
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ def stage(ins, outs):
 _OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
 
 _usual_stdout: Any = sys.__stdout__
-#: Stages and callbacks of this process by label, as long as someone holds them; in another process options are parsed again.
+#: Stages and callbacks of this process by label, as long as someone holds them; in another process
+#: options are parsed again.
 made: WeakValueDictionary[str, ExpandedStage | Callback] = WeakValueDictionary()
 
 
@@ -96,7 +98,8 @@ def python_filter(
 
 
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Run an expanded stage, or several together, on one point view; True, also where one failed (see above).
+    """Run an expanded stage, or several together, on one point view; True, also where one failed
+    (see above).
 
     Parameters
     ----------
@@ -175,7 +178,9 @@ def points_of(
 def points_of_views(
     arrays: Sequence[np.ndarray], metadata: dict[str, Any], made: Callable[..., Points] = Points
 ) -> Points:
-    """The points of all views that a pipeline gave, with PDAL's metadata of it, as a stage's `points` makes them."""
+    """The points of all views that a pipeline gave, with PDAL's metadata of it, as a stage's
+    `points` makes them.
+    """
     arrays = [array for array in arrays if len(array)] or list(arrays[:1])
     names = arrays[0].dtype.names or () if arrays else ()
     columns = {name: np.concatenate([array[name] for array in arrays]) for name in names}
@@ -186,7 +191,9 @@ def points_of_views(
 
 
 def _made_again(arguments: Mapping[str, Any]) -> tuple[Stage, StageContext]:
-    """Return the stage of an expanded pipeline, in another process than the one that expanded it."""
+    """Return the stage of an expanded pipeline, in another process than the one that expanded
+    it.
+    """
     named = {"type": arguments["stage"], "tag": arguments.get("tag")}
     stage = stage_from({**arguments.get("options", {}), **named})
     created_before = arguments.get("created_before", False)
@@ -222,14 +229,18 @@ def run_on_view(
 
 
 def _refuse_overwritten(metadata: Any) -> None:
-    """Refuse points whose dimensions PDAL has overwritten with extra bytes, which it does unless we run it."""
+    """Refuse points whose dimensions PDAL has overwritten with extra bytes, which it does unless we
+    run it.
+    """
     titles = pdal_env.overwritten_dimensions(metadata)
     if titles:
         raise StageError(
             "extra bytes are named like dimensions of LAS, so PDAL has overwritten these",
             found=", ".join(titles),
-            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under other names; or name "
-            'them all yourself: readers.las with "ignore_vlr": "LASF_Spec/4" and "extra_dims": "Name=type,..."',
+            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under "
+            "other names; or name "
+            'them all yourself: readers.las with "ignore_vlr": "LASF_Spec/4" and "extra_dims": '
+            '"Name=type,..."',
         )
 
 
@@ -332,14 +343,18 @@ class Callbacks:
     def filter(
         self, function: Function, adds: Mapping[str, str] | None = None, **own: Any
     ) -> dict[str, Any]:
-        """A ``filters.python`` that calls a function and adds dimensions (name -> PDAL type); `own`: its tag, inputs."""
+        """A ``filters.python`` that calls a function and adds dimensions (name -> PDAL type);
+        `own`: its tag, inputs.
+        """
         label = f"pdal_stages_callback_{uuid.uuid4().hex}"
         self._held.append(callback := Callback(function))
         made[label] = callback
         return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **own}
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """The stages, with a check before each one that crashes old PDAL where no point is ground."""
+        """The stages, with a check before each one that crashes old PDAL where no point is
+        ground.
+        """
         if pdal_env.version() >= (2, 9, 0):
             return list(stages)
         out: list[dict[str, Any]] = []
@@ -364,6 +379,7 @@ def _check_ground(
         "no ground was found: none of the points has class 2",
         where=where,
         found=f"{len(codes)} points of class {', '.join(map(str, np.unique(codes)[:10].tolist()))}",
-        cure="Classify ground first, with filters.smrf or filters.csf, or use filters.hag_morphological, which needs no "
+        cure="Classify ground first, with filters.smrf or filters.csf, or use "
+        "filters.hag_morphological, which needs no "
         "classes",
     )

@@ -1,4 +1,6 @@
-"""Spatial references of several inputs, which must be the same: PDAL merges meters and feet as they are."""
+"""Spatial references of several inputs, which must be the same: PDAL merges meters and feet as they
+are.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ MOVING = (
     "filters.transformation",
     "filters.georeference",
 )
-#: Differences between references that move coordinates by less than a meter; units are compared separately.
+#: Differences between references that move coordinates by less than a meter; units are compared
+#: separately.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
 _ASIDE = re.compile(r"\+(v?units|v?to_meter|towgs84|geoidgrids|no_defs|type|wktext)")
 #: Part of the message about inputs that have none, next to others.
@@ -45,8 +48,8 @@ class Reference:
 def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str = "") -> Reference:
     """Return the reference of what a reader reads, according to PDAL.
 
-    `horizontal` and `vertical` override the unit of x and y, and of z. The reader should be restricted to as few
-    points as possible.
+    `horizontal` and `vertical` override the unit of x and y, and of z. The reader should be
+    restricted to as few points as possible.
     """
     # Without extra bytes: of a file with odd ones, all of it would be copied for a single point.
     plain = {"ignore_vlr": "LASF_Spec/4"} if reader["type"] == "readers.las" else {}
@@ -79,7 +82,8 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str 
 
 
 def plane_unit(stages: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any]) -> float | None:
-    """Return the unit of x and y, in meters, that a pipeline's readers give its writers; None where that is not known.
+    """Return the unit of x and y, in meters, that a pipeline's readers give its writers; None where
+    that is not known.
 
     `metadata` is PDAL's, of the run.
     """
@@ -102,7 +106,8 @@ def reference_of_file(path: str, horizontal: str = "", vertical: str = "") -> Re
 
 
 def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
-    """Refuse inputs, by path, with different units or reference systems; where one has none, only units are compared.
+    """Refuse inputs, by path, with different units or reference systems; where one has none, only
+    units are compared.
 
     Returns messages: which inputs have no reference, while others have one.
     """
@@ -140,7 +145,9 @@ def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
 
 
 def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:
-    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points; returns messages."""
+    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points;
+    returns messages.
+    """
     if any(stage["type"] in MOVING for stage in stages):
         return []
     readers: dict[str, tuple[str, dict[str, Any]]] = {}

@@ -18,7 +18,9 @@ _NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
 
 
 def readers_files(stages: list[dict[str, Any]], *, las: bool = False) -> list[str]:
-    """Local files that PDAL's readers read, patterns filled in; only LAS and LAZ files with `las`."""
+    """Local files that PDAL's readers read, patterns filled in; only LAS and LAZ files with
+    `las`.
+    """
     return [name for stage in stages for name in reader_files(stage, las=las)]
 
 

@@ -1,4 +1,6 @@
-"""Worker processes on this machine: pools of one process each, so that one can die without the others."""
+"""Worker processes on this machine: pools of one process each, so that one can die without the
+others.
+"""
 
 from __future__ import annotations
 
@@ -106,7 +108,9 @@ class ThisProcess(AbstractContextManager):
 
 
 class WorkerProcesses(AbstractContextManager):
-    """Tasks in processes of their own, one at a time in each; they end with this process, however that ends."""
+    """Tasks in processes of their own, one at a time in each; they end with this process, however
+    that ends.
+    """
 
     def __init__(self, slots: int, threads: int) -> None:
         self.slots, self.threads = slots, threads
@@ -153,7 +157,9 @@ class WorkerProcesses(AbstractContextManager):
 
 
 def _stop_sending(pool: Any) -> None:
-    """Let go of a large task that a dead worker did not read; Python before 3.11.5 would wait for it (gh-94777)."""
+    """Let go of a large task that a dead worker did not read; Python before 3.11.5 would wait for
+    it (gh-94777).
+    """
     if sys.version_info < (3, 11, 5):
         with (
             suppress(OSError),
@@ -178,7 +184,8 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """The environment of a process started meanwhile: its share of the cores, no modules of the current folder, no Ctrl-C.
+    """The environment of a process started meanwhile: its share of the cores, no modules of the
+    current folder, no Ctrl-C.
 
     The program is not imported in it, so a script needs no ``if __name__ == "__main__"``.
     """
@@ -208,9 +215,11 @@ def _environment(threads: int) -> Iterator[None]:
 def run_tasks(
     workers: Any, waiting: deque, task_of: Callable[[Any], Callable[[], Any]]
 ) -> Iterator[tuple[Any, TaskResult]]:
-    """Yield (item, answer) for every waiting item, as they finish; items may be added after every answer.
+    """Yield (item, answer) for every waiting item, as they finish; items may be added after every
+    answer.
 
-    `workers` have slots, submit and wait; `task_of` is called for an item's task just before it is sent.
+    `workers` have slots, submit and wait; `task_of` is called for an item's task just before it is
+    sent.
     """
     out: dict[Any, Any] = {}
     while waiting or out:
@@ -235,8 +244,8 @@ def each_file(
 ) -> Iterator[Any]:
     """The result for each item of work, the function's arguments, as they finish.
 
-    The function must be importable by other processes. They share the cores. A single worker is this process. At the end
-    a StageError names the first files that failed.
+    The function must be importable by other processes. They share the cores. A single worker is
+    this process. At the end a StageError names the first files that failed.
     """
     count = min(checks.whole("--workers", workers, 1, 1024), len(work))
     threads = max(1, available_threads() // count)

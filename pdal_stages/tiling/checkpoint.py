@@ -1,4 +1,6 @@
-"""The working folder of a run beside its outputs: a lock, arrays and records of finished jobs, temporary files."""
+"""The working folder of a run beside its outputs: a lock, arrays and records of finished jobs,
+temporary files.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +71,8 @@ class Store:
         return self
 
     def __exit__(self, kind: type | None, *exc: object) -> None:
-        # After an error of a first run there may be nothing to go on from. Whoever locks the deleted file finds no folder.
+        # After an error of a first run there may be nothing to go on from. Whoever locks the
+        # deleted file finds no folder.
         failed = self._new and kind is not None and issubclass(kind, StageError)
         useless = failed and not any(self.kept.glob("*.npz"))
         shutil.rmtree(self.folder if useless else self.scratch.parent, ignore_errors=True)
@@ -87,13 +90,17 @@ class Store:
         return str(self.kept / f"{name}{ending}")
 
     def finish(self, name: str, mark: str, record: Mapping[str, Any]) -> None:
-        """Save the record of a finished job; `mark` is the fingerprint of everything that affects it."""
+        """Save the record of a finished job; `mark` is the fingerprint of everything that affects
+        it.
+        """
         partial = self.kept / f"{name}.partial"
         partial.write_text(json.dumps({**record, "fingerprint": mark}))
         os.replace(partial, self._note(name))
 
     def forget(self, name: str) -> None:
-        """Remove the record of a job that will be run again, so that it cannot match a newer file."""
+        """Remove the record of a job that will be run again, so that it cannot match a newer
+        file.
+        """
         self._note(name).unlink(missing_ok=True)
 
     def note(self, name: str) -> dict[str, Any]:

@@ -1,4 +1,6 @@
-"""Classify a file or a survey: in one piece where it fits into memory, otherwise in seamless tiles."""
+"""Classify a file or a survey: in one piece where it fits into memory, otherwise in seamless
+tiles.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,9 @@ class ClassifyTask:
 
     @contextmanager
     def folders(self) -> Iterator[None]:
-        """Create the output folder, and the folders in it; those that are still empty at the end are removed."""
+        """Create the output folder, and the folders in it; those that are still empty at the end
+        are removed.
+        """
         made: list[Path] = []
         names = [f"{self.output}/#", *self.outputs] if is_folder(self.output) else []
         try:
@@ -125,9 +129,11 @@ class ClassifyTask:
 
         if odd := [name for name in self.files if not is_las(name) and not is_ept(name)]:
             raise OptionError(
-                "several inputs, and the options of tiles, need LAS, LAZ, COPC or EPT, which can be cut into tiles",
+                "several inputs, and the options of tiles, need LAS, LAZ, COPC or EPT, which can "
+                "be cut into tiles",
                 found=odd[0],
-                cure="Convert them first (pdal translate INPUT input.laz), or classify them one at a time without "
+                cure="Convert them first (pdal translate INPUT input.laz), or classify them one at "
+                "a time without "
                 "tile options",
             )
         target = named = self.output
@@ -137,8 +143,10 @@ class ClassifyTask:
             raise OptionError(
                 "runs in tiles write plain LAS or LAZ",
                 found=target,
-                cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. Tiles are for "
-                "several inputs, clouds too large for the memory, --tile, --per, --resume and --report",
+                cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. "
+                "Tiles are for "
+                "several inputs, clouds too large for the memory, --tile, --per, --resume and "
+                "--report",
             )
         alike = one_format(self.files) if self._per_tile else {}
         writer = {**writer_of(named), "filename": target, **alike}

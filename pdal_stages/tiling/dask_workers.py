@@ -68,7 +68,9 @@ class Cluster(contextlib.AbstractContextManager):
             raise _lost() from None
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """The futures that are done, at least one; StageError where a worker is unsuitable, or the cluster is lost."""
+        """The futures that are done, at least one; StageError where a worker is unsuitable, or the
+        cluster is lost.
+        """
         gone: float | None = None
         while True:
             done = wait(list(futures), timeout=_ASK, return_when=FIRST_COMPLETED).done
@@ -100,8 +102,10 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
     here, theirs = socket.gethostname(), _versions()
     if theirs != wanted:
         return (
-            f"a worker of the scheduler runs other versions than this program (found pdal-stages {theirs[0]} and PDAL "
-            f"{theirs[1]} on {here}, here {wanted[0]} and {wanted[1]}). Install the same on all hosts"
+            "a worker of the scheduler runs other versions than this program (found pdal-stages "
+            f"{theirs[0]} and PDAL "
+            f"{theirs[1]} on {here}, here {wanted[0]} and {wanted[1]}). Install the same on all "
+            "hosts"
         )
     for _ in range(5):  # network file systems may show a new folder late
         if os.path.isdir(folder):
@@ -109,7 +113,8 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
         time.sleep(1)
     else:
         return (
-            f"a worker of the scheduler does not see the output folder (found no {folder} on {here}). Inputs, model and "
+            f"a worker of the scheduler does not see the output folder (found no {folder} on "
+            f"{here}). Inputs, model and "
             "outputs must have the same paths on all hosts"
         )
     answer = perform(pickle.loads(task))

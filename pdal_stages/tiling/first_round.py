@@ -1,11 +1,11 @@
 """Rounds before the tiles: the raster of a far-reaching stage is computed once, in blocks.
 
-Filtered ground depends on points half a kilometer around a tile, but only through a raster of the lowest
-points and of the positions of ground points in each cell. So squares of some tiles are read first, with the
-halo of the earlier stages (noise is marked before heights are computed). The lowest points, possible ground
-points, and changes by earlier stages are saved. Then blocks of the raster are computed from the lowest points
-around them and the points inside. Finally a tile reads the points that the later stages need, applies the
-saved changes, and takes the raster from the blocks.
+Filtered ground depends on points half a kilometer around a tile, but only through a raster of the
+lowest points and of the positions of ground points in each cell. So squares of some tiles are read
+first, with the halo of the earlier stages (noise is marked before heights are computed). The lowest
+points, possible ground points, and changes by earlier stages are saved. Then blocks of the raster
+are computed from the lowest points around them and the points inside. Finally a tile reads the
+points that the later stages need, applies the saved changes, and takes the raster from the blocks.
 
 What a stage saves and computes is its own affair: see :class:`..stages.first_round.FarReaching`.
 """
@@ -57,7 +57,9 @@ def stage_of(plan: TilePlan) -> FarReaching:
 def make_block(
     plan: TilePlan, block: tuple[int, int], squares: Sequence[str], target: str
 ) -> dict[str, Any]:
-    """Save a block of the raster, computed from the files of the squares around it; return a record."""
+    """Save a block of the raster, computed from the files of the squares around it; return a
+    record.
+    """
     assert plan.first is not None
     blocks = plan.first.blocks
     low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(block, blocks.reach)

@@ -1,4 +1,6 @@
-"""The inputs of a tiled run, checked before any tile: whether they can be read, their extent and unit."""
+"""The inputs of a tiled run, checked before any tile: whether they can be read, their extent and
+unit.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ class InputSource:
 
 
 def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
-    """The inputs of readers: names, patterns, EPT addresses, tile indexes; PipelineError where one cannot be cut."""
+    """The inputs of readers: names, patterns, EPT addresses, tile indexes; PipelineError where one
+    cannot be cut.
+    """
     found: dict[str, InputSource] = {}
     for reader in readers:
         given, kind = reader.get("filename", ""), reader["type"]
@@ -74,7 +78,8 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
         if kind == "readers.tindex":
             if ignored := [o for o in _TINDEX_QUERIES if o in reader]:
                 raise PipelineError(
-                    "in tiles, all files of a tile index are read whole and in their own spatial reference",
+                    "in tiles, all files of a tile index are read whole and in their own spatial "
+                    "reference",
                     where=kind,
                     found=", ".join(ignored),
                     cure="Leave these options out, or make an index of the files you mean",
@@ -98,7 +103,9 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
 
 
 def read_extent(source: InputSource) -> Extent:
-    """Number of points and bounding box, from the first bytes; StageError where these cannot be read."""
+    """Number of points and bounding box, from the first bytes; StageError where these cannot be
+    read.
+    """
     if source.kind != "ept":
         return las_extent(source.path)
     described = check_ept(source.path)
@@ -139,7 +146,8 @@ def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
 def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
     """Read the points of an EPT source in a box into a LAS file; whether there are any.
 
-    Scales and offsets are the source's, so coordinates do not change; other dimensions become extra dimensions.
+    Scales and offsets are the source's, so coordinates do not change; other dimensions become extra
+    dimensions.
     """
     form = {**ept_form(read_ept(source.path)), "extra_dims": "all"}
     run = pdal_env.execute(
@@ -179,7 +187,8 @@ class CloudIndex:
     def is_of(self, path: str) -> bool:
         """Return whether the input still holds the bytes that were read.
 
-        It is read again only where its status changed, as it does when a file is copied, linked or edited.
+        It is read again only where its status changed, as it does when a file is copied, linked or
+        edited.
         """
         try:
             return os.stat(path).st_ctime_ns == self.changed_ns or digest_of(path) == self.digest
@@ -197,7 +206,9 @@ class Survey:
     def __init__(
         self, plan: TilePlan, options: TilingOptions, earlier: Mapping[str, Any] | None = None
     ) -> None:
-        """`earlier`: the :attr:`layout` of the run that this one resumes, where the user gives no tile size."""
+        """`earlier`: the :attr:`layout` of the run that this one resumes, where the user gives no
+        tile size.
+        """
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
         self.unreadable: dict[str, str] = {}  #: unreadable inputs by path, and why
@@ -259,12 +270,15 @@ class Survey:
         self.messages += [f"{said}{more}" for said in odd[:1]]
         if lost := len(self.sources) - len(self.extents):
             self.messages.append(
-                f"{lost:,} of the inputs have no readable header: where they lie is not known, and tiles beside them may "
+                f"{lost:,} of the inputs have no readable header: where they lie is not known, and "
+                "tiles beside them may "
                 "lack neighbors. Once they can be read, --resume runs those tiles again"
             )
 
     def _unit(self, plan: TilePlan) -> float:
-        """Meters per unit of the coordinates; inputs that stages see together must have the same reference."""
+        """Meters per unit of the coordinates; inputs that stages see together must have the same
+        reference.
+        """
         needed = bool(plan.head and plan.sees_m)
         of_kind: dict[str, Reference] = {}  # PDAL is asked once for equal references
         found: dict[str, Reference] = {}
@@ -296,7 +310,9 @@ class Survey:
         return next(iter(found.values())).units.horizontal
 
     def _reference_of(self, source: InputSource, horizontal: str) -> Reference:
-        """The reference of an input, according to PDAL's reader, with as few points read as possible."""
+        """The reference of an input, according to PDAL's reader, with as few points read as
+        possible.
+        """
         if source.kind == "las":
             return reference_of({**source.reader, "filename": source.path, "count": 1}, horizontal)
         x, y, _, _ = self.extents[source.path].box
@@ -349,7 +365,9 @@ class Survey:
         return [(s, self.indexes.get(s.path)) for s in sources if s.path not in self.unreadable]
 
     def tiles(self) -> dict[tuple[int, int], int]:
-        """Every tile that may have own points, row by row, and their number where known (else 0)."""
+        """Every tile that may have own points, row by row, and their number where known (else
+        0).
+        """
         counts: dict[tuple[int, int], int] = {}
         for path, header in self.extents.items():
             if path in self.indexes:
@@ -386,7 +404,8 @@ def digest_of(path: str | os.PathLike) -> str:
 
 
 def stamp(path: str | os.PathLike) -> list[Any]:
-    """A fingerprint: size, time of change, and a digest of both ends. Copies and changes of mode keep it.
+    """A fingerprint: size, time of change, and a digest of both ends. Copies and changes of mode
+    keep it.
 
     It also detects a file that was replaced by one with the same size and time.
     """
@@ -402,11 +421,12 @@ def stamp(path: str | os.PathLike) -> list[Any]:
 
 
 def one_format(paths: Sequence[str]) -> dict[str, Any]:
-    """Options of ``writers.las`` that can hold the points of all inputs; none where these are LAS files of one form.
+    """Options of ``writers.las`` that can hold the points of all inputs; none where these are LAS
+    files of one form.
 
-    The finest scale of each axis with its offset, and the first format of LAS 1.4 with all colors of the inputs: PDAL only
-    forwards what all inputs of a tile share, and otherwise uses scales of a centimeter and point format 3. Unreadable
-    inputs are reported later.
+    The finest scale of each axis with its offset, and the first format of LAS 1.4 with all colors
+    of the inputs: PDAL only forwards what all inputs of a tile share, and otherwise uses scales of
+    a centimeter and point format 3. Unreadable inputs are reported later.
     """
     formats: set[int] = set()
     places: set[tuple[float, ...]] = set()
@@ -431,7 +451,8 @@ def one_format(paths: Sequence[str]) -> dict[str, Any]:
         along = {(place[axis], place[3 + axis]) for place in places}
         if len(along) > 1:
             scale, offset = min(along, key=lambda one: (one[0], -abs(one[1])))
-            # Of newer PDAL "auto" is the tile's middle, off the grid of the coordinates: only for what lies too far apart.
+            # Of newer PDAL "auto" is the tile's middle, off the grid of the coordinates: only for
+            # what lies too far apart.
             far = any(abs(one - offset) > 2**30 * scale for _, one in along)
             options |= {f"scale_{name}": scale, f"offset_{name}": "auto" if far else offset}
     return options

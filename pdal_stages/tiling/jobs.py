@@ -18,14 +18,17 @@ if TYPE_CHECKING:
 #: Most distinct warnings of tiles that a run repeats.
 _MOST_MESSAGES = 20
 _CHANGED = (
-    "it changed during the run, so outputs may hold results from before and after. Once it no longer changes, run "
+    "it changed during the run, so outputs may hold results from before and after. Once it no "
+    "longer changes, run "
     "it again with --resume"
 )
 
 
 @dataclass
 class Job:
-    """A task of a run and its state: a tile, an output to be assembled from tiles, or a task of the first round."""
+    """A task of a run and its state: a tile, an output to be assembled from tiles, or a task of the
+    first round.
+    """
 
     name: str  #: its key in the work folder
     points: int = 0  #: its own; 0 where unknown before it is read
@@ -35,9 +38,11 @@ class Job:
     outputs: list[str] | None = None
     jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is assembled from
     mark: str = ""  #: fingerprint of everything that affects its result
-    #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier run) or ``failed``.
+    #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier
+    #: run) or ``failed``.
     state: str = "waiting"
-    #: The result of its task, as saved in the work folder: counts, messages, outputs, cost, fingerprint.
+    #: The result of its task, as saved in the work folder: counts, messages, outputs, cost,
+    #: fingerprint.
     record: dict[str, Any] = field(default_factory=dict)
     reason: str = ""  #: why it failed
     blocked_by: str = ""  #: the unreadable input that is the reason, if any
@@ -81,7 +86,9 @@ class TiledRun:
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """What failed, and why: inputs with the jobs that depend on them, then other tiles and outputs."""
+        """What failed, and why: inputs with the jobs that depend on them, then other tiles and
+        outputs.
+        """
         jobs = [(f"tile {job.name}", job) for job in self.tiles]
         jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
         return [
@@ -105,7 +112,8 @@ class TiledRun:
         if not tiles and not outputs:
             return ""
         return (
-            f" ({count_of(tiles, 'tile')} and {count_of(outputs, 'output')} depend on it and are not made. Remove it from "
+            f" ({count_of(tiles, 'tile')} and {count_of(outputs, 'output')} depend on it and are "
+            "not made. Remove it from "
             "the inputs to make them without it)"
         )
 
@@ -165,9 +173,11 @@ def summarize(tiles: list[Job], cpu_seconds: float, seconds: float) -> dict[str,
 def messages_on_folders(
     outputs: Iterable[str], inputs: Iterable[str], resumed: bool = False
 ) -> list[str]:
-    """Return what the user should know of LAS and LAZ files that are in the folders of outputs before a run.
+    """Return what the user should know of LAS and LAZ files that are in the folders of outputs
+    before a run.
 
-    Outputs that are there will be replaced, unless the run is `resumed` and may keep them; others stay.
+    Outputs that are there will be replaced, unless the run is `resumed` and may keep them; others
+    stay.
     """
     names = {os.path.realpath(name) for name in outputs}
     known = names | {os.path.realpath(name) for name in inputs}
@@ -185,7 +195,8 @@ def messages_on_folders(
         )
     if others := there - known:
         told.append(
-            f"{count_of(len(others), 'LAS or LAZ file')} in the folder of the outputs not written by this run, left as "
+            f"{count_of(len(others), 'LAS or LAZ file')} in the folder of the outputs not written "
+            "by this run, left as "
             f"before: {_some(others)}"
         )
     return told
@@ -215,8 +226,9 @@ def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> 
         told.append(f"and {len(found) - _MOST_MESSAGES} more; see --report")
     if short := [job.name for job in done if job.record.get("short")]:
         told.append(
-            f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods or terrain reach farther "
-            f"than could be read within {most_points:,} points; they may differ from an untiled run: "
-            + ", ".join(short[:5])
+            f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
+            "or terrain reach farther "
+            f"than could be read within {most_points:,} points; they may differ from an untiled "
+            "run: " + ", ".join(short[:5])
         )
     return told

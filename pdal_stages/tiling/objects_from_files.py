@@ -1,4 +1,5 @@
-"""The command ``pdal-stages objects``: from classified files to one vector file, with objects whole across file borders.
+"""The command ``pdal-stages objects``: from classified files to one vector file, with objects whole
+across file borders.
 
 Each file is read once into records of cells; then objects are found in all.
 """
@@ -51,7 +52,9 @@ def refuse_tiles(task: ClassifyTask) -> None:
 def objects_of_files(
     names: Sequence[str], stage: WriteObjects, workers: int = 1, metadata: str | None = None
 ) -> dict[str, Any]:
-    """Find objects in classified files, write and summarize them; returns the files, and counts by kind."""
+    """Find objects in classified files, write and summarize them; returns the files, and counts by
+    kind.
+    """
     inputs = input_files(names)
     more = [Output(metadata, "metadata", JSON)] if metadata else []
     check_outputs([*stage.outputs(), *more], [*inputs, *names, *stage_files(stage)])
@@ -83,7 +86,9 @@ def objects_of_files(
 
 
 def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> WriteObjects:
-    """The stage with the options of the command: ``--writers.objects.NAME=``, or ``--filters.objects.NAME=``."""
+    """The stage with the options of the command: ``--writers.objects.NAME=``, or
+    ``--filters.objects.NAME=``.
+    """
     for one in overrides:
         if one.by_tag or one.selector not in OPTIONS_OF:
             raise OptionError(
@@ -109,7 +114,8 @@ def _find_in_files(
     if thin:
         too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
         print_messages(
-            f"{too_few}, so cells of {cells.size:g} m are used, where roofs look rougher; --cell {size:g} keeps smaller ones"
+            f"{too_few}, so cells of {cells.size:g} m are used, where roofs look rougher; --cell "
+            f"{size:g} keeps smaller ones"
             if widens
             else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
         )

@@ -18,20 +18,23 @@ from .tile_grid import Box, TileGrid, union
 
 #: Ways to cut the output.
 PER = ("auto", "file", "tile")
-#: Largest side of a tile, in units of the coordinates, and buffer: more than the Earth's circumference in feet.
+#: Largest side of a tile, in units of the coordinates, and buffer: more than the Earth's
+#: circumference in feet.
 LARGEST_TILE = 1e9
-#: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output file that is
-#: assembled, and the `memory` option of our stages. See docs/large-areas.md.
+#: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output
+#: file that is assembled, and the `memory` option of our stages. See docs/large-areas.md.
 BASE, TILE_POINT, FILE_POINT, STAGES = 350 << 20, 285, 250, 512 << 20
 #: Memory of a raster cell of a block in the first round.
 _CELL = 200
-#: Larger output files are assembled in parts of this many points, so that memory does not grow with the file.
+#: Larger output files are assembled in parts of this many points, so that memory does not grow with
+#: the file.
 MOST_AT_ONCE = 4_000_000
 #: Memory of the main process.
 PARENT = 350 << 20
 #: Most points of a tile of automatic size: a failed tile is lost, and progress is counted in tiles.
 _MOST_OF_A_TILE = 3_000_000
-#: A square of the first round is as many times wider than its halo: what is read twice is then about a half.
+#: A square of the first round is as many times wider than its halo: what is read twice is then
+#: about a half.
 _HALOS_OF_A_SQUARE = 8
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 8,000,000.
 _SIDES = [
@@ -46,13 +49,16 @@ class TilingOptions:
     #: side of a tile, in the unit of the coordinates; by default as large as the memory allows
     tile: float | None = None
     workers: int | None = None  #: processes, 0 works in this one; default: one for every two cores
-    #: address of a running Dask scheduler, ``tcp://host:8786``, instead of processes on this machine
+    #: address of a running Dask scheduler, ``tcp://host:8786``, instead of processes on this
+    #: machine
     scheduler: str = ""
-    #: ``file``: one output for each input, in its order of points; ``tile``: one for each; ``auto``: file, but for EPT
+    #: ``file``: one output for each input, in its order of points; ``tile``: one for each;
+    #: ``auto``: file, but for EPT
     per: str = "auto"
     #: meters of halo for PDAL filters that look at neighbors, beside what our stages ask for
     buffer: float | None = None
-    #: bytes for all local processes together, with a scheduler for each worker; default: half of the free memory
+    #: bytes for all local processes together, with a scheduler for each worker; default: half of
+    #: the free memory
     memory: int | None = None
     resume: bool = False  #: keep what an earlier run finished
     most_points: int = 5_000_000  #: most points of a tile that is read again with a wider halo
@@ -137,7 +143,8 @@ class Density:
     def grid_around(self) -> TileGrid | None:
         """Return the grid of the smallest tiles of which one holds all inputs, if any does.
 
-        Where the lines of a grid at zero cut the inputs, as coordinates on both sides of zero, the grid is shifted.
+        Where the lines of a grid at zero cut the inputs, as coordinates on both sides of zero, the
+        grid is shifted.
         """
         grids = (TileGrid(side, shift * side) for side in _SIDES for shift in (0.0, -0.5))
         for grid in grids:
@@ -157,7 +164,9 @@ def block_bytes(blocks: Blocks, area_m2: float) -> float:
 
 
 def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:
-    """Memory of a worker, from the points of a tile and of an output file; `block`: see :func:`block_bytes`."""
+    """Memory of a worker, from the points of a tile and of an output file; `block`: see
+    :func:`block_bytes`.
+    """
     of_file = min(largest_file, MOST_AT_ONCE) * FILE_POINT
     return BASE + max(points_read * TILE_POINT + STAGES, of_file, block)
 
@@ -170,7 +179,9 @@ def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool
 def settled(
     options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
 ) -> tuple[TilingOptions, TileGrid]:
-    """Choose tiles and the number of workers so that they fit into memory; OptionError where no tile fits."""
+    """Choose tiles and the number of workers so that they fit into memory; OptionError where no
+    tile fits.
+    """
     whole = options.memory or free_memory() // 2
     local = 0 if options.scheduler else options.local_workers
     fixed = options.workers is not None or local <= 1
@@ -220,7 +231,8 @@ def tiles_per_square(
 ) -> int:
     """Return how many tiles of a `side` make the side of a square of the first round.
 
-    Its halo is wide, so squares are eight times as wide where as many points fit into the memory as a tile may have.
+    Its halo is wide, so squares are eight times as wide where as many points fit into the memory as
+    a tile may have.
     """
     workers = max(1, options.local_workers)
     room = ((options.memory or free_memory() // 2) - PARENT) / workers - BASE - STAGES

@@ -1,4 +1,6 @@
-"""From a pipeline to the plan of each tile: readers, a head that sees neighbors, a tail that writes."""
+"""From a pipeline to the plan of each tile: readers, a head that sees neighbors, a tail that
+writes.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,14 @@ from .tile_grid import Box, TileGrid
 ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
 #: PDAL's filters that process each point by itself.
 _PER_POINT = (
-    "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay projpipeline range "
+    "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay "
+    "projpipeline range "
     "reprojection transformation"
 )
 #: Filters whose result depends on all points at once.
 _GLOBAL = (
-    "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr locate mad mortonorder "
+    "chipper colorinterp cpd divider fps georeference gpstimeconvert groupby head hexbin icp iqr "
+    "locate mad mortonorder "
     "randomize relaxationdartthrowing returns shell sort splitter stats tail teaser"
 )
 
@@ -41,8 +45,8 @@ class FirstRound:
     at: int  #: index of the stage in the head
     halo_m: float  #: halo of the stages before it
     blocks: Blocks
-    #: Dimensions changed by the stages before it, saved for the tiles, which then skip these stages; None where they must
-    #: run again in each tile.
+    #: Dimensions changed by the stages before it, saved for the tiles, which then skip these
+    #: stages; None where they must run again in each tile.
     kept: list[str] | None
 
 
@@ -54,7 +58,8 @@ class TilePlan:
     head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its halo
     #: Of each stage of the head, meters outside the tile within which later stages use its results.
     used_m: list[float]
-    #: Of each, how far around the points that it reads they must lie for stages before it to be right.
+    #: Of each, how far around the points that it reads they must lie for stages before it to be
+    #: right.
     upstream_m: list[float]
     #: Stages that process single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
@@ -68,10 +73,11 @@ class TilePlan:
     #: Created dimensions that LAS files get besides the input's own; None leaves it to the writer.
     extra_dims: dict[str, str] | None = None
     first: FirstRound | None = None  #: the first round, where there is one
-    #: Called with each tile's own results, the outputs and the temporary folder, in place of the tail; returns a record of
-    #: what was written.
+    #: Called with each tile's own results, the outputs and the temporary folder, in place of the
+    #: tail; returns a record of what was written.
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
-    #: Dimensions that our stages create and outputs hold, with PDAL's types; files without points get them, too.
+    #: Dimensions that our stages create and outputs hold, with PDAL's types; files without points
+    #: get them, too.
     makes: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -120,7 +126,9 @@ class _Step:
         return self.ours is not None or self.type.removeprefix("filters.") not in _PER_POINT.split()
 
     def sees_results_of(self, earlier: _Step) -> bool:
-        """Return whether results of an earlier step at neighbors can change a point's; PDAL's do not say."""
+        """Return whether results of an earlier step at neighbors can change a point's; PDAL's do
+        not say.
+        """
         return self.ours is None or earlier.ours is None or self.ours.sees_results_of(earlier.ours)
 
     def reach(self, buffer: float | None) -> float:
@@ -131,7 +139,8 @@ class _Step:
 
 
 def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
-    """Check that a pipeline can be run in tiles, and plan it; `buffer`: how far PDAL's filters look, meters.
+    """Check that a pipeline can be run in tiles, and plan it; `buffer`: how far PDAL's filters
+    look, meters.
 
     PipelineError or OptionError, with the reason and the cure, where tiles cannot give its result.
     """
@@ -204,7 +213,9 @@ def plan_of_files(
 
 
 def _distances(head: list[_Step], reaches: list[float]) -> tuple[list[float], float]:
-    """Return how far outside a tile results of each step are used, and how wide the halo is; meters."""
+    """Return how far outside a tile results of each step are used, and how wide the halo is;
+    meters.
+    """
     used = [0.0] * len(head)
     for n in range(len(head) - 1, -1, -1):
         for m in range(n + 1, len(head)):
@@ -257,7 +268,8 @@ def _check_linear(steps: list[_Step]) -> None:
             names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))
             if names not in (readers, {str(before.given.get("tag"))}):
                 raise PipelineError(
-                    "a pipeline in tiles is linear; this stage takes only some of the points before it",
+                    "a pipeline in tiles is linear; this stage takes only some of the points "
+                    "before it",
                     where=step.where,
                     found=f"inputs {sorted(names)}",
                     cure="Run one pipeline for each branch",
@@ -279,7 +291,8 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
             raise PipelineError(
                 "rasters are not written in tiles: each would lack the points beyond its edge",
                 where=step.where,
-                cure="Write LAS files, and give these to PDAL: pdal pipeline pipelines/terrain-and-surface.json",
+                cure="Write LAS files, and give these to PDAL: pdal pipeline "
+                "pipelines/terrain-and-surface.json",
             )
     for step in readers:
         for name in ("count", "start", "bounds", "polygon", "resolution"):
@@ -309,7 +322,8 @@ def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
         )
     if in_head and step.type in MOVING:
         raise PipelineError(
-            f"{step.type} moves points, but tiles are cut before it, and stages after it see neighbors",
+            f"{step.type} moves points, but tiles are cut before it, and stages after it see "
+            "neighbors",
             where=step.where,
             cure="Reproject the files first, or put it after the last stage of pdal_stages",
         )
@@ -334,7 +348,9 @@ def _for_workers(step: _Step) -> dict[str, Any]:
 def outputs_for(
     plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None
 ) -> list[list[str]]:
-    """For every input, or every tile by name, the output of each writer; StageError where it cannot be written."""
+    """For every input, or every tile by name, the output of each writer; StageError where it cannot
+    be written.
+    """
     found = []
     for writer in plan.writers:
         name = os.path.abspath(writer["filename"])

@@ -1,4 +1,6 @@
-"""A tile: its points with a halo go through the head of the pipeline, and the results of its own points are saved."""
+"""A tile: its points with a halo go through the head of the pipeline, and the results of its own
+points are saved.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,8 @@ class _HeadRun:
     #: Dimensions of the tile's own points alone, to save memory; one for each view.
     views: list[dict[str, NDArray]] = field(default_factory=list)
     expanded: dict[int, ExpandedStage] = field(default_factory=dict)  #: by place in the pipeline
-    #: Place in the pipeline -> how far outside results of a stage are used, and how far around its own input matters.
+    #: Place in the pipeline -> how far outside results of a stage are used, and how far around its
+    #: own input matters.
     distances_m: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def run(self, last: Function | None = None) -> HeadResult:
@@ -148,7 +151,9 @@ def _merges(stage: Mapping[str, Any]) -> bool:
 
 
 def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
-    """Messages of a tile, worded the same for every tile, as a run repeats them once; none about files in `scratch`."""
+    """Messages of a tile, worded the same for every tile, as a run repeats them once; none about
+    files in `scratch`.
+    """
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
         about_piece = text.startswith((scratch, REPLACED)) or NO_REFERENCE in text
@@ -236,7 +241,8 @@ def run_first_round(
             arrays = {name: values[inside] for name, values in ins.items()}
             left.append(stage.reduce_points(points_of(stage, WHOLE_CLOUD, module, arrays)))
 
-    # Class codes that do not fit the writers may still be changed by the stages after these: no tail.
+    # Class codes that do not fit the writers may still be changed by the stages after these: no
+    # tail.
     head = context.plan.head[: first.at]
     before = replace(context.plan, head=head, tail=[], creates=first.kept or [], first=None)
     context = replace(context, plan=before, grid=context.squares)
@@ -304,8 +310,8 @@ def _run_with_halo(
 ) -> tuple[list[PieceResults], dict[str, Any]]:
     """Run the head with a sufficient halo; return results and a record.
 
-    It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and whether that was too
-    ``short``.
+    It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and
+    whether that was too ``short``.
     """
     grid, least_m = context.grid, context.plan.halo_m
     side_m, halo_m, short = grid.size * context.unit, least_m, False

@@ -1,7 +1,8 @@
 """A model for a survey without labels, trained on the points that another model is sure of.
 
-Self-training: on a new survey, a model is nearly always right where it is sure. These points show what roofs, crowns and
-ground look like with this sensor and point density and in this region, and a model trained on them alone is better there.
+Self-training: on a new survey, a model is nearly always right where it is sure. These points show
+what roofs, crowns and ground look like with this sensor and point density and in this region, and a
+model trained on them alone is better there.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from .classify import ClassifyTask
 from .options import TilingOptions
 from .train_survey import TrainTask
 
-#: Least reliability of points to train on. With 0.55 the gain is smaller, as errors are learned, too.
+#: Least reliability of points to train on. With 0.55 the gain is smaller, as errors are learned,
+#: too.
 SURE = 0.7
 #: Samples of each class: enough for one survey, and quick to train.
 COUNT = 6_000
@@ -47,7 +49,8 @@ def adapt(
     Parameters
     ----------
     inputs : sequence of str
-        Files, folders, patterns, tile indexes of one survey; of their classes only noise and overlap matter.
+        Files, folders, patterns, tile indexes of one survey; of their classes only noise and
+        overlap matter.
     model : str
         The file to write.
     teacher : str
@@ -96,7 +99,8 @@ def adapt(
     missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
     if missing:
         told.append(
-            f"'{teacher}' is sure of too few points of a class ({', '.join(missing)}): the new model leaves it out"
+            f"'{teacher}' is sure of too few points of a class ({', '.join(missing)}): the new "
+            "model leaves it out"
         )
     return told
 

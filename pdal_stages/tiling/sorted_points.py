@@ -1,7 +1,9 @@
-"""Points of inputs: read once and sorted by location into an uncompressed copy, from which each tile cuts its points.
+"""Points of inputs: read once and sorted by location into an uncompressed copy, from which each
+tile cuts its points.
 
-A LAZ file can only be read in chunks of 50,000 points, often along a flight line. Tiles read most points several times (for
-the first round, as halo of their neighbors), so they read the copy. It is removed at the end of the run.
+A LAZ file can only be read in chunks of 50,000 points, often along a flight line. Tiles read most
+points several times (for the first round, as halo of their neighbors), so they read the copy. It is
+removed at the end of the run.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ TEMPORARY = "temporary"
 _PART = 1_000_000
 #: The points are sorted by cells; this many make up the side of a tile.
 _CELLS = 4
-#: Points are alone if no other lies in the same square of this side, at least: small tiles are no sign of damage.
+#: Points are alone if no other lies in the same square of this side, at least: small tiles are no
+#: sign of damage.
 _PLACE = 250.0
 
 
@@ -65,7 +68,9 @@ def _copy_type(header: laspy.LasHeader) -> np.dtype:
 
 
 def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
-    """Read a file once, write its points into a sorted copy, and return their index (:class:`CloudIndex`)."""
+    """Read a file once, write its points into a sorted copy, and return their index
+    (:class:`CloudIndex`).
+    """
     header = laspy_header(path)
     dtype, cells = _copy_type(header), grid.scaled(1 / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -118,7 +123,9 @@ def is_intact(index: CloudIndex) -> bool:
 
 
 def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
-    """(m, 3) squares of `side` cells that hold points, in ascending order: column, row, number of points."""
+    """(m, 3) squares of `side` cells that hold points, in ascending order: column, row, number of
+    points.
+    """
     squares, of = np.unique(cells[:, :2] // side, axis=0, return_inverse=True)
     points = np.bincount(of.reshape(-1), cells[:, 3], len(squares))
     return np.column_stack([squares, points.astype(np.int64)])
@@ -127,7 +134,7 @@ def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
 def coordinates(
     records: NDArray, header: laspy.LasHeader
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """x and y of records."""
+    """X and y of records."""
     x, y = (records[name] * header.scales[k] + header.offsets[k] for k, name in enumerate("XY"))
     return x, y
 
@@ -163,7 +170,8 @@ class Piece:
     source: InputSource
     path: str
     index: NDArray[np.int64]  #: (n,) number of each point in its input file
-    #: (n,) distance outside the tile along the farther axis, in the unit of the coordinates; -1 inside
+    #: (n,) distance outside the tile along the farther axis, in the unit of the coordinates; -1
+    #: inside
     away: NDArray[np.float64]
 
     @cached_property

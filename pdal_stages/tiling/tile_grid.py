@@ -20,11 +20,13 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Square tiles of one size; tile (i, j) holds ``i*size <= x - origin < (i+1)*size``, likewise y."""
+    """Square tiles of one size; tile (i, j) holds ``i*size <= x - origin < (i+1)*size``, likewise
+    y.
+    """
 
     size: float  #: side of a tile, in the unit of the coordinates
-    #: A line of the grid, along either axis. Zero, so that tiles are the same in every run, but for a cloud that one tile
-    #: can hold.
+    #: A line of the grid, along either axis. Zero, so that tiles are the same in every run, but for
+    #: a cloud that one tile can hold.
     origin: float = 0.0
 
     def index(self, coordinate: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -59,7 +61,9 @@ class TileGrid:
         return "_".join(f"{n * self.size + self.origin:.10g}" for n in tile)
 
     def covering(self, box: Box) -> list[tuple[int, int]]:
-        """Every tile that a box touches, row by row; StageError for more than :data:`MOST_TILES`."""
+        """Every tile that a box touches, row by row; StageError for more than
+        :data:`MOST_TILES`.
+        """
         x0, y0, x1, y1 = (int(self.index(np.array([v]))[0]) for v in box)
         check_number((x1 - x0 + 1) * (y1 - y0 + 1), f"bounds {box}, tiles of {self.size:g}")
         return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]

@@ -1,4 +1,6 @@
-"""A tiled run: reading the inputs, the first round, tiles, and outputs that are assembled from them."""
+"""A tiled run: reading the inputs, the first round, tiles, and outputs that are assembled from
+them.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ from .write_outputs import write_file
 
 #: A run stops when this many tiles failed for the same reason and none succeeded.
 _HOPELESS = 10
-#: Bytes on disk for a point until its output is written; in the first round, for a point and for a raster cell.
+#: Bytes on disk for a point until its output is written; in the first round, for a point and for a
+#: raster cell.
 _KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 60, 33, 112
 
 
@@ -168,7 +171,9 @@ def _workers(options: TilingOptions, folder: str) -> Any:
 
 
 def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> None:
-    """Let PDAL prepare the pipeline on one input, so that missing dimensions and unknown options fail before any tile."""
+    """Let PDAL prepare the pipeline on one input, so that missing dimensions and unknown options
+    fail before any tile.
+    """
     inputs = [s for s in survey.sources if s.path not in survey.unreadable and s.kind == "las"]
     if not inputs:
         return
@@ -197,13 +202,15 @@ class _Run:
         self.cpu_seconds = 0.0  #: of tasks, including failed ones
         self.peak_mb = 0.0  #: peak memory of a process
         self.messages_before: list[list[str]] = []  #: warnings and notes of the first round
-        #: How far around a tile, in units of the coordinates, inputs are available: its halo may have to grow.
+        #: How far around a tile, in units of the coordinates, inputs are available: its halo may
+        #: have to grow.
         self.farthest = max(4 * survey.halo_units, survey.halo_units + survey.grid.size)
 
     def _do(
         self, what: str, waiting: deque[Job], task_of: Callable[[Job], Callable[[], Any]]
     ) -> Iterator[Job]:
-        """Run jobs as workers become free, save their records, and yield each; outputs may be added after every one.
+        """Run jobs as workers become free, save their records, and yield each; outputs may be added
+        after every one.
 
         StageError where the first ones all fail for the same reason.
         """
@@ -232,7 +239,8 @@ class _Run:
                 yield job
                 if not done and len(failures) >= _HOPELESS and len(set(failures)) == 1:
                     raise StageError(
-                        f"the first {len(failures)} tiles all failed for the same reason, so the run was stopped",
+                        f"the first {len(failures)} tiles all failed for the same reason, so the "
+                        "run was stopped",
                         found=failures[0],
                     )
 
@@ -241,8 +249,8 @@ class _Run:
     def read_inputs(self, needed: Collection[str] | None = None) -> None:
         """Read LAS and LAZ files once, sort their points by location, and save their index.
 
-        Files that an earlier run read are read again where they changed, or where their points are `needed` (paths) and
-        the copy of these is gone or damaged.
+        Files that an earlier run read are read again where they changed, or where their points are
+        `needed` (paths) and the copy of these is gone or damaged.
         """
         survey, store = self.survey, self.store
         waiting: deque[Job] = deque()
@@ -292,7 +300,8 @@ class _Run:
     def find_jobs(self) -> None:
         """Find all tiles and outputs; those with unreadable inputs fail.
 
-        Their marks are fingerprints of everything that affects a result, including every input that may be read for it.
+        Their marks are fingerprints of everything that affects a result, including every input that
+        may be read for it.
         """
         plan, survey, grid = self.plan, self.survey, self.survey.grid
         sees = plan.sees_m / survey.unit
@@ -359,7 +368,9 @@ class _Run:
         return RunContext(plan, *grids, survey.unit, survey.bounds, threads, most, scratch)
 
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
-        """Run all waiting tiles, and outputs as soon as their last tile is done. `finished` is called with outputs."""
+        """Run all waiting tiles, and outputs as soon as their last tile is done. `finished` is
+        called with outputs.
+        """
         survey, store, context = self.survey, self.store, self._context()
         if self.plan.first is not None and len(self.tiles) > 1:
             context = replace(context, rasters=str(store.kept))
@@ -412,7 +423,9 @@ class _Run:
     # ---- the first round, before the tiles ---------------------------------------------------------------------------
 
     def make_ground(self) -> None:
-        """Make what waiting tiles need and an earlier run has not left; jobs that depend on failed ones fail, too."""
+        """Make what waiting tiles need and an earlier run has not left; jobs that depend on failed
+        ones fail, too.
+        """
         first, survey, store = self.plan.first, self.survey, self.store
         if first is None or len(self.tiles) == 1:
             return
@@ -497,7 +510,9 @@ def _make_ready(out: Job, waiting: deque[Job]) -> None:
 
 
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
-    """What a run would do: tiles, points, memory and disk, estimated from the headers of the inputs (``--dry-run``)."""
+    """What a run would do: tiles, points, memory and disk, estimated from the headers of the inputs
+    (``--dry-run``).
+    """
     grid, options, density = survey.grid, survey.options, survey.density
     tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
     if survey.per == "tile":

@@ -1,4 +1,6 @@
-"""Training on a survey: in one piece where it fits into memory, otherwise in tiles, with the same model."""
+"""Training on a survey: in one piece where it fits into memory, otherwise in tiles, with the same
+model.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ from .write_outputs import NewValues, PieceResults, of_own_points, read_with
 
 #: Memory of a point in training in one piece, with voxels and neighborhoods of samples.
 TRAIN_POINT = 400
-#: Arrays of points that a person checked, and of others that the base model is sure of: see :mod:`..stages.checked_points`.
+#: Arrays of points that a person checked, and of others that the base model is sure of: see
+#: :mod:`..stages.checked_points`.
 _WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
@@ -54,7 +57,8 @@ def _training_stage(given: Mapping[str, Any]) -> TrainModel:
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
-    """Name -> files of each survey; `grouped` are ``NAME=PATTERN``, and any other file is a survey by itself.
+    """Name -> files of each survey; `grouped` are ``NAME=PATTERN``, and any other file is a survey
+    by itself.
 
     OptionError where a group is malformed or empty, or a file is in two.
     """
@@ -110,7 +114,9 @@ class TrainTask:
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
-        """The training stage as in a pipeline; several files are scored by file, unless specified otherwise."""
+        """The training stage as in a pipeline; several files are scored by file, unless specified
+        otherwise.
+        """
         files = list(self.files)
         writer = {
             "type": TrainModel.type,
@@ -147,7 +153,8 @@ class TrainTask:
         return _training_stage(self._writer)
 
     def in_one_piece(self) -> bool:
-        """Whether all points fit into the memory, those of each survey by themselves, or cannot be cut into tiles.
+        """Whether all points fit into the memory, those of each survey by themselves, or cannot be
+        cut into tiles.
 
         Not where tiles are asked for.
         """
@@ -183,7 +190,9 @@ class TrainTask:
         return [one for one in said if not any(one.endswith(f": {other}") for other in said)]
 
     def _read(self, heights: Sequence[Mapping[str, Any]], stage: TrainModel) -> Points:
-        """The points with heights, and with file numbers where these are the groups of the score."""
+        """The points with heights, and with file numbers where these are the groups of the
+        score.
+        """
         readers = [reader_of(file, f"input{i}") for i, file in enumerate(self.files, 1)]
         told = check_readers(readers)
         own = [one for one in self.overrides if one.selector != stage.type]
@@ -330,9 +339,11 @@ def take_points(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Save a tile's own points for training, in place of a pipeline's writers (:attr:`TilePlan.takes`).
+    """Save a tile's own points for training, in place of a pipeline's writers
+    (:attr:`TilePlan.takes`).
 
-    `writer` is the stage that trains; `numbers` are those of inputs by path, where points are to have the number of theirs.
+    `writer` is the stage that trains; `numbers` are those of inputs by path, where points are to
+    have the number of theirs.
     """
     stage = _training_stage(writer)
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]

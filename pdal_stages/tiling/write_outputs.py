@@ -1,4 +1,6 @@
-"""Outputs: points are read again, get the results of tiles, and go through the pipeline's tail with its writers."""
+"""Outputs: points are read again, get the results of tiles, and go through the pipeline's tail with
+its writers.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ class NewValues:
 
 
 def of_own_points(result: PieceResults) -> NewValues:
-    """The results as new values for the piece's file, of which only the tile's own points remain."""
+    """The results as new values for the piece's file, of which only the tile's own points
+    remain.
+    """
     kept = np.zeros(len(result.piece.index), bool)
     kept[result.rows] = True
     return NewValues(kept, {name: (result.rows, values) for name, values in result.values.items()})
@@ -76,7 +80,8 @@ def changed_in(
     values: NDArray,
     holds_flags: NDArray[np.bool_] | bool,
 ) -> NDArray:
-    """Return a dimension (n,) with new values in some or all rows; flags that are bits of the class are kept.
+    """Return a dimension (n,) with new values in some or all rows; flags that are bits of the class
+    are kept.
 
     `holds_flags` (n,) tells of which points the class holds flags.
     """
@@ -90,8 +95,9 @@ def changed_in(
 def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
     """Return the results of a tile as arrays to be saved.
 
-    Each input has one record array (n,) under its key: the ``index`` of each point in the input, ascending, and the new
-    values ``dim/NAME``. ``own`` holds the keys with the number of points in the tile, dropped ones included.
+    Each input has one record array (n,) under its key: the ``index`` of each point in the input,
+    ascending, and the new values ``dim/NAME``. ``own`` holds the keys with the number of points in
+    the tile, dropped ones included.
     """
     content: dict[str, NDArray] = {}
     own: list[tuple[str, int]] = []
@@ -112,7 +118,8 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
 def read_results(
     tiles: Iterable[str], source: InputSource, count: int, start: int, end: int
 ) -> NewValues:
-    """The results of points `start` to `end` of a file with `count` points, from the files of its tiles.
+    """The results of points `start` to `end` of a file with `count` points, from the files of its
+    tiles.
 
     StageError where these do not contain each of the file's points once.
     """
@@ -165,11 +172,13 @@ def run_tail(
     scratch: str,
     sources: Sequence[str],
 ) -> dict[str, Any]:
-    """Run readers, their new values, and the tail with its writers; returns a record of what was written.
+    """Run readers, their new values, and the tail with its writers; returns a record of what was
+    written.
 
     The readers read `sources`, or parts of them.
 
-    The `outputs` get their names once all are complete, and only while the run with the temporary folder `scratch` exists.
+    The `outputs` get their names once all are complete, and only while the run with the temporary
+    folder `scratch` exists.
     """
     writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
@@ -202,10 +211,12 @@ def run_tail(
 def read_with(
     callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: Sequence[bool]
 ) -> tuple[list[dict[str, Any]], str]:
-    """Return stages that read points, merge them in the order of the readers, and set new values; and the last one's tag.
+    """Return stages that read points, merge them in the order of the readers, and set new values;
+    and the last one's tag.
 
-    One filter sets the values of all readers: the time PDAL needs grows with the third power of the number of filters
-    that add dimensions. `flags`: of each reader, whether flags must be split from the class (old PDAL); empty for none.
+    One filter sets the values of all readers: the time PDAL needs grows with the third power of the
+    number of filters that add dimensions. `flags`: of each reader, whether flags must be split from
+    the class (old PDAL); empty for none.
     """
     stages: list[dict[str, Any]] = []
     last = []
@@ -247,7 +258,9 @@ def joined(new: Sequence[NewValues]) -> NewValues:
 def _put(
     callbacks: Callbacks, new: NewValues, inputs: list[str], holds_flags: NDArray[np.bool_]
 ) -> Iterator[dict[str, Any]]:
-    """Yield filters that set new values of points, and drop some; PDAL needs two filters for this."""
+    """Yield filters that set new values of points, and drop some; PDAL needs two filters for
+    this.
+    """
 
     def put(module, ins, outs) -> None:
         if len(ins["X"]) != len(new.kept):
@@ -268,7 +281,9 @@ def _put(
 def with_dimensions(
     tail: list[dict[str, Any]], extra_dims: Mapping[str, str] | None, paths: list[str]
 ) -> list[dict[str, Any]]:
-    """A tail whose LAS writers list the extra dimensions to write: the inputs' own, and `extra_dims`."""
+    """A tail whose LAS writers list the extra dimensions to write: the inputs' own, and
+    `extra_dims`.
+    """
     listed = "" if extra_dims is None else las_output.extra_dims_option(paths, extra_dims)
     return [
         {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
@@ -287,7 +302,9 @@ def write_file(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Write the outputs of an input file of `count` points from the results of its tiles; the record, with class counts."""
+    """Write the outputs of an input file of `count` points from the results of its tiles; the
+    record, with class counts.
+    """
     tail = with_dimensions(plan.tail, plan.extra_dims, [source.path])
     writer, names = plan.writers[0], [Path(path).suffix.lower() for path in outputs]
     plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())
@@ -315,7 +332,9 @@ def _in_parts(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Run the tail on each part into an uncompressed file, and join these under the first one's header."""
+    """Run the tail on each part into an uncompressed file, and join these under the first one's
+    header.
+    """
     import laspy
 
     classes: Counter[str] = Counter()

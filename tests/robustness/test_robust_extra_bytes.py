@@ -310,6 +310,10 @@ def pointwise(path):
 
 
 def test_laz_without_chunks(command, tmp_path, write_las, model):
+    if pdal_env.version() >= (2, 4):
+        pytest.skip(
+            "PDAL from 2.4 on decodes LAZ without chunks no longer: 'Unexpected end of file'"
+        )
     plain = write_las(tmp_path / "plain.laz", {**scene(), "Mine": np.arange(600.0)}, point_format=3)
     source = tmp_path / "in.laz"
     source.write_bytes(plain.read_bytes())
