@@ -9,6 +9,7 @@ import itertools
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from ..base.errors import StageError
 from ..base.messages import PlainStream, print_messages
@@ -35,7 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         with contextlib.suppress(AttributeError, ValueError):  # a notebook's stream cannot
             # Characters that the locale lacks are escaped; messages and results keep their order in
             # a file as well.
-            stream.reconfigure(errors="backslashreplace", line_buffering=True)  # type: ignore[union-attr]
+            text: Any = stream
+            text.reconfigure(errors="backslashreplace", line_buffering=True)
     sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
     progress_before = os.environ.get("PDAL_STAGES_PROGRESS")
     try:
@@ -74,9 +76,7 @@ def _tune_process() -> None:
 
 
 def _protect_names(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments without ``--``; after it, names with a leading dash become
-    ``./-name``.
-    """
+    """Return the arguments without ``--``, and names with a dash after it as ``./-name``."""
     before = list(itertools.takewhile(lambda word: word != "--", arguments))
     after = arguments[len(before) + 1 :]
     return before + [f"./{word}" if word.startswith("-") else word for word in after]

@@ -159,7 +159,8 @@ def _classify(options: argparse.Namespace) -> int:
     signals.end_at_ctrl_c(command.is_program)
     if command.is_program and not command.task.request.polygons:
         # laspy imports them for nothing, half of its time.
-        sys.modules.update(dict.fromkeys({"requests", "pyproj"} - sys.modules.keys()))  # type: ignore[arg-type]
+        absent: Any = dict.fromkeys({"requests", "pyproj"} - sys.modules.keys())
+        sys.modules.update(absent)
     written = command.task.run_whole()
     if command.files.metadata:
         write_json(command.files.metadata, written.metadata, indent=2)

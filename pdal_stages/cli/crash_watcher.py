@@ -1,6 +1,4 @@
-"""A small process beside the command that reports when the command dies without a message of its
-own.
-"""
+"""A small process beside the command that reports when the command dies without a message."""
 
 from __future__ import annotations
 

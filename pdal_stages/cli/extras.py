@@ -65,7 +65,10 @@ def add_commands(parser: Parser) -> None:
         metavar="METERS",
         help="Radius checked around changes (1)",
     )
+    _add_demo(parser)
 
+
+def _add_demo(parser: Parser) -> None:
     add = parser.command(
         "demo", _demo, "Make a town, train on one half, classify the other", progress=True
     )

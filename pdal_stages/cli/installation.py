@@ -33,8 +33,8 @@ def add_commands(parser: Parser) -> None:
     add = parser.command(
         "commands", partial(_commands, parser), "List commands with their arguments"
     )
-    told = "As JSON, with stages, models and classes, for programs that build dialogs"
-    add("--showjson", action="store_true", help=told)
+    details = "As JSON, with stages, models and classes, for programs that build dialogs"
+    add("--showjson", action="store_true", help=details)
 
     parser.command("doctor", _doctor, "Check what is installed, and say how to get what is missing")
 
@@ -83,7 +83,7 @@ def _drivers(options: argparse.Namespace) -> None:
 
 
 def _options(options: argparse.Namespace) -> None:
-    """The options of one of our stages or of PDAL's, in PDAL's form."""
+    """Print the options of one of our stages or of PDAL's, in PDAL's form."""
     from ..pipeline.pdal import ask_program
     from ..stages.registry import stage_type, stage_types
 
@@ -93,7 +93,9 @@ def _options(options: argparse.Namespace) -> None:
         with contextlib.suppress(DependencyError, PipelineError):
             answer = ask_program("--options", name, *(["--showjson"] if options.showjson else []))
         if not answer.strip() or "Unable to create" in answer or "not found" in answer:
-            theirs = [one["name"] for one in json.loads(ask_program("--drivers", "--showjson"))]
+            theirs = [
+                driver["name"] for driver in json.loads(ask_program("--drivers", "--showjson"))
+            ]
             raise PipelineError(
                 f"there is no stage '{name}', neither of ours nor of PDAL's",
                 cure=f"{suggest(name, [*stage_types(), *theirs])}List them with: pdal-stages "
@@ -130,8 +132,9 @@ def _commands(parser: Parser, options: argparse.Namespace) -> None:
 
 
 def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
-    """Arguments of commands and stages, models and classes, as JSON, for programs that build
-    dialogs (the QGIS plugin).
+    """Return commands, stages, models and classes as JSON, for programs that build dialogs.
+
+    The plugin for QGIS is one of them.
 
     An argument has ``name``, ``flag`` (empty for one without), ``kind`` (``number``, ``integer``,
     ``boolean``, ``string``), ``help``, ``default``, ``choices``, ``required``, ``many`` (add
@@ -153,9 +156,9 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
             name: {
                 "help": parser.description,
                 "arguments": [
-                    _argument(one)
-                    for one in parser._actions
-                    if one.help != argparse.SUPPRESS and one.dest != "help"
+                    _argument(action)
+                    for action in parser._actions
+                    if action.help != argparse.SUPPRESS and action.dest != "help"
                 ],
             }
             for name, parser in commands.items()
@@ -164,13 +167,13 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
             name: {
                 "help": stage.summary,
                 "options": [
-                    asdict(one)
+                    asdict(option)
                     | {
-                        "default": one.typed_default
-                        if isinstance(one.default, tuple)
-                        else one.default
+                        "default": option.typed_default
+                        if isinstance(option.default, tuple)
+                        else option.default
                     }
-                    for one in stage.all_options()
+                    for option in stage.all_options()
                 ],
             }
             for name, stage in stage_types().items()
@@ -182,14 +185,15 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
 def _argument(action: argparse.Action) -> dict[str, Any]:
     switch = action.nargs == 0
     of_choices = type(next(iter(action.choices))) if action.choices else None
-    kind = "boolean" if switch else _TYPES.get(action.type or of_choices, "string")  # type: ignore[arg-type]
+    value_type: Any = action.type or of_choices
+    kind = "boolean" if switch else _TYPES.get(value_type, "string")
     default = bool(action.default) if switch else action.default
     return {
         "name": action.dest,
         "flag": max(action.option_strings, key=len, default="")
         if not switch
         else action.option_strings[0],
-        "off": next((one for one in action.option_strings if one.startswith("--no-")), ""),
+        "off": next((flag for flag in action.option_strings if flag.startswith("--no-")), ""),
         "kind": kind,
         "help": (action.help or "").replace("%%", "%"),
         "default": default if isinstance(default, bool | int | float | str) else None,
@@ -227,9 +231,7 @@ def _plugin(options: argparse.Namespace) -> int:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    """Run the kernels of the demo, the default heights, training, classification and objects on a
-    few points.
-    """
+    """Run the kernels of the demo, heights, training, classification and objects once."""
     import numpy as np
 
     from ..classifier.training import train

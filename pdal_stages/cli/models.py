@@ -172,10 +172,10 @@ def _compare_objects(options: argparse.Namespace) -> None:
             "--objects compares one vector file with another, and add --area and --json alone",
             found=options.html or ", ".join(options.inputs),
         )
-    found, reference = options.inputs[0], options.objects
+    judged, reference = options.inputs[0], options.objects
     outputs = [Output(options.json, "json", JSON)] if options.json else []
-    check_outputs(outputs, [found, reference, *([options.area] if options.area else [])])
-    figures, warnings = compare_objects(found, reference, options.area)
+    check_outputs(outputs, [judged, reference, *([options.area] if options.area else [])])
+    figures, warnings = compare_objects(judged, reference, options.area)
     print(table(figures), end="")
     print_messages(*warnings)
     if options.json:

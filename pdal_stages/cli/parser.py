@@ -1,6 +1,4 @@
-"""The parser of the command line: commands of one screen of help each, and flags from options that
-stages declare.
-"""
+"""The parser of the command line, and flags from options that stages declare."""
 
 from __future__ import annotations
 
@@ -49,7 +47,8 @@ def parse(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     parser = Parser(
         prog="pdal-stages",
         description="Classify airborne laser scans, alone or in PDAL pipelines.",
-        epilog="Help on a command: pdal-stages COMMAND --help. With --debug errors show tracebacks.",
+        epilog="Help on a command: pdal-stages COMMAND --help. "
+        "With --debug errors show tracebacks.",
     )
     parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
     module_of = {command: module for module, names in COMMANDS.items() for command in names}

@@ -146,9 +146,7 @@ def _expand(options: argparse.Namespace) -> None:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    """Print PDAL's verdict or ours as JSON, on standard output; an error goes to standard error
-    too.
-    """
+    """Print PDAL's verdict or ours as JSON; an error goes to standard error, too."""
     try:
         pipeline = _build(options)
         print(pipeline.validate())

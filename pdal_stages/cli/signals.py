@@ -37,8 +37,9 @@ def run_until_interrupted(start: Callable[[], TiledRun]) -> tuple[TiledRun, bool
 
 
 def end_at_ctrl_c(is_program: bool) -> None:
-    """Let Ctrl-C end the program while PDAL works, when Python cannot handle signals; the next run
-    cleans up.
+    """Let Ctrl-C end the program while PDAL works, when Python cannot handle signals.
+
+    The next run cleans up.
     """
     if is_program and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,6 +1,4 @@
-"""Flags of runs in tiles, which several commands share, and the records that they are parsed
-into.
-"""
+"""Flags of runs in tiles, which several commands share, and the records of them."""
 
 from __future__ import annotations
 
@@ -68,9 +66,7 @@ def add_tile_sizes(
     command: argparse.ArgumentParser,
     what: str = "Points that do not fit in memory are read in tiles, which give the same model.",
 ) -> Callable:
-    """Add the flags of ``train``, whose only output is a model; return the function that adds
-    more.
-    """
+    """Add the flags of ``train``, whose only output is a model; return what adds more."""
     add = command.add_argument_group("large areas", what).add_argument
     side = "Side of the tiles in the cloud's unit (default: auto)"
     add("--tile", type=_tile_side, metavar="SIZE", help=side)
@@ -98,7 +94,7 @@ def tiling_options(options: argparse.Namespace) -> TilingOptions:
 
 
 def requests_tiles(options: argparse.Namespace) -> bool:
-    """Whether ``pipeline`` is to run in tiles; other flags of tiles are refused without it."""
+    """Return whether ``pipeline`` runs in tiles; refuse other flags of tiles without it."""
     if options.tile is None:
         add_tile_options(usual := argparse.ArgumentParser())
         for name, default in vars(usual.parse_args([])).items():

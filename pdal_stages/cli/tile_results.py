@@ -35,8 +35,9 @@ def print_classes(
 
 
 def print_output(job: Job, names: Mapping[int, str]) -> None:
-    """Print an output when it is finished: ``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0
-    %``.
+    """Print an output when it is finished.
+
+    For instance ``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %``.
     """
     assert job.outputs is not None
     classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
@@ -107,8 +108,9 @@ def _print_failures(run: TiledRun) -> None:
 
 
 def end_run(files: RunFiles, run: TiledRun, again: str) -> int:
-    """Write metadata and reports; return the exit code. `again`: how to continue an interrupted
-    run, else empty.
+    """Write metadata and reports; return the exit code.
+
+    `again` says how to continue an interrupted run, else it is empty.
     """
     content = run.to_dict()
     for name in filter(None, [files.metadata, *files.reports]):

@@ -1,6 +1,4 @@
-"""The command ``accuracy``: two class dimensions of files, or files against reference files of the
-same points.
-"""
+"""The command ``accuracy``: class dimensions of files against those of reference files."""
 
 from __future__ import annotations
 
@@ -52,38 +50,31 @@ def compare_files(
     pairs = paired(files, input_files(references)) if references else [(file, "") for file in files]
     listed = {"files": [name for pair in pairs for name in pair if name]}
     wanted: dict[str, Any] = {"type": "filters.accuracy", **listed, **outputs}
-    own = [one for one in overrides if not model or one.selector == AccuracyStage.type]
+    of_accuracy = [each for each in overrides if not model or each.selector == AccuracyStage.type]
     if model:
         wanted["model"] = model
-    (given,) = apply_overrides([wanted], own)
+    (options,) = apply_overrides([wanted], of_accuracy)
     renamed = {"dimension": "Classification", "reference": "Reference"}
-    stage = cast(AccuracyStage, stage_from({**given, **renamed}))
+    stage = cast(AccuracyStage, stage_from({**options, **renamed}))
     read = [*listed["files"], *sources, *references, *stage_files(stage)]
     check_outputs(stage.outputs(), read)
-    others = tuple(one for one in overrides if one not in own)
+    others = tuple(each for each in overrides if each not in of_accuracy)
     parts = []
     kept = {"X", "Y", "Z", "Reliability", "Margin"}
     kept |= {span.dimension for span in stage.ignore.spans} if stage.ignore else set()
     with Progress(len(pairs), "reading" if not model else "classifying", "files") as bar:
         for source, reference in pairs:
             if model:
-                ferry = {"type": "filters.ferry", "dimensions": f"{reference_dimension}=>{_TRUTH}"}
-                mine = _read(source, [ferry, *ClassifyRequest(model, others).stages], others)
-                judged, true = _codes(mine, "Classification", source), _codes(mine, _TRUTH, source)
+                points, judged, true = _classified(source, model, reference_dimension, others)
             else:
-                mine = _read(source)
-                judged, other = _codes(mine, dimension, source), mine
-                if reference:
-                    other = _read(reference)
-                    _refuse_other_points(mine, other, source, reference)
-                true = _codes(other, reference_dimension, reference or source)
-            arrays = {name: values for name, values in mine.arrays.items() if name in kept}
+                points, judged, true = _paired(source, reference, dimension, reference_dimension)
+            arrays = {name: values for name, values in points.arrays.items() if name in kept}
             arrays |= {
-                "Withheld": mine.flag("Withheld"),
+                "Withheld": points.flag("Withheld"),
                 "Classification": judged,
                 "Reference": true,
             }
-            parts.append((Path(source).name, stage.points(arrays, wkt=mine.wkt)))
+            parts.append((Path(source).name, stage.points(arrays, wkt=points.wkt)))
             bar.update(1)
     if not any(points.count for _, points in parts):
         raise StageError("there are no points to compare", found=", ".join(files[:3]))
@@ -100,27 +91,49 @@ def compare_files(
 #: Dimension that keeps the files' own classes while a model assigns new ones.
 _TRUTH = "TrueClass"
 
+#: Points of a file, their judged and their true classes (n,).
+Judged = tuple[Points, NDArray[np.uint8], NDArray[np.uint8]]
+
+
+def _classified(
+    source: str, model: str, reference_dimension: str, overrides: Sequence[Override]
+) -> Judged:
+    """Return the points of a file with the classes of a model and the file's own."""
+    ferry = {"type": "filters.ferry", "dimensions": f"{reference_dimension}=>{_TRUTH}"}
+    points = _read(source, [ferry, *ClassifyRequest(model, tuple(overrides)).stages], overrides)
+    return points, _codes(points, "Classification", source), _codes(points, _TRUTH, source)
+
+
+def _paired(source: str, reference: str, dimension: str, reference_dimension: str) -> Judged:
+    """Return the points of a file with its classes and those of its reference, if it has one."""
+    points = _read(source)
+    judged, other = _codes(points, dimension, source), points
+    if reference:
+        other = _read(reference)
+        _refuse_other_points(points, other, source, reference)
+    return points, judged, _codes(other, reference_dimension, reference or source)
+
 
 def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str, str]]:
-    """Files with their references: of the same name, or the longest name inside theirs (c_town:
-    town).
+    """Return files with their references: of the same name, or the longest one inside theirs.
 
-    Names are looked for in the same folder (`in_folders`) where a name comes twice.
+    ``c_town`` is paired with ``town``. Where a name comes twice, names are looked for in the same
+    folder (`in_folders`).
     """
     if len(sources) == len(references) == 1:
         return [(sources[0], references[0])]
     by_name = dict(zip(_places_and_names(references), references, strict=True))
     pairs: dict[str, str] = {}
     for source, (place, stem) in zip(sources, _places_and_names(sources), strict=True):
-        inside = [one for one in by_name if one[0] == place and one[1] in stem]
+        inside = [key for key in by_name if key[0] == place and key[1] in stem]
         if not inside:
             raise StageError(
                 "a file has no reference with its name",
                 found=source,
                 cure="Name the references like the files they belong to, not "
-                + ", ".join([os.path.join(*one) for one in by_name][:5]),
+                + ", ".join([os.path.join(*key) for key in by_name][:5]),
             )
-        reference = by_name[max(inside, key=lambda one: len(one[1]))]
+        reference = by_name[max(inside, key=lambda key: len(key[1]))]
         if reference in pairs:
             raise StageError(
                 "two files have the same reference",
@@ -131,21 +144,21 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
 
 
 def _places_and_names(files: Sequence[str]) -> list[tuple[str, str]]:
-    """The folders, empty where no name comes twice, and names without suffix."""
+    """Return folders, empty where no name comes twice, and names without suffix."""
     return [os.path.split(name) for name in in_folders(files, [Path(file).stem for file in files])]
 
 
 def _read(
     source: str, stages: Sequence[dict[str, Any]] = (), overrides: Sequence[Override] = ()
 ) -> Points:
-    """All points of a file, after some stages."""
+    """Return all points of a file, after some stages."""
     pipeline = Pipeline([reader_of(source, "input"), *stages], overrides)
     pipeline.execute()
     return points_of_views(pipeline.arrays, pipeline.metadata)
 
 
 def _codes(points: Points, name: str, source: str) -> NDArray[np.uint8]:
-    """A dimension of class codes."""
+    """Return a dimension of class codes."""
     if name not in points.arrays:
         raise DimensionError(
             f"the dimension '{name}' is missing",
@@ -156,21 +169,21 @@ def _codes(points: Points, name: str, source: str) -> NDArray[np.uint8]:
     return points.codes_of(name)
 
 
-def _refuse_other_points(mine: Points, true: Points, source: str, reference: str) -> None:
-    named = [name for name in ("X", "Y", "Z") if name in mine.arrays and name in true.arrays]
-    if mine.count != true.count:
-        found = f"{mine.count:,} points in {source}, {true.count:,} in {reference}"
+def _refuse_other_points(judged: Points, true: Points, source: str, reference: str) -> None:
+    named = [name for name in ("X", "Y", "Z") if name in judged.arrays and name in true.arrays]
+    if judged.count != true.count:
+        difference = f"{judged.count:,} points in {source}, {true.count:,} in {reference}"
     else:
-        apart = [np.count_nonzero(np.abs(mine.arrays[n] - true.arrays[n]) > 0.01) for n in named]
-        found = (
+        apart = [np.count_nonzero(np.abs(judged.arrays[n] - true.arrays[n]) > 0.01) for n in named]
+        difference = (
             f"{max(apart, default=0):,} points of {source} and {reference} lie apart"
             if any(apart)
             else ""
         )
-    if found:
+    if difference:
         raise StageError(
             "the two files do not hold the same points in the same order",
-            found=found,
+            found=difference,
             cure="Compare files of the same points, or keep the labels with filters.ferry while "
             "classifying",
         )
