@@ -307,7 +307,9 @@ def test_two_passes_equal_the_passes_by_hand(base):
     """The base, the point's own probabilities, the first forest on top, context by loops, the second."""
     from test_classifier_context import reference
 
-    model = on_top(base, keep=base.codes.tolist()[:-1], passes=2, voxel=0, n=200, prior_weight=0.5)
+    # Other features than the base's, of the same neighborhoods.
+    few = {"keep": base.codes.tolist()[:-1], "n": 200, "feature_set": "geometric"}
+    model = on_top(base, passes=2, voxel=0, prior_weight=0.5, **few)
     xyz, _, dimensions = scene(seed=7, n=4000)
     first, second = model.passes[-2:]
     values, labeled = computed(first.features, xyz, dimensions), list(first.blend.labeled)

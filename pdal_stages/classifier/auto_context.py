@@ -305,7 +305,7 @@ def _share_sources(
         if features is None:
             out.append(None)
             continue
-        key = json.dumps(features.to_dict())
+        key = json.dumps([features.plan.names, features.to_dict()])
         if key not in sources:
             sources[key] = CloudFeatures(features, request)
         out.append(sources[key])
