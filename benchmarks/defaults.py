@@ -27,7 +27,7 @@ import numpy as np
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier.input_dimensions import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS
-from pdal_stages.classifier.load_model import load_model
+from pdal_stages.classifier.model import load_model
 from pdal_stages.features.registry import SURFACE_FEATURES
 from pdal_stages.terrain import filtered_ground
 

@@ -29,7 +29,7 @@ _WHERE = {
     "find_objects": "objects.detect",
     "filtered_ground": "terrain",
     "hag_minima": "terrain",
-    "load_model": "classifier.load_model",
+    "load_model": "classifier.model",
     "make_town": "synthetic",
     "object_frames": "reports.object_layers",
     "object_layers": "reports.object_layers",
@@ -47,8 +47,7 @@ __all__ = [*_WHERE, "__version__"]
 if TYPE_CHECKING:
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
-    from .classifier.load_model import load_model
-    from .classifier.model import Model
+    from .classifier.model import Model, load_model
     from .classifier.training import train
     from .classifier.training_clouds import TrainingCloud
     from .classifier.training_options import TrainingOptions

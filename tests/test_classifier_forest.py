@@ -8,8 +8,7 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.classifier.grow_forest import Growth, grow_forest
-from pdal_stages.classifier.random_forest import MAX_DEPTH, Forest
+from pdal_stages.classifier.random_forest import MAX_DEPTH, Forest, Growth, grow_forest
 
 
 def data(n=600, features=17, classes=4, seed=0):

@@ -8,7 +8,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
-from pdal_stages.classifier.load_model import load_model
+from pdal_stages.classifier.model import load_model
 from pdal_stages.cli import main
 from pdal_stages.pipeline.expansion import settle_upstream
 from pdal_stages.stages.registry import stage_from

@@ -11,7 +11,7 @@ import pytest
 
 from pdal_stages import Filter, run_tiled
 from pdal_stages.base.errors import DimensionError, OptionError, StageError
-from pdal_stages.classifier.load_model import load_model
+from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.model_file import STANDARD, find, shipped
 from pdal_stages.cli import main
 from pdal_stages.pipeline.run import Pipeline

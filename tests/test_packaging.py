@@ -85,7 +85,7 @@ def test_a_wheel_has_all_that_it_needs(tmp_path):
     zipfile.ZipFile(wheel).extractall(target)
     code = (
         "import pdal_stages, pdal_stages.plugin.install as install\n"
-        "from pdal_stages.classifier.load_model import loaded_model\n"
+        "from pdal_stages.classifier.model import loaded_model\n"
         "print(pdal_stages.__file__, install.SOURCE, len(loaded_model('standard').classes))"
     )
     package, sources, classes = python(code, env={"PYTHONPATH": str(target)}, cwd=tmp_path).split()

@@ -18,7 +18,7 @@ import pytest
 from alsnet_scenes import model_of, random_net
 
 import pdal_stages as ps
-from pdal_stages.classifier.load_model import load_model
+from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.model_file import find
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env

@@ -7,7 +7,7 @@ import pytest
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.grow_forest import Growth, grow_forest
+from pdal_stages.classifier.random_forest import Growth, grow_forest
 from pdal_stages.classifier.recipes import NOT_STATED, RECIPES, describe_recipes, with_recipe
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import limit_to_percentiles

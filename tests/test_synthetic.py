@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from processes import printed
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.load_model import load_model
+from pdal_stages.classifier.model import load_model
 from pdal_stages.stages.registry import stage_type, stage_types
 from pdal_stages.synthetic import Town, make_town, write_town
 from pdal_stages.synthetic.demo import pipelines

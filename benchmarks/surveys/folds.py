@@ -21,12 +21,10 @@ from surveys import SURVEYS
 
 from pdal_stages import Model, TrainingCloud
 from pdal_stages.classifier.context_features import HEIGHT, Context, count_shares
-from pdal_stages.classifier.feature_forest import FeatureForest
-from pdal_stages.classifier.fitted_features import CloudFeatures, Features
-from pdal_stages.classifier.grow_forest import Growth, grow_forest
+from pdal_stages.classifier.feature_forest import CloudFeatures, FeatureForest, Features
 from pdal_stages.classifier.interface import PredictRequest
-from pdal_stages.classifier.load_model import load_model
-from pdal_stages.classifier.random_forest import Forest
+from pdal_stages.classifier.model import load_model
+from pdal_stages.classifier.random_forest import Forest, Growth, grow_forest
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import FOLD_TREES, feature_plan
 from pdal_stages.classifier.training_clouds import label_classes

@@ -18,8 +18,7 @@ from ..base.hashing import hash_rows
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.class_map import ClassMap
-from ..classifier.load_model import load_model
-from ..classifier.model import Model
+from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions

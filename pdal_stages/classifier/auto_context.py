@@ -23,8 +23,7 @@ from ..base.threads import map_blocks
 from ..features import FeaturePlan
 from ..features.engine import FeatureBlock, Run
 from .context_features import HEIGHT, CellContext, Context, count_shares, rows_needed
-from .feature_forest import FeatureForest
-from .fitted_features import CloudFeatures, Features
+from .feature_forest import CloudFeatures, FeatureForest, Features
 from .interface import Block, InputPlan, PredictRequest, weigh
 
 #: Points of a band at most, but for a band of one strip.

@@ -1,4 +1,4 @@
-"""A trained model: what it needs, what it knows, its file, and applying it to a cloud."""
+"""A trained model: what it needs, what it knows, its file, loading it, and applying it to a cloud."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import DimensionError, OptionError
+from ..base.errors import DimensionError, ModelError, OptionError, suggest
 from ..base.report import Report
 from ..features import FeaturePlan
 from ..features.cell_means import density
 from ..features.point_grid import check_xyz
 from ..features.registry import ALGORITHM_VERSION
-from ..features.voxels import Representatives, represent
+from ..features.voxels import Representatives, check_side, represent
 from . import model_description, model_file
 from .auto_context import WeightedPass, classify, plan_of
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
@@ -34,7 +34,7 @@ from .prediction import (
     move_from_ground,
     reject,
 )
-from .registry import preprocessing
+from .registry import classifier_of, preprocessing
 
 #: How many times sparser or denser than those trained on a cloud may be without a warning.
 DENSITY_TOLERANCE = 2.0
@@ -365,3 +365,101 @@ class Model:
             f"{model_description.range_text(trained)}{lonely if few else ''}. Expect lower "
             "accuracy, or train with 'thin'"
         )
+
+
+def load_model(path: str | os.PathLike) -> Model:
+    """Read a model file, or a shipped model by its name. Nothing in it is executed.
+
+    The stages that it wants before it (``info["preparation"]``) are of a short list, with options
+    in bounds.
+
+    Raises
+    ------
+    ModelError
+        The file is missing, damaged, of a newer version, contradicts itself, or asks for what no
+        model may ask for.
+    """
+    name = os.fspath(path)
+    file = model_file.find(name)
+    try:
+        model = assemble(*model_file.read(file, lambda kind: classifier_of(kind).rules))
+        if model.preparation:
+            model.info["preparation"] = preprocessing().check(model.preparation)
+        return model
+    except ModelError as error:
+        others = [shipped for shipped in model_file.shipped() if shipped != name]
+        near = "" if os.path.lexists(name) else suggest(name, others)
+        error.cure = f"{near}{error.cure or model_file.CURE}"
+        raise error.at(file) from error.__cause__
+    except OptionError as error:  # a feature of another release, say
+        raise ModelError(
+            "the model needs what this release does not have", where=file, found=error
+        ) from error
+
+
+def loaded_model(path: str) -> Model:
+    """Return a model that this process has loaded before, or load it; also a changed file."""
+    path = model_file.find(path)
+    try:
+        stat = os.stat(path)
+    except (OSError, ValueError):  # the latter for a name that holds a null
+        return load_model(path)  # raises
+    return _loaded(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4)
+def _loaded(path: str, *stamp: int) -> Model:
+    return load_model(path)
+
+
+def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
+    """Return the model of a manifest and arrays; ModelError where they contradict each other."""
+    classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
+    codes = [code for code, _ in classes]
+    if sorted(set(codes)) != codes:
+        raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
+    check_side(manifest.get("voxel") or 0.0)
+    priors = manifest.get("priors")
+    if priors is not None and len(priors["factors"]) != len(classes):
+        raise ModelError(
+            "the manifest's priors must have one factor per class", found=len(priors["factors"])
+        )
+    passes, before = [], codes
+    for number, entry in enumerate(manifest["passes"]):
+        own_codes = entry.get("codes") or codes
+        passes.append(_make_pass(entry, number, arrays[number], own_codes, before))
+        before = own_codes
+    if before != codes:
+        raise ModelError("the last pass has other classes than the model", found=before[:10])
+    info = {k: value for k, value in manifest.items() if k not in ("format", "version", "arrays")}
+    scores = ("importances", "codes", "factors")
+    info["passes"] = [
+        {key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]
+    ]
+    return Model(tuple(passes), classes, info)
+
+
+def _make_pass(
+    entry: Mapping[str, Any],
+    number: int,
+    arrays: Mapping[str, npt.NDArray[Any]],
+    codes: list[int],
+    codes_before: list[int],
+) -> Any:
+    """Return the classifier of a pass, the `number`-th from 0, whose classes are `codes`."""
+    here = f"pass {number + 1}"
+    if sorted(set(codes)) != codes or len(entry.get("factors") or codes) != len(codes):
+        raise ModelError(
+            "a pass's classes must ascend, each once, with one factor each", found=codes[:10]
+        )
+    if (number > 0) != bool(entry["context"]):
+        raise ModelError("every pass but the first must read context", found=here)
+    classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, arrays, codes)
+    if number and classifier.classes_before(codes) != codes_before:
+        raise ModelError("a pass reads other classes than the one before gives", found=here)
+    importances = entry["importances"]
+    if importances is not None and len(importances) != len(entry["feature_names"]):
+        raise ModelError(
+            "the manifest's importances must have one value per feature", found=len(importances)
+        )
+    return classifier

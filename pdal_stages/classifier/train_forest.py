@@ -22,13 +22,11 @@ from ..features.return_features import SOURCES
 from .auto_context import FoldForests, WeightedPass, sample_context
 from .calibration import Calibration
 from .context_features import OWN, Context
-from .feature_forest import FeatureForest
-from .fitted_features import CloudFeatures, Features
-from .grow_forest import Growth, grow_forest
+from .feature_forest import CloudFeatures, FeatureForest, Features
 from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
 from .interface import PredictRequest, weigh
 from .model import Model
-from .random_forest import Forest
+from .random_forest import Forest, Growth, grow_forest
 from .refinement import Blend, describe_refinement, trust
 from .sampling import BLOCK, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes

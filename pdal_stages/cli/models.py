@@ -91,7 +91,7 @@ def add_commands(parser: Parser) -> None:
 
 def _models(options: argparse.Namespace) -> None:
     from ..base.asprs import class_name
-    from ..classifier.load_model import load_model
+    from ..classifier.model import load_model
     from ..classifier.model_file import shipped
 
     for name, path in shipped().items():
@@ -101,7 +101,7 @@ def _models(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from ..classifier.load_model import load_model
+    from ..classifier.model import load_model
     from ..pipeline.inputs_outputs import input_files
     from ..tiling.train_survey import TrainTask, surveys_of
 
@@ -127,7 +127,7 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _adapt(options: argparse.Namespace) -> None:
-    from ..classifier.load_model import load_model
+    from ..classifier.model import load_model
     from ..tiling.self_training import adapt
 
     how = tiling_options(options)
@@ -185,7 +185,7 @@ def _compare_objects(options: argparse.Namespace) -> None:
 def _model(options: argparse.Namespace) -> None:
     from ..base.errors import OptionError
     from ..classifier.calibration import read_calibration
-    from ..classifier.load_model import load_model
+    from ..classifier.model import load_model
     from ..classifier.model_file import find
 
     model = load_model(options.file)

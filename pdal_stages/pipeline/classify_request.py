@@ -11,7 +11,7 @@ from typing import Any
 from ..base.asprs import GROUND, OVERLAP
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.extra_bytes import extra_dimensions
-from ..classifier.load_model import loaded_model
+from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..stages import preprocessing
 from ..stages.points import SELECTED

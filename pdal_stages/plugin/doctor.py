@@ -16,7 +16,7 @@ from ..base.jit import count_cached_kernels
 from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..base.version import __version__
-from ..classifier.load_model import loaded_model
+from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..pipeline import pdal as pdal_env
 from ..pipeline import runtime

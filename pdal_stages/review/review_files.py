@@ -17,7 +17,7 @@ from ..base.errors import StageError
 from ..base.las import read_header
 from ..base.messages import print_messages
 from ..base.version import __version__
-from ..classifier.load_model import loaded_model
+from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.las_chunks import can_read_chunks, read_columns

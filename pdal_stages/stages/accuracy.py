@@ -21,7 +21,7 @@ from ..base.files import HTML, JSON, Output, whole_files
 from ..base.messages import plain
 from ..base.report import Report
 from ..base.units import name_of_wkt
-from ..classifier.load_model import loaded_model
+from ..classifier.model import loaded_model
 from .apply_model import ApplyModel
 from .base import Stage, files_read
 from .context import StageContext

@@ -15,8 +15,7 @@ from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
-from ..classifier.load_model import loaded_model
-from ..classifier.model import Model
+from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
 from .base import Stage

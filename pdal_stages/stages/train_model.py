@@ -24,8 +24,7 @@ from ..classifier.input_dimensions import (
     required_dimensions,
     take_dimensions,
 )
-from ..classifier.load_model import loaded_model
-from ..classifier.model import Model
+from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import digest_of, find
 from ..classifier.recipes import RECIPES, describe_recipes, with_recipe
 from ..classifier.registry import kinds, trainer_of

@@ -17,7 +17,7 @@ import numpy as np
 from ..base import checks, las
 from ..base.errors import StageError
 from ..base.files import MODEL, Output, check_outputs, work_folder
-from ..classifier.load_model import load_model
+from ..classifier.model import load_model
 from ..classifier.model_file import digest_of, find
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las

@@ -29,7 +29,7 @@ from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.extra_bytes import extra_dimensions
 from pdal_stages.classifier import model_file
-from pdal_stages.classifier.load_model import assemble
+from pdal_stages.classifier.model import assemble
 from pdal_stages.classifier.registry import classifier_of
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
