@@ -166,6 +166,28 @@ def test_a_dry_run_writes_nothing_and_finds_what_is_wrong(survey, classify, tmp_
     assert not list(tmp_path.iterdir())
 
 
+def test_a_report_needs_no_tiles(survey, classify, whole, tmp_path):
+    names = [str(tmp_path / name) for name in ("r.json", "r.html", "m.json")]
+    words = ("--report", names[0], "--report", names[1], "--metadata", names[2])
+    town, target = survey / "town.laz", tmp_path / "out.laz"
+    code, out, err = classify(town, target, *words, "--dry-run")
+    dry = json.loads((tmp_path / "r.json").read_text())
+    assert code == 0 and "in one piece" in out and not target.exists(), err
+    assert dry["points"] == len(laspy.read(town)) and dry["states"] == {"waiting": 0}
+    code, out, err = classify(town, target, *words)
+    assert code == 0 and target.read_bytes() == whole.read_bytes(), err
+    report = json.loads((tmp_path / "r.json").read_text())
+    counted = np.bincount(laspy.read(whole).classification)
+    assert report["classes"] == {str(code): int(counted[code]) for code in np.flatnonzero(counted)}
+    assert report["tiles"] == [] and report["outputs"][0]["output"] == [str(target)]
+    assert report["points"] == report["outputs"][0]["written"] == counted.sum()
+    page = (tmp_path / "r.html").read_text()
+    assert "in one piece" in page and f"{counted.sum():,}" in page and "Tiles" not in page
+    assert "filters.modelclassifier" in json.loads((tmp_path / "m.json").read_text())["metadata"]
+    for extra in ("--report", "--metadata"):
+        assert classify(town, target, extra, town)[0] == 1
+
+
 def test_one_output_for_each_tile(survey, classify, whole, tmp_path):
     code, _, err = classify(survey / "in", tmp_path / "out/", "--tile", 45, "--per", "tile")
     assert code == 0, err

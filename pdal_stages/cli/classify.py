@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ..base.errors import StageError
-from ..base.files import Output, write_json
+from ..base.files import Output
 from ..base.messages import count_of, one_line, print_messages
 from . import signals
 from .parser import INPUTS, Parser, add_stage_options, stage_options
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..pipeline.classify_request import ClassifyRequest
     from ..stages.write_objects import WriteObjects
     from ..tiling.classify import ClassifyTask
+    from ..tiling.jobs import TiledRun
 
 #: Options of ``filters.modelclassifier`` that ``classify`` has flags for.
 _CLASSIFIER_OPTIONS = ("vegetation_heights", "keep_sure")
@@ -152,24 +153,32 @@ def _classify(options: argparse.Namespace) -> int:
     names = {code: one_line(name) for code, name in command.task.request.loaded.classes}
     if not command.task.in_one_piece:
         return _classify_tiles(command, names)
-    if command.dry_run:
-        command.task.request.pipeline(command.task.files[0], command.task.outputs[0])
-        print("1 input, in one piece")
-        return 0
     signals.end_at_ctrl_c(command.is_program)
     if command.is_program and not command.task.request.polygons:
         # laspy imports them for nothing, half of its time.
         absent: Any = dict.fromkeys({"requests", "pyproj"} - sys.modules.keys())
         sys.modules.update(absent)
-    written = command.task.run_whole()
-    if command.files.metadata:
-        write_json(command.files.metadata, written.metadata, indent=2)
-    print_messages(*written.messages)
-    print(f"{count_of(written.points, 'point')} written to {written.path}")
-    print_classes(written.classes, written.left_alone, names)
-    if command.objects is not None:
-        command.write_objects()
-    return 0
+    run = command.task.run_whole(dry_run=command.dry_run)
+    if command.dry_run:
+        print("1 input, in one piece")
+    else:
+        print_messages(*run.messages)
+        points = count_of(run.summary["points"], "point")
+        print(f"{points} written to {command.task.outputs[0]}")
+        print_classes(run.summary["classes"], run.summary["left_alone"], names)
+        _add_objects(command, run)
+    return end_run(command.files, run, "")
+
+
+def _add_objects(command: ClassifyCommand, run: TiledRun) -> None:
+    """Write the objects that the command asks for; what is known of the run, if that fails."""
+    if command.objects is None:
+        return
+    try:
+        run.objects = command.write_objects()
+    except StageError:
+        end_run(command.files, run, "")
+        raise
 
 
 def _classify_tiles(command: ClassifyCommand, names: dict[int, str]) -> int:
@@ -183,10 +192,6 @@ def _classify_tiles(command: ClassifyCommand, names: dict[int, str]) -> int:
     else:
         print_run(run)
         print_classes(run.summary["classes"], run.summary["left_alone"], names)
-        if command.objects is not None and not interrupted and not run.failures:
-            try:
-                run.objects = command.write_objects()
-            except StageError:
-                end_run(command.files, run, "")
-                raise
+        if not interrupted and not run.failures:
+            _add_objects(command, run)
     return end_run(command.files, run, command.again if interrupted else "")

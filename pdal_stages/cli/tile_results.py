@@ -113,8 +113,10 @@ def end_run(files: RunFiles, run: TiledRun, again: str) -> int:
     `again` says how to continue an interrupted run, else it is empty.
     """
     content = run.to_dict()
-    for name in filter(None, [files.metadata, *files.reports]):
-        if name in files.reports and Path(name).suffix.lower() != ".json":
+    if files.metadata:
+        write_json(files.metadata, content if run.metadata is None else run.metadata, "metadata")
+    for name in files.reports:
+        if Path(name).suffix.lower() != ".json":
             from ..reports.run_page import run_page
 
             write_whole(name, run_page(content).encode(), "report")

@@ -1,4 +1,4 @@
-"""Web page about a tiled run, made from its JSON report."""
+"""Web page about a run, made from its JSON report."""
 
 from __future__ import annotations
 
@@ -32,16 +32,19 @@ _TITLES = {
 
 
 def run_page(run: Mapping[str, Any]) -> str:
-    """Return the page about a tiled run; `run` is the result of ``TiledRun.to_dict``."""
+    """Return the page about a run, in tiles or in one piece: ``TiledRun.to_dict``."""
     done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
     objects = dict(run.get("objects") or {})
     objects.pop("files", None)
+    tiles = "in one piece"
+    if "tile" in run:
+        tiles = f"{count_of(len(run['tiles']), 'tile')} of {run['tile']:g}"
     pipeline = f"{Path(run['pipeline']).name}, " if run.get("pipeline") else ""
     return render(
         "run.html",
-        title="Run in tiles",
-        subtitle=f"{pipeline}{count_of(len(run['tiles']), 'tile')} of {run['tile']:g}",
+        title="Run in tiles" if "tile" in run else "Run",
+        subtitle=pipeline + tiles,
         run=run,
         figures=_figures(run),
         what=_settings(run),
@@ -66,10 +69,13 @@ def _figures(run: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         details.append(f"{run['dropped']:,} dropped by filters")
     points = run.get("points", 0)
     size, unit = (f"{points:,}", "") if points < 10_000_000 else (f"{points / 1e6:,.1f}", "million")
-    out = [("Tiles", tiles, "", rest), ("Points", size, unit, "; ".join(details))]
+    out = [("Tiles", tiles, "", rest)] if "tile" in run else []
+    out.append(("Points", size, unit, "; ".join(details)))
     if "seconds" in run:
-        out.append(("Time", duration(run["seconds"]), "", count_of(run["workers"], "worker")))
+        workers = count_of(run["workers"], "worker") if "workers" in run else ""
+        out.append(("Time", duration(run["seconds"]), "", workers))
         out.append(("Speed", f"{run['points_per_second']:,.0f}", "points/s", ""))
+    if "peak_mb_of_a_worker" in run:
         out.append(("Most memory of a worker", f"{run['peak_mb_of_a_worker']:,.0f}", "MB", ""))
     return out
 

@@ -5,12 +5,12 @@ tiles.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from ..base import las
 from ..base.errors import OptionError, StageError
@@ -18,20 +18,9 @@ from ..base.files import Output, check_outputs
 from ..base.las_check import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
+from .inputs import InputSource, one_format
 from .jobs import Job, TiledRun, messages_on_folders
 from .options import TilingOptions, fits_whole
-
-
-@dataclass
-class Written:
-    """The output of a run in one piece."""
-
-    path: str
-    points: int
-    classes: dict[str, int]  #: number of points by code
-    left_alone: dict[str, int]  #: of points that got no class, by reason
-    messages: list[str]
-    metadata: dict[str, Any]  #: PDAL's, of the run
 
 
 @dataclass(frozen=True)
@@ -51,12 +40,10 @@ class ClassifyTask:
 
     @cached_property
     def in_one_piece(self) -> bool:
-        """Whether there is one input that fits into memory, and no option asks for tiles."""
+        """Return whether one input fits into memory, and no option asks for tiles."""
         options = self.options
-        asked = (
-            options.tile is not None or options.per != "auto" or options.scheduler or options.resume
-        )
-        if len(self.files) > 1 or asked or any(one.what == "report" for one in self.extra_files):
+        tiles = options.tile is not None or options.per != "auto"
+        if len(self.files) > 1 or tiles or options.scheduler or options.resume:
             return False
         if not is_las(self.files[0]):
             return not is_ept(self.files[0])
@@ -99,31 +86,57 @@ class ClassifyTask:
                 with suppress(OSError):
                     folder.rmdir()
 
-    def run_whole(self) -> Written:
-        """Classify the only input in one piece."""
+    def run_whole(self, *, dry_run: bool = False) -> TiledRun:
+        """Classify the only input in one piece; a run without tiles, with PDAL's metadata."""
         (source,), (target,) = self.files, self.outputs
-        named = is_folder(self.output)
-        before = messages_on_folders([target], [source]) if named else []
+        header = las.header_there(source) if is_las(source) else None
+        summary = {
+            "pipeline": self.request.model,
+            "models": [self.request.model],
+            "started": time.strftime("%Y-%m-%d %H:%M"),
+            "per": "file",
+            "inputs": 1,
+            "bounds": list(header.box) if header and header.count else None,
+        }
+        output = Job(source, source=InputSource(source, {}, "las"), outputs=[target])
+        if dry_run:
+            self.request.pipeline(source, target)
+            check_outputs(self.extra_files, self.inputs)
+            summary |= {"points": header.count if header else 0, "states": {"waiting": 0}}
+            return TiledRun([], [output], {}, [], [], summary)
+        seconds, cpu_seconds = time.perf_counter(), time.process_time()
+        messages = messages_on_folders([target], [source]) if is_folder(self.output) else []
         with self.folders():
             pipeline = self.request.pipeline(source, target)
             pipeline.check_outputs(*self.extra_files, read=self.inputs)
             count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
+        messages = [
+            *(f"PDAL says: {line}" for line in pipeline.log_lines),
+            *messages,
+            *pipeline.messages,
+        ]
+        if header is not None and is_las(target) and (written := las.read_header(target)):
+            messages += filter(None, [beyond_box(source, written.box)])
         reports = [each[-1] for _, each in pipeline.reports if each]
-        codes = [report.codes for report in reports if report.codes is not None]
-        messages = [f"PDAL says: {line}" for line in pipeline.log_lines]
-        messages += [*before, *pipeline.messages]
-        if all(is_las(name) and Path(name).is_file() for name in (source, target)):
-            written = las.read_header(target)
-            odd = beyond_box(source, written.box) if written else None
-            messages += [odd] if odd else []
-        classes = codes[-1] if codes else {}
-        return Written(target, count, classes, pipeline.left_alone, messages, pipeline.metadata)
+        classes = [report.codes for report in reports if report.codes is not None][-1:]
+        output.state = "done"
+        output.record = {"written": count, "classes": classes[0] if classes else {}}
+        seconds = time.perf_counter() - seconds
+        summary |= {
+            "points": count,
+            "seconds": seconds,
+            "points_per_second": count / seconds if seconds else 0.0,
+            "cpu_seconds": time.process_time() - cpu_seconds,
+            "states": {},
+            "classes": output.record["classes"],
+            "left_alone": pipeline.left_alone,
+        }
+        return TiledRun([], [output], {}, [], messages, summary, metadata=pipeline.metadata)
 
     def run_tiles(
         self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None
     ) -> TiledRun:
         """Classify all inputs in tiles; `finished` is called with every output that was written."""
-        from .inputs import one_format
         from .plan import plan_of_files
         from .tiled_run import run_plan
 
@@ -145,8 +158,7 @@ class ClassifyTask:
                 found=target,
                 cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. "
                 "Tiles are for "
-                "several inputs, clouds too large for the memory, --tile, --per, --resume and "
-                "--report",
+                "several inputs, clouds too large for the memory, --tile, --per and --resume",
             )
         alike = one_format(self.files) if self._per_tile else {}
         writer = {**writer_of(named), "filename": target, **alike}

@@ -80,9 +80,10 @@ class TiledRun:
     changed: list[str]  #: files that changed during the run
     messages: list[str]  #: what the user should know
     summary: dict[str, Any]  #: figures for people; see :meth:`to_dict`
-    objects: dict[str, Any] | None = (
-        None  #: objects of the outputs: their files, and counts by kind
-    )
+    #: objects of the outputs: their files, and counts by kind
+    objects: dict[str, Any] | None = None
+    #: PDAL's, of a run in one piece, which has no tiles
+    metadata: dict[str, Any] | None = None
 
     @property
     def failures(self) -> list[tuple[str, str]]:

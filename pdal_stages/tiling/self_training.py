@@ -108,7 +108,7 @@ def adapt(
 def _classified(task: ClassifyTask) -> list[str]:
     """The files that a task classifies."""
     if task.in_one_piece:
-        return [task.run_whole().path]
+        return list(task.run_whole().outputs[0].outputs or ())
     run = task.run_tiles()
     if run.failures:
         raise StageError(
