@@ -7,7 +7,7 @@ import laspy
 import numpy as np
 import pytest
 
-from pdal_stages.stages.context import WHOLE_CLOUD
+from pdal_stages.stages.base import WHOLE_CLOUD
 from pdal_stages.stages.registry import stage_type, stage_types
 
 DATA = Path(__file__).parent / "data"

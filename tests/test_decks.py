@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.cli import main
+from pdal_stages.stages.base import WHOLE_CLOUD
 from pdal_stages.stages.bridges import Bridges
-from pdal_stages.stages.context import WHOLE_CLOUD
 from pdal_stages.structures.decks import DeckRules, find_decks
 from pdal_stages.terrain import filtered_ground
 

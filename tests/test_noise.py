@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
-from pdal_stages.stages.context import WHOLE_CLOUD
+from pdal_stages.stages.base import WHOLE_CLOUD
 from pdal_stages.stages.detached_noise import DetachedNoise
 from pdal_stages.terrain import low_outliers, noise
 from pdal_stages.terrain.noise import detached_noise

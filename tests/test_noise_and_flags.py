@@ -16,7 +16,7 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.stages.hag_minima import HagMinima
-from pdal_stages.stages.selection import Selection
+from pdal_stages.stages.options import Selection
 
 pytestmark = pytest.mark.pdal
 FLAGS = ("Synthetic", "KeyPoint", "Withheld")

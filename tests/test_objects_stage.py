@@ -9,7 +9,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.stages.context import WHOLE_CLOUD, StageContext
+from pdal_stages.stages.base import WHOLE_CLOUD, StageContext
 from pdal_stages.stages.registry import stage_type
 from pdal_stages.synthetic import write_town
 

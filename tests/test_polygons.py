@@ -14,7 +14,7 @@ import pdal_stages as ps
 from pdal_stages.base import polygons as overlays
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.polygons import Overlay, points_inside
-from pdal_stages.stages.context import WHOLE_CLOUD
+from pdal_stages.stages.base import WHOLE_CLOUD
 from pdal_stages.stages.polygons import Polygons
 
 pyogrio, shapely, pyproj = (pytest.importorskip(name) for name in ("pyogrio", "shapely", "pyproj"))

@@ -15,7 +15,7 @@ from pdal_stages import TilingOptions
 from pdal_stages.base.errors import OptionError
 from pdal_stages.base.memory import free_memory, parse_size
 from pdal_stages.cli import main
-from pdal_stages.stages.first_round import Blocks
+from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.town import WKT
 from pdal_stages.tiling.options import PARENT, Density, Extent, block_bytes, settled, worker_bytes
 

@@ -10,7 +10,7 @@ import pytest
 from corridor_scenes import CORRIDORS
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from pdal_stages.stages.context import WHOLE_CLOUD
+from pdal_stages.stages.base import WHOLE_CLOUD
 from pdal_stages.stages.wires import Wires
 from pdal_stages.structures import towers
 from pdal_stages.structures import wires as lines

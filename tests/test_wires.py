@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import pdal_stages as ps
 import pdal_stages.synthetic
-from pdal_stages.stages.context import WHOLE_CLOUD
+from pdal_stages.stages.base import WHOLE_CLOUD
 from pdal_stages.stages.wires import Wires
 from pdal_stages.structures import wires
 from pdal_stages.structures.wires import find_wires

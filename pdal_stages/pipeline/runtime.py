@@ -25,8 +25,7 @@ import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
 from ..base.report import Report
-from ..stages.base import Stage
-from ..stages.context import WHOLE_CLOUD, StageContext
+from ..stages.base import WHOLE_CLOUD, Stage, StageContext
 from ..stages.points import Points
 from ..stages.preprocessing import NEEDS_GROUND
 from ..stages.registry import place, stage_from

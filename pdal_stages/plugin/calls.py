@@ -18,8 +18,7 @@ from typing import Any
 from ..base.errors import StageError
 from ..base.version import __version__
 from ..pipeline import expansion, runtime
-from ..stages.base import Stage
-from ..stages.context import StageContext
+from ..stages.base import Stage, StageContext
 from ..stages.registry import place, stage_from, stage_type, stage_types
 from . import declarations
 

@@ -23,11 +23,9 @@ from ..base.report import Report
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
 from .apply_model import ApplyModel
-from .base import Stage, files_read
-from .context import StageContext
-from .options import option
+from .base import Stage, StageContext, files_read
+from .options import Selection, option
 from .points import Points
-from .selection import Selection
 
 #: Classes that count as HIGH where vegetation is one class.
 LOWER = (LOW, MEDIUM)

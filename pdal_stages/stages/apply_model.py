@@ -18,13 +18,11 @@ from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
-from .base import Stage
-from .context import WHOLE_CLOUD, StageContext
-from .options import declared_option, ignore_option, keep_option, option
+from .base import WHOLE_CLOUD, Stage, StageContext
+from .options import Selection, declared_option, ignore_option, keep_option, option
 from .points import Points, class_counts
 from .preprocessing import OF_PDAL, as_json, same, with_given_ground
 from .registry import stage_type
-from .selection import Selection
 
 #: Dimension of the height above ground.
 HEIGHT = "HeightAboveGround"

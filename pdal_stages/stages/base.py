@@ -5,15 +5,15 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Self
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
 from ..base.units import named_unit
-from .context import WHOLE_CLOUD, StageContext
 from .options import Option, option, parse_options
 from .points import Points
 from .where_expression import Expression
@@ -29,6 +29,37 @@ def files_read(stages: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the files of the readers among stages, as they are written."""
     readers = [stage for stage in stages if str(stage.get("type")).startswith("readers.")]
     return [str(stage["filename"]) for stage in readers if "filename" in stage]
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """Facts that hold for one run of a stage; the default is a run of its own on a whole cloud."""
+
+    #: Whether an earlier stage of the pipeline created a dimension that this one creates too: the
+    #: values that points have are results then, not an input's leftovers.
+    created_before: bool = False
+    #: What to report where a class code above 31 does not fit the pipeline's writer, and the cure;
+    #: None where all fit.
+    code_limit: tuple[str, str] | None = None
+    #: In a tile: the dimension that holds how many meters a point lies outside the tile; negative
+    #: inside. Else empty.
+    outside: str = ""
+    #: In a tile: how many meters outside it the results of this stage are still used, by later
+    #: stages.
+    used_m: float = 0.0
+    #: In a tile: what the first round computed for a stage that reaches far (:class:`FarReaching`).
+    blocks: Any = None
+
+    def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_] | None:
+        """Return which points (n,) have results that are used; None outside tiles: all."""
+        meters = arrays.get(self.outside)
+        if meters is None:
+            return None
+        return meters <= self.used_m if self.used_m > 0 else meters < 0
+
+
+#: Outside tiles and pipelines.
+WHOLE_CLOUD = StageContext()
 
 
 class Stage(ABC):
@@ -306,3 +337,61 @@ class ClassStage(Stage):
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""
         return {"Classification": "uint8_t"}
+
+
+class Blocks(NamedTuple):
+    """Squares of a grid that are computed once before the tiles; lengths in meters."""
+
+    side: float
+    reach: float  #: how far around a block points matter
+    margin: float  #: how far beyond the points that are read a tile needs blocks
+    spill: float  #: how far beyond all points blocks hold something
+    cell: float = 1.0  #: side of the cells that they are rasters of
+
+
+def inside_block(block: tuple[int, int]) -> str:
+    """Return the name of the array of the points inside a block (column, row)."""
+    return f"inside/{block[0]}/{block[1]}"
+
+
+class FarReaching(Stage):
+    """A stage that looks too far for the surroundings of a tile: a first round serves it.
+
+    The points of each tile are reduced to what matters far away (:meth:`reduce_points`), blocks of
+    a grid are computed from that (:meth:`compute_block`), and a tile joins the parts of the blocks
+    that it needs (:meth:`join_blocks`).
+    """
+
+    @abstractmethod
+    def blocks(self) -> Blocks | None:
+        """Return the blocks that the stage needs; None where it looks no farther than its halo."""
+
+    @abstractmethod
+    def reduce_points(self, points: Points) -> dict[str, NDArray[np.float64]]:
+        """Return what blocks need of points.
+
+        That is an array (n, 4) ``around``, for blocks that the points do not lie in, and (n, 3)
+        for each block that they lie in (:func:`inside_block`).
+        """
+
+    @abstractmethod
+    def compute_block(
+        self,
+        far_points: NDArray[np.float64],
+        inside: Iterable[NDArray[np.float64]],
+        block: tuple[int, int],
+    ) -> dict[str, NDArray]:
+        """Compute a block (column, row) from the reduced points around and in it."""
+
+    @abstractmethod
+    def arrays_in(self, box: Sequence[float]) -> set[str]:
+        """Return names of arrays that a box (min x, min y, max x, max y, meters) needs."""
+
+    @abstractmethod
+    def join_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
+        """Join these arrays of the blocks that a box touches to :attr:`StageContext.blocks`."""
+
+
+def first_round_of(stage: Stage | None) -> Blocks | None:
+    """Return the blocks that a stage needs before the tiles; None where it does without."""
+    return stage.blocks() if isinstance(stage, FarReaching) else None

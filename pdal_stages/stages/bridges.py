@@ -7,11 +7,9 @@ from numpy.typing import NDArray
 
 from ..base.asprs import BRIDGE
 from ..structures.decks import RULES, find_decks
-from .base import ClassStage
-from .context import StageContext
-from .options import code_option, ignore_option, keep_option
+from .base import ClassStage, StageContext
+from .options import Selection, code_option, ignore_option, keep_option
 from .points import Points, class_counts
-from .selection import Selection
 
 #: Leaves beside a deck, as high as it is.
 _VEGETATION = (3, 4, 5)

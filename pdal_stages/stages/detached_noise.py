@@ -6,11 +6,9 @@ from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
 from ..terrain.noise import REACH, detached_noise
-from .base import ClassStage
-from .context import StageContext
-from .options import code_option, ignore_option, option
+from .base import ClassStage, StageContext
+from .options import Selection, code_option, ignore_option, option
 from .points import Points, class_counts
-from .selection import Selection
 
 
 class DetachedNoise(ClassStage):

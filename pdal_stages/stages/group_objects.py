@@ -25,11 +25,9 @@ from ..objects.cells import (
 from ..objects.detect import find_objects
 from ..objects.raster_view import MARGIN
 from ..objects.results import Objects, ObjectSettings
-from .base import Stage
-from .context import StageContext
-from .options import code_option, ignore_option, option
+from .base import Stage, StageContext
+from .options import Selection, code_option, ignore_option, option
 from .points import Points
-from .selection import Selection
 
 #: Settings of the search, each of which is an option.
 _SETTINGS = {field.name: field for field in fields(ObjectSettings)}

@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
-from .base import HEIGHTS_OUTSIDE, Stage
-from .context import StageContext
-from .options import ignore_option, option
+from .base import HEIGHTS_OUTSIDE, Stage, StageContext
+from .options import Selection, ignore_option, option
 from .points import Points
-from .selection import Selection
 
 
 class HagMinima(Stage):

@@ -23,12 +23,9 @@ from ..terrain.ground_blocks import (
 from ..terrain.heights import filtered_ground
 from ..terrain.openings import opening_names
 from ..terrain.smrf import FilterOptions
-from .base import HEIGHTS_OUTSIDE
-from .context import StageContext
-from .first_round import Blocks, FarReaching, inside_block
-from .options import ignore_option, option
+from .base import HEIGHTS_OUTSIDE, Blocks, FarReaching, StageContext, inside_block
+from .options import Selection, ignore_option, option
 from .points import Points
-from .selection import Selection
 
 #: Cells along the side of squares of a block that a tile reads by themselves.
 _PART = 256

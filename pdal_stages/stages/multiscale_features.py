@@ -17,11 +17,9 @@ from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.registry import ALGORITHM_VERSION
 from ..features.voxels import LARGEST, check_side, represent
-from .base import Stage
-from .context import StageContext
-from .options import ignore_option, option
+from .base import Stage, StageContext
+from .options import Selection, ignore_option, option
 from .points import Points
-from .selection import Selection
 
 #: Bytes a LAS extra-dimension name may have.
 _NAME_BYTES = 32

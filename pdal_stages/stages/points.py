@@ -16,7 +16,7 @@ from ..base.errors import DimensionError, OptionError, StageError
 from ..base.memory import release_pages
 from ..base.report import Report
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
-from .selection import Selection
+from .options import Selection
 from .where_expression import Expression
 
 #: Which stage makes a dimension that a user may lack.
@@ -68,7 +68,7 @@ class Points:
     meters_outside: NDArray | None = None
     #: In tiles: the points whose results are used.
     used: NDArray[np.bool_] | None = None
-    code_limit: tuple[str, str] | None = None  #: as in :class:`.context.StageContext`
+    code_limit: tuple[str, str] | None = None  #: as in :class:`.base.StageContext`
     #: Which of the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
     lent_by_pdal: Set[str] = frozenset()
 

@@ -7,11 +7,9 @@ from numpy.typing import NDArray
 
 from ..base.polygons import Overlay, inside_of
 from ..base.vector import with_vector
-from .base import ClassStage
-from .context import StageContext
-from .options import ignore_option, keep_option, option
+from .base import ClassStage, StageContext
+from .options import Selection, ignore_option, keep_option, option
 from .points import NO_POLYGON_NEAR, Points, class_counts
-from .selection import Selection
 
 
 class Polygons(ClassStage):

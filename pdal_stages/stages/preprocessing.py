@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, StageError
 from ..base.las import number_type
-from .context import WHOLE_CLOUD
+from .base import WHOLE_CLOUD
 from .options import Option, split_list
 from .registry import stage_type, stage_types
 

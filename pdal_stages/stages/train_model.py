@@ -32,13 +32,11 @@ from ..classifier.train_forest import SHORT
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
-from .base import Stage, files_read
+from .base import Stage, StageContext, files_read
 from .checked_points import SURE, CheckedChoice, CheckedPoints
-from .context import StageContext
-from .options import declared_option, option
+from .options import UNWANTED, Selection, declared_option, option
 from .points import Points
 from .preprocessing import check
-from .selection import UNWANTED, Selection
 
 #: The trainer's own options.
 _TRAINING = {field.name: field for field in fields(TrainingOptions)}

@@ -9,11 +9,9 @@ from ..base.asprs import TOWER, WIRE
 from ..structures import towers
 from ..structures.towers import find_towers
 from ..structures.wires import RULES, find_wires
-from .base import ClassStage
-from .context import StageContext
-from .options import code_option, ignore_option, keep_option, option
+from .base import ClassStage, StageContext
+from .options import Selection, code_option, ignore_option, keep_option, option
 from .points import Points, class_counts
-from .selection import Selection
 
 
 class Wires(ClassStage):

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from ..base.files import Output
 from ..base.vector import with_vector
 from ..objects.detect import find_objects
-from .base import Stage
-from .context import StageContext
+from .base import Stage, StageContext
 from .group_objects import ObjectOptions
 from .options import option
 from .points import Points

@@ -7,7 +7,7 @@ points, possible ground points, and changes by earlier stages are saved. Then bl
 are computed from the lowest points around them and the points inside. Finally a tile reads the
 points that the later stages need, applies the saved changes, and takes the raster from the blocks.
 
-What a stage saves and computes is its own affair: see :class:`..stages.first_round.FarReaching`.
+What a stage saves and computes is its own affair: see :class:`..stages.base.FarReaching`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.grid import places_among
-from ..stages.first_round import FarReaching, inside_block
+from ..stages.base import FarReaching, inside_block
 from ..stages.registry import stage_from
 from .checkpoint import load_arrays, save_arrays, written
 from .plan import RunContext, TilePlan

@@ -13,7 +13,7 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.memory import free_memory
 from ..base.threads import available_threads
-from ..stages.first_round import Blocks
+from ..stages.base import Blocks
 from .tile_grid import Box, TileGrid, union
 
 #: Ways to cut the output.

@@ -18,8 +18,7 @@ from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import MOVING
 from ..pipeline.stage_files import writes_las
-from ..stages.base import Stage
-from ..stages.first_round import Blocks, first_round_of
+from ..stages.base import Blocks, Stage, first_round_of
 from .tile_grid import Box, TileGrid
 
 #: Dimensions that follow a point through a tile's pipeline.

@@ -20,8 +20,7 @@ from ..pipeline.las_output import REPLACED, check_writers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, Function, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
-from ..stages.context import WHOLE_CLOUD
-from ..stages.first_round import first_round_of
+from ..stages.base import WHOLE_CLOUD, first_round_of
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
 from ..stages.registry import stage_types
 from .checkpoint import save_arrays, written
