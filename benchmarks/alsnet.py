@@ -1,10 +1,12 @@
 """alsNet trained on labeled clouds and scored on others.
 
-    python benchmarks/alsnet.py --train A.laz B.laz --test C.laz --classes '{"2": "Ground", "6": "Building"}' \
+    python benchmarks/alsnet.py --train A.laz B.laz --test C.laz --classes '{"2": "Ground", "6":
+    "Building"}' \
         --network '{"configuration": "small", "epochs": 30}'
 
-Scores are over the test points of the classes trained. Nothing is fitted or chosen on test points: epochs are chosen on
-blocks of the training part. Seconds are CPU seconds of the process (all threads).
+Scores are over the test points of the classes trained. Nothing is fitted or chosen on test points:
+epochs are chosen on blocks of the training part. Seconds are CPU seconds of the process (all
+threads).
 """
 
 from __future__ import annotations
@@ -61,16 +63,17 @@ def main() -> None:
     started = time.process_time()
     model = train([cloud_of(args.train)], options, progress=True)
     print(
-        f"trained in {time.process_time() - started:.0f} s, epoch {model.info['training']['best_epoch']}"
+        f"trained in {time.process_time() - started:.0f} s, epoch "
+        f"{model.info['training']['best_epoch']}"
     )
     if args.save:
         model.save(args.save)
     test = cloud_of(args.test)
     started = time.process_time()
-    found = model.predict(test.xyz, test.dimensions, threads=args.threads)
+    prediction = model.predict(test.xyz, test.dimensions, threads=args.threads)
     print(f"classified {len(test.xyz):,} points in {time.process_time() - started:.0f} s")
     codes = [code for code, _ in model.classes]
-    print(Accuracy.from_labels(test.labels, found.classification, classes=codes).table())
+    print(Accuracy.from_labels(test.labels, prediction.classification, classes=codes).table())
 
 
 if __name__ == "__main__":

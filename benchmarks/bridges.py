@@ -1,10 +1,12 @@
-"""Bridge decks, wires and towers: how many of their points are found, and how many others are taken for them.
+"""Bridge decks, wires and towers: how many of their points are found, and how many others are taken
+for them.
 
 python benchmarks/bridges.py --data FOLDER
 
-Decks of scenes (tests/bridge_scenes.py; 8 points/m2), of the generated town and of the labeled clouds; wires of the town, of
-generated corridors (tests/corridor_scenes.py) and of those clouds. Cars, lamps and what was never labeled count
-neither way. `false` is the share of all points that are wrongly taken; seconds are of one process.
+Decks of scenes (tests/bridge_scenes.py; 8 points/m2), of the generated town and of the labeled
+clouds; wires of the town, of generated corridors (tests/corridor_scenes.py) and of those clouds.
+Cars, lamps and what was never labeled count neither way. `false` is the share of all points that
+are wrongly taken; seconds are of one process.
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ def row(
     score = 2 * right / max(2 * right + wrong + int((true & ~found).sum()), 1)
     words = f"{100 * score:.1f}" if true.any() else "–"
     print(
-        f"| {name} | {what} | {int(true.sum()):,} | {words} | {100 * wrong / len(found):.3f} | {seconds:.1f} |",
+        f"| {name} | {what} | {int(true.sum()):,} | {words} | {100 * wrong / len(found):.3f} | "
+        f"{seconds:.1f} |",
         flush=True,
     )
 
@@ -63,8 +66,8 @@ def decks(
 ) -> None:
     ground = filtered_ground(xyz, mask=use)["Ground"] > 0
     begin = time.process_time()
-    found = find_decks(*(np.ascontiguousarray(axis) for axis in xyz.T), use, ground)
-    row(name, "deck", found, true, either, time.process_time() - begin)
+    decks = find_decks(*(np.ascontiguousarray(axis) for axis in xyz.T), use, ground)
+    row(name, "deck", decks, true, either, time.process_time() - begin)
 
 
 def wires(

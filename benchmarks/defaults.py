@@ -4,11 +4,13 @@
     python benchmarks/defaults.py --data DIR --table trees --json FILE
     python benchmarks/defaults.py --data DIR --table base --count 40000 --bases MODELS
 
-Each training tile of Montpellier, and each third of Delft's training part, of Seville and of the hamlet, is classified by
-a model of the rest of that survey, with one thing of the defaults changed. Cross-validation over small blocks amid the
-training points is flattered by what neighbors share; a tile never seen is what a user's next tile is. Test parts are
-not touched. MODELS holds shipped models that have not seen the survey, as ``benchmarks/surveys/leave_one_out.py --save``
-writes them. CPU seconds are those of training, and microseconds a point those of classifying, both with one thread.
+Each training tile of Montpellier, and each third of Delft's training part, of Seville and of the
+hamlet, is classified by a model of the rest of that survey, with one thing of the defaults changed.
+Cross-validation over small blocks amid the training points is flattered by what neighbors share; a
+tile never seen is what a user's next tile is. Test parts are not touched. MODELS holds shipped
+models that have not seen the survey, as ``benchmarks/surveys/leave_one_out.py --save`` writes them.
+CPU seconds are those of training, and microseconds a point those of classifying, both with one
+thread.
 """
 
 from __future__ import annotations
@@ -153,21 +155,21 @@ def held_out(data: Path) -> Iterator[tuple[str, TrainingCloud, TrainingCloud]]:
 
 def options(changes: dict[str, Any], codes: tuple[int, ...], count: int) -> TrainingOptions:
     """Today's defaults with changes."""
-    given = {
+    options = {
         "dimensions": DIMENSIONS,
         "classes": list(codes),
         "count": count,
         "threads": 1,
         "folds": 0,
     }
-    return TrainingOptions(**{**given, **changes})
+    return TrainingOptions(**{**options, **changes})
 
 
 def run(
     data: Path, rows: dict[str, dict[str, Any]], count: int, bases: Path | None = None
 ) -> list[dict[str, Any]]:
     """A line for each row."""
-    found = {
+    scores = {
         name: {
             scene: np.zeros((len(codes), len(codes)), np.int64) for scene, codes in CODES.items()
         }
@@ -183,20 +185,23 @@ def run(
             began = time.process_time()
             model = train([rest], options(changes, codes, count), progress=False)
             trained = time.process_time()
-            given = model.predict(held.xyz, held.dimensions, threads=1).classification
+            predicted = model.predict(held.xyz, held.dimensions, threads=1).classification
             seconds[name][0] += trained - began
             seconds[name][1] += time.process_time() - trained
             seconds[name][2] += len(held.xyz)
             columns[name] = len(model.passes[-1].plan.names)
             known = np.isin(held.labels, codes)
-            pair = np.searchsorted(codes, held.labels[known]), np.searchsorted(codes, given[known])
-            np.add.at(found[name][scene], pair, 1)
+            pair = (
+                np.searchsorted(codes, held.labels[known]),
+                np.searchsorted(codes, predicted[known]),
+            )
+            np.add.at(scores[name][scene], pair, 1)
         print(f"{scene}: a part held out", flush=True)
     lines = []
     for name in rows:
         line: dict[str, Any] = {"name": name, "features": columns[name]}
         for scene, codes in CODES.items():
-            accuracy = Accuracy.from_confusion(found[name][scene], codes)
+            accuracy = Accuracy.from_confusion(scores[name][scene], codes)
             line[scene] = {
                 "oa": 100 * accuracy.overall_accuracy,
                 "f1": 100 * accuracy.mean_f1,
@@ -211,23 +216,27 @@ def run(
 
 
 def text(tables: dict[str, list[dict[str, Any]]]) -> str:
-    """As Markdown: overall accuracy / mean F1 / F1 of low vegetation, percent."""
+    """Return Markdown: overall accuracy / mean F1 / F1 of low vegetation, percent."""
     out = []
     for title, lines in tables.items():
         out += [
-            f"| {title} | features | {' | '.join(CODES)} | mean | training, CPU s | microseconds a point |",
+            f"| {title} | features | {' | '.join(CODES)} | mean | training, CPU s | microseconds a "
+            "point |",
             "|---|---:|" + "---:|" * len(CODES) + "---:|---:|---:|",
         ]
         for line in lines:
-            found = [line[scene] for scene in CODES]
-            cells = [_figures(one["oa"], one["f1"], one["classes"].get("3")) for one in found]
-            low = [one["classes"]["3"] for one in found if "3" in one["classes"]]
+            scores = [line[scene] for scene in CODES]
+            cells = [
+                _figures(score["oa"], score["f1"], score["classes"].get("3")) for score in scores
+            ]
+            low = [score["classes"]["3"] for score in scores if "3" in score["classes"]]
             mean = _figures(
-                *(statistics.fmean(one[key] for one in found) for key in ("oa", "f1")),
+                *(statistics.fmean(score[key] for score in scores) for key in ("oa", "f1")),
                 statistics.fmean(low),
             )
             out.append(
-                f"| {line['name']} | {line['features']} | {' | '.join([*cells, mean])} | {line['training']:.0f} | "
+                f"| {line['name']} | {line['features']} | {' | '.join([*cells, mean])} | "
+                f"{line['training']:.0f} | "
                 f"{line['classifying']:.1f} |"
             )
         out.append("")
@@ -247,16 +256,16 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2500, help="samples of each class")
     parser.add_argument("--json", type=Path, help="where the figures go")
     parser.add_argument("--bases", type=Path, help="folder of models, for the table of bases")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     tables = {}
-    for title in given.table:
-        if title == BASE and given.bases is None:
+    for title in arguments.table:
+        if title == BASE and arguments.bases is None:
             print("the table of bases needs --bases")
             continue
-        tables[title] = run(given.data, TABLES[title], given.count, given.bases)
+        tables[title] = run(arguments.data, TABLES[title], arguments.count, arguments.bases)
         print(text({title: tables[title]}), flush=True)
-    if given.json:
-        given.json.write_text(json.dumps(tables, indent=1) + "\n")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(tables, indent=1) + "\n")
 
 
 if __name__ == "__main__":

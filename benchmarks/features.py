@@ -1,14 +1,16 @@
 """Time of features beside libraries that do some of the same: pgeof, jakteristics, PDAL.
 
-    python benchmarks/features.py                               # generated town, 500,000 points, 7 per square meter
+    # generated town, 500,000 points, 7 per square meter
+    python benchmarks/features.py
     python benchmarks/features.py --cloud file.laz --only moments kopt --repeats 5
 
-All run in one process tree on the same cloud with the same number of threads, one after the other, each `--repeats`
-times in turns. Times are CPU seconds of all threads (which other work on the machine disturbs least) and
-wall seconds, and include building the search structure from plain coordinates; a ratio is a peer's time over ours in
-the same turn, given as least / median / largest. PDAL runs as a program of its own, since its covariance
-filter crashes with several threads in some releases: its time is that of a pipeline with the filter less that of one
-that only reads, with one thread.
+All run in one process tree on the same cloud with the same number of threads, one after the other,
+each `--repeats` times in turns. Times are CPU seconds of all threads (which other work on the
+machine disturbs least) and wall seconds, and include building the search structure from plain
+coordinates; a ratio is a peer's time over ours in the same turn, given as least / median / largest.
+PDAL runs as a program of its own, since its covariance filter crashes with several threads in some
+releases: its time is that of a pipeline with the filter less that of one that only reads, with one
+thread.
 """
 
 from __future__ import annotations
@@ -67,8 +69,8 @@ def ours(neighborhoods: str, feature_set: str, threads: int) -> Work:
     plan = FeaturePlan.parse(neighborhoods, feature_set)
 
     def run(xyz: np.ndarray) -> None:
-        given = {name: np.zeros(len(xyz), np.float32) for name in plan.dimensions}
-        for _ in FeatureEngine(xyz, plan, threads=threads).blocks(dimensions=given):
+        dimensions = {name: np.zeros(len(xyz), np.float32) for name in plan.dimensions}
+        for _ in FeatureEngine(xyz, plan, threads=threads).blocks(dimensions=dimensions):
             pass
 
     return run
@@ -111,9 +113,9 @@ def pgeof_optimal(xyz: np.ndarray) -> None:
     import pgeof
 
     near = np.ascontiguousarray(xyz - xyz[0], dtype=np.float32)
-    found = pgeof.knn_search(near, near, 101)[0]
+    neighbors = pgeof.knn_search(near, near, 101)[0]
     pointers = np.arange(0, 101 * len(near) + 1, 101, dtype=np.uint32)
-    pgeof.compute_features_optimal(near, found.astype(np.uint32).ravel(), pointers, 10, 1, 10)
+    pgeof.compute_features_optimal(near, neighbors.astype(np.uint32).ravel(), pointers, 10, 1, 10)
 
 
 def cases(threads: int) -> dict[str, tuple[str, Work, dict[str, Work]]]:
@@ -147,8 +149,8 @@ def cases(threads: int) -> dict[str, tuple[str, Work, dict[str, Work]]]:
 def timed(function: Work, xyz: np.ndarray) -> Times:
     """CPU seconds of all threads, and wall seconds; a function may return its own."""
     cpu, wall = time.process_time(), time.perf_counter()
-    own = function(xyz)
-    return own or (time.process_time() - cpu, time.perf_counter() - wall)
+    ours = function(xyz)
+    return ours or (time.process_time() - cpu, time.perf_counter() - wall)
 
 
 def pdal(stages: list[dict]) -> Work:
@@ -231,7 +233,8 @@ def spread(values: Iterable[float], form: str = ".2f") -> str:
 
 def table(cloud: str, xyz: np.ndarray, results: list[dict], threads: int) -> str:
     lines = [
-        f"{cloud}: {len(xyz):,} points, {point_density(xyz):.1f} per occupied square meter, {threads} threads",
+        f"{cloud}: {len(xyz):,} points, {point_density(xyz):.1f} per occupied square meter, "
+        f"{threads} threads",
         "",
         "| what | who | CPU s | wall s | CPU time over ours | points/s |",
         "|---|---|---:|---:|---:|---:|",
@@ -240,11 +243,11 @@ def table(cloud: str, xyz: np.ndarray, results: list[dict], threads: int) -> str
         rows = {"pdal_stages": entry["ours"], **entry["peers"]}
         for who, times in rows.items():
             cpu, wall = zip(*times, strict=True)
-            own = [o[0] for o in entry["ours"]][: len(cpu)]
+            our_cpu = [o[0] for o in entry["ours"]][: len(cpu)]
             ratio = (
                 ""
                 if who == "pdal_stages"
-                else spread((c / o for c, o in zip(cpu, own, strict=True)), ".1f")
+                else spread((c / o for c, o in zip(cpu, our_cpu, strict=True)), ".1f")
             )
             # What so many quiet cores would do, from CPU time: wall time depends on what else runs.
             cores = 1 if who == "PDAL" else threads

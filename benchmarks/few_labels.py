@@ -1,9 +1,11 @@
 """A few labels of a survey that the base has not seen: from nothing, and on top of the base.
 
-    python benchmarks/few_labels.py --data FOLDER [--base MODEL] [--survey bank] [--labels 10 100 300] [--json FILE]
+    python benchmarks/few_labels.py --data FOLDER [--base MODEL] [--survey bank] [--labels 10 100
+    300] [--json FILE]
 
-Of each survey the western half gives labels, drawn at random, as many of each class; the eastern half is scored (at most
-200,000 points of it, drawn once). The base must not know the survey: benchmarks/surveys trains one without it.
+Of each survey the western half gives labels, drawn at random, as many of each class; the eastern
+half is scored (at most 200,000 points of it, drawn once). The base must not know the survey:
+benchmarks/surveys trains one without it.
 """
 
 from __future__ import annotations
@@ -63,12 +65,12 @@ def scores(folder: Path, name: str, base, counts):
     scored = np.flatnonzero(~west & (label > 0))
     if len(scored) > SCORED:
         scored = np.random.default_rng(1).choice(scored, SCORED, replace=False)
-    asked = np.zeros(len(xyz), bool)
-    asked[scored] = True
+    queries = np.zeros(len(xyz), bool)
+    queries[scored] = True
 
     def score(model) -> float:
-        found = model.predict(xyz, dimensions, asked).classification
-        return 100 * float(np.mean(found[asked] == label[asked]))
+        predicted = model.predict(xyz, dimensions, queries).classification
+        return 100 * float(np.mean(predicted[queries] == label[queries]))
 
     alone = score(base)
     print(f"{name}: base {alone:.2f}", flush=True)

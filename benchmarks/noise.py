@@ -5,12 +5,13 @@ python benchmarks/noise.py --data FOLDER --classify
 python benchmarks/noise.py --data FOLDER --terrain
 python benchmarks/noise.py --places
 
-Noise as the field knows it is put into each cloud: points and clusters of 2 to 30 within a meter, half of them 1 to 30 m
-below the ground (the lowest of what is labeled ground, and of all points, near by), half 3 to 300 m above the highest point
-near by. `good` are labeled points other than noise; speed is in points per CPU second of one thread. With --classify and
---terrain, clusters of all sizes are put below the ground: what the shipped model then calls right of the labeled points, and
-how far off the ground filter's heights are, with noise marked first and without.
-With --places, generated land that holds no noise: how much of its ground is marked.
+Noise as the field knows it is put into each cloud: points and clusters of 2 to 30 within a meter,
+half of them 1 to 30 m below the ground (the lowest of what is labeled ground, and of all points,
+near by), half 3 to 300 m above the highest point near by. `good` are labeled points other than
+noise; speed is in points per CPU second of one thread. With --classify and --terrain, clusters of
+all sizes are put below the ground: what the shipped model then calls right of the labeled points,
+and how far off the ground filter's heights are, with noise marked first and without. With --places,
+generated land that holds no noise: how much of its ground is marked.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ UNDER = (
     "montpellier/train_77055_627755.laz", "seville/plazanueva.laz", "rural/lidarhd_57ppm2.laz", "rural/lidarhd_11ppm2.laz",
     "rural/lidarhd_bank.laz", "forest/neon_osbs.laz", "rural/ign_0p3ppm2.laz", "delft/train.laz",
 )  # fmt: skip
-#: What is classified: a dense town, a bank, a town with noise of its own, a hamlet, a farm, an old town with canals.
+#: What is classified: a dense town, a bank, a town with noise of its own, a hamlet, a farm, an old
+#: town with canals.
 CLASSIFIED = (
     "montpellier/train_77055_627755.laz", "rural/lidarhd_bank.laz", "seville/plazanueva.laz",
     "rural/lidarhd_57ppm2.laz", "rural/lidarhd_11ppm2.laz", "delft/train.laz",
@@ -49,7 +51,8 @@ CLASSIFIED = (
 #: Labels of points that are what they are called.
 GOOD = (2, 3, 4, 5, 6, 9, 12, 14, 15, 17)
 SHARES = (0.0001, 0.001, 0.01)
-#: Clusters below the ground: points, meters across, meters below; one and five per hectare by turns.
+#: Clusters below the ground: points, meters across, meters below; one and five per hectare by
+#: turns.
 CLUSTERS = (
     (1, 0.5, 3), (1, 0.5, 30), (2, 2, 60), (10, 0.5, 3), (10, 2, 10), (30, 4, 22), (30, 10, 60), (100, 5, 10), (128, 7, 22),
     (100, 10, 40), (300, 2, 5), (300, 10, 60), (1000, 2, 3), (1000, 10, 30), (1000, 10, 3),
@@ -62,12 +65,12 @@ def injected(
     """Noise of that share of a cloud's points: coordinates, and 7 or 18."""
     rng = np.random.default_rng(seed)
     ground = xyz[codes == 2]
-    nearest, around = cKDTree(ground[:, :2]), cKDTree(xyz[:, :2])
+    nearest, cloud_tree = cKDTree(ground[:, :2]), cKDTree(xyz[:, :2])
     parts, kinds = [], []
     while sum(map(len, parts)) < max(share * len(xyz), 1):
         size = 1 if rng.random() < 0.5 else rng.integers(2, 31)
         at = xyz[rng.integers(len(xyz)), :2] + rng.uniform(-1, 1, 2)
-        near = xyz[around.query_ball_point(at, 2.0), 2]
+        near = xyz[cloud_tree.query_ball_point(at, 2.0), 2]
         part = rng.normal(0, 0.4, (size, 3)) * (size > 1)
         if low := rng.random() < 0.5:
             level = ground[nearest.query(at, 3)[1], 2].min()
@@ -92,18 +95,19 @@ def planted(
     per_hectare: int,
     seed: int,
 ) -> np.ndarray:
-    """Clusters of `size` points, `extent` meters across, `depth` below all near by, under land that holds points."""
+    """Clusters of `size` points, `extent` meters across, `depth` below all near by, under land that
+    holds points."""
     rng = np.random.default_rng(seed)
     squares = np.unique(np.floor(xyz[:, :2] / 10).astype(int), axis=0)
     spacing = np.sqrt(100 * len(squares) / len(xyz))
     ground = xyz[codes == 2]
-    nearest, around = cKDTree(ground[:, :2]), cKDTree(xyz[:, :2])
+    nearest, cloud_tree = cKDTree(ground[:, :2]), cKDTree(xyz[:, :2])
     parts: list[np.ndarray] = []
     taken: set[tuple[int, ...]] = set()
     for i, j in rng.permutation(squares).tolist():
         if len(parts) >= max(1, per_hectare * len(squares) / 100):
             break
-        at = xyz[around.query((np.array([i, j]) + rng.random(2)) * 10)[1], :2]
+        at = xyz[cloud_tree.query((np.array([i, j]) + rng.random(2)) * 10)[1], :2]
         part = rng.normal(0, 1, (size, 3))
         part *= (
             rng.random((size, 1)) ** (1 / 3)
@@ -112,11 +116,11 @@ def planted(
             / np.linalg.norm(part, axis=1, keepdims=True)
         )
         part[:, :2] += at
-        if (i, j) in taken or np.quantile(around.query(part[:, :2])[0], 0.8) > max(
+        if (i, j) in taken or np.quantile(cloud_tree.query(part[:, :2])[0], 0.8) > max(
             0.75, 1.2 * spacing
         ):
             continue
-        near = xyz[around.query_ball_point(at, extent / 2 + 1), 2]
+        near = xyz[cloud_tree.query_ball_point(at, extent / 2 + 1), 2]
         level = ground[nearest.query(at, 3)[1], 2].min()
         part[:, 2] += min([level, *near]) - depth - part[:, 2].max()
         parts.append(part)
@@ -127,27 +131,27 @@ def planted(
 def right(
     xyz: np.ndarray, truth: np.ndarray, returns: np.ndarray, noise: np.ndarray, word: str
 ) -> float:
-    """Overall accuracy (2, 5, 6) of points, in %, by the shipped model, classified with noise among them."""
+    """Overall accuracy (2, 5, 6) of points, in %, by the shipped model, classified with noise among
+    them."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales, header.offsets = [0.001] * 3, np.floor(xyz.min(axis=0))
-    made = laspy.LasData(header)
-    made.x, made.y, made.z = np.vstack([xyz, noise]).T
-    made.return_number, made.number_of_returns = np.vstack(
-        [returns, np.ones((len(noise), 2), int)]
-    ).T
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.vstack([xyz, noise]).T
+    las.return_number, las.number_of_returns = np.vstack([returns, np.ones((len(noise), 2), int)]).T
     with TemporaryDirectory() as scratch:
         source, target = str(Path(scratch) / "in.laz"), str(Path(scratch) / "out.laz")
-        made.write(source)
+        las.write(source)
         with redirect_stdout(io.StringIO()):
             if command(["classify", source, target, word, "--no-progress"]):
                 raise SystemExit("the cloud could not be classified")
-        found = np.asarray(laspy.read(target).classification)[: len(xyz)]
+        classes = np.asarray(laspy.read(target).classification)[: len(xyz)]
     scored = np.isin(truth, (2, 5, 6))
-    return 100 * float((np.where(np.isin(found, (3, 4, 5)), 5, found) == truth)[scored].mean())
+    return 100 * float((np.where(np.isin(classes, (3, 4, 5)), 5, classes) == truth)[scored].mean())
 
 
 def classified(folder: Path) -> None:
-    """Print by how much overall accuracy (2, 5, 6) changes with clusters below, marked by default and not looked for.
+    """Print by how much overall accuracy (2, 5, 6) changes with clusters below, marked by default
+    and not looked for.
 
     Of the labeled points alone; the first line of a cloud says what is without them.
     """
@@ -174,7 +178,8 @@ def classified(folder: Path) -> None:
 
 
 def terrain(folder: Path) -> None:
-    """Print the RMSE of heights of labeled ground that clusters below it make, alone and after those found were left out."""
+    """Print the RMSE of heights of labeled ground that clusters below it make, alone and after
+    those found were left out."""
     print(
         "| cloud | clusters: points / across / below, m; per hectare | found, % | RMSE, m | alone |"
     )
@@ -191,8 +196,8 @@ def terrain(folder: Path) -> None:
             marked = detached_noise(both)
             shown = []
             for use in (marked == 0, np.ones(len(both), bool)):
-                found = filtered_ground(*both.T, mask=use)["HeightAboveGround"][: len(xyz)]
-                shown.append(f"{np.sqrt(np.mean((found - clean)[labeled] ** 2)):.2f}")
+                heights = filtered_ground(*both.T, mask=use)["HeightAboveGround"][: len(xyz)]
+                shown.append(f"{np.sqrt(np.mean((heights - clean)[labeled] ** 2)):.2f}")
             share = 100 * (marked[len(xyz) :] == 7).mean() if len(both) > len(xyz) else np.nan
             cells = f"{size} / {extent:g} / {depth:g}; {each} | {share:.0f} | {' | '.join(shown)}"
             print(f"| {name} | {cells} |", flush=True)
@@ -260,7 +265,8 @@ def main() -> None:
         return
     detached_noise(np.random.default_rng(0).uniform(0, 30, (500, 3)))
     print(
-        "| cloud | million points/s | good points marked | found of 0.01 % | 0.1 % | 1 % (low / high) |"
+        "| cloud | million points/s | good points marked | found of 0.01 % | 0.1 % | 1 % (low / "
+        "high) |"
     )
     print("|---|---:|---:|---:|---:|---:|")
     for name in CLOUDS:
@@ -270,17 +276,17 @@ def main() -> None:
         marked = detached_noise(xyz)
         spent = time.process_time() - start
         good = np.isin(codes, GOOD)
-        found = []
+        detected = []
         for share in SHARES:
             tally = np.zeros((2, 2))
             for seed in range(5 if share < 0.001 else 1):
                 noise, kinds = injected(xyz, codes, share, seed)
-                told = detached_noise(np.vstack([xyz, noise]))[len(xyz) :]
+                mask = detached_noise(np.vstack([xyz, noise]))[len(xyz) :]
                 for row, kind in enumerate((7, 18)):
-                    tally[row] += [(told[kinds == kind] == kind).sum(), (kinds == kind).sum()]
-            found.append(" / ".join(f"{100 * hits / max(n, 1):.0f}" for hits, n in tally))
+                    tally[row] += [(mask[kinds == kind] == kind).sum(), (kinds == kind).sum()]
+            detected.append(" / ".join(f"{100 * hits / max(n, 1):.0f}" for hits, n in tally))
         rate, false = len(xyz) / spent / 1e6, 100 * (marked[good] > 0).mean()
-        print(f"| {name} | {rate:.1f} | {false:.4f} % | {' | '.join(found)} |", flush=True)
+        print(f"| {name} | {rate:.1f} | {false:.4f} % | {' | '.join(detected)} |", flush=True)
 
 
 if __name__ == "__main__":

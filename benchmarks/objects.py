@@ -1,7 +1,7 @@
 """Objects of generated towns and of Delft's train part against what truly stands there.
 
-python benchmarks/objects.py [--data FOLDER [--picture FILE]]
-python benchmarks/objects.py --classified MODEL... [--refuse REASON,...] [--flags FLAG,...]  (a row a model)
+python benchmarks/objects.py [--data FOLDER [--picture FILE]] python benchmarks/objects.py
+--classified MODEL... [--refuse REASON,...] [--flags FLAG,...]  (a row a model)
 """
 
 from __future__ import annotations
@@ -24,13 +24,18 @@ from pdal_stages.synthetic import TownOptions, make_town
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from town_truth import true_objects
 
-SIZE, DENSITY = 300.0, 8.0
-#: Two roofs are one building where they differ by at most STEP along a third of the wall they share.
-STEP, SHARE, TOUCHING = 2.5, 0.34, 0.6
+SIZE = 300.0
+DENSITY = 8.0
+#: Two roofs are one building where they differ by at most STEP along a third of the wall they
+#: share.
+STEP = 2.5
+SHARE = 0.34
+TOUCHING = 0.6
 
 
 def true_buildings(houses, step):
-    """Outlines of buildings: houses that touch and whose roofs meet; a `step` of 0: all that touch."""
+    """Outlines of buildings: houses that touch and whose roofs meet; a `step` of 0: all that
+    touch."""
     shapes = [shapely.Polygon(house.corners) for house in houses]
     parent = list(range(len(shapes)))
 
@@ -43,8 +48,8 @@ def true_buildings(houses, step):
         if shapes[a].distance(shapes[b]) >= TOUCHING:
             continue
         near = []
-        for one, other in ((a, b), (b, a)):
-            edge = shapes[one].exterior
+        for first, other in ((a, b), (b, a)):
+            edge = shapes[first].exterior
             places = shapely.line_interpolate_point(edge, np.arange(0, edge.length, 0.25))
             places = shapely.get_coordinates(
                 places[shapely.dwithin(shapes[other], places, TOUCHING)]
@@ -65,7 +70,8 @@ def true_buildings(houses, step):
 
 
 def true_spans(cables):
-    """A line of each span: its middle conductor; of `cables` (n, 2, 3) those of a span follow each other."""
+    """A line of each span: its middle conductor; of `cables` (n, 2, 3) those of a span follow each
+    other."""
     middle = cables[:, :, :2].mean(axis=1)
     apart = np.flatnonzero(np.hypot(*np.diff(middle, axis=0).T) > 1.0) + 1
     return [
@@ -76,21 +82,22 @@ def true_spans(cables):
 
 
 def town(seed, codes=None, refuse=()):
-    """Figures of a town, by its true classes or by others (`codes`: of a town its codes and reliabilities).
+    """Figures of a town, by its true classes or by others (`codes`: of a town its codes and
+    reliabilities).
 
     `refuse`: reasons of objects that are left out.
     """
-    made = make_town(SIZE, DENSITY, seed, progress=False)
+    town_points = make_town(SIZE, DENSITY, seed, progress=False)
     true = true_objects(TownOptions(SIZE, DENSITY, seed))
-    x0, y0 = made.options.origin[:2]
+    x0, y0 = town_points.options.origin[:2]
     square = shapely.box(x0, y0, x0 + SIZE, y0 + SIZE)
-    codes, told = (made.classification, None) if codes is None else codes(made)
-    cells = Cells.from_points(*made.xyz.T, codes, 0.5, reliability=told)
+    codes, reliability = (town_points.classification, None) if codes is None else codes(town_points)
+    cells = Cells.from_points(*town_points.xyz.T, codes, 0.5, reliability=reliability)
     rows = {}
     for step in (0.0, STEP):
         started = time.process_time()
-        found, _ = find_objects(cells, ObjectSettings(step=step), progress=False).without(refuse)
-        raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
+        objects, _ = find_objects(cells, ObjectSettings(step=step), progress=False).without(refuse)
+        raw = raw_outlines(objects.tables[Kind.BUILDING], 0.5)
         shapes = [shapely.transform(s, lambda xy: xy / 2) for s in straight_outlines(raw)]
         seconds = time.process_time() - started
         houses = [h.intersection(square) for h in true_buildings(true.houses, step)]
@@ -105,7 +112,7 @@ def town(seed, codes=None, refuse=()):
     ]
     places, high = np.array([(t.x, t.y) for t in trees]), np.array([t.height for t in trees])
     radius = np.array([t.radius for t in trees])
-    table = found.tables[Kind.TREE].columns
+    table = objects.tables[Kind.TREE].columns
     at = np.column_stack([table["x"], table["y"]])
     inner = shapely.contains_xy(square.buffer(-2), *at.T)
     at, tall = at[inner], table["height"][inner]
@@ -116,7 +123,7 @@ def town(seed, codes=None, refuse=()):
     extra = sorted(set(range(len(at))) - {a for a, _ in pairs})
     wrong = sum(alone[np.argmin(np.hypot(*(places - at[n]).T))] for n in extra)
     hit = sum(alone[b] for _, b in pairs)
-    paths = [shapely.LineString(path) for path in found.tables[Kind.SPAN].paths]
+    paths = [shapely.LineString(path) for path in objects.tables[Kind.SPAN].paths]
     true_paths = [line.intersection(square) for line in true_spans(true.cables)]
     lines = [
         [shapely.buffer(line, 1.0, cap_style="flat") for line in many]
@@ -129,23 +136,26 @@ def town(seed, codes=None, refuse=()):
 
 
 def delft(data, picture=None):
-    """Figures of Delft's train part by its own classes: houses covered, area, boundary; and a picture of a part."""
+    """Figures of Delft's train part by its own classes: houses covered, area, boundary; and a
+    picture of a part."""
     import json
 
     import laspy
 
     las = laspy.read(Path(data) / "delft" / "train.laz")
     xyz, codes = np.column_stack([las.x, las.y, las.z]), np.asarray(las.classification)
-    found = find_objects(Cells.from_points(*xyz.T, codes, 0.5), progress=False)
-    raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
+    objects = find_objects(Cells.from_points(*xyz.T, codes, 0.5), progress=False)
+    raw = raw_outlines(objects.tables[Kind.BUILDING], 0.5)
     listed = json.loads((Path(data) / "delft" / "buildings_train.geojson").read_text())["features"]
     true = [shapely.make_valid(shapely.from_geojson(json.dumps(f["geometry"]))) for f in listed]
     for name, shapes in (("cells", raw), ("straight", straight_outlines(raw))):
         shapes = [shapely.transform(s, lambda xy: xy / 2) for s in shapes]
         got = compare_buildings(shapes, true)
         print(
-            f"Delft, {name}: {100 * got['covered']:.1f} % of {len(true)} outlines covered by 80 % or more, "
-            f"{100 * got['area']['completeness']:.1f} % of their area, boundary {got['boundary']['median']:.2f} m, "
+            f"Delft, {name}: {100 * got['covered']:.1f} % of {len(true)} outlines covered by 80 % "
+            "or more, "
+            f"{100 * got['area']['completeness']:.1f} % of their area, boundary "
+            f"{got['boundary']['median']:.2f} m, "
             f"95 %: {got['boundary']['p95']:.2f} m"
         )
     if picture:
@@ -153,7 +163,8 @@ def delft(data, picture=None):
 
 
 def draw(path, colored, around, size=(170, 140), pixels=5, finer=3):
-    """Outlines by color, in the middle of what they are `around`: `size` in meters, `pixels` a meter."""
+    """Outlines by color, in the middle of what they are `around`: `size` in meters, `pixels` a
+    meter."""
     from PIL import Image, ImageDraw
 
     west, south, east, north = shapely.total_bounds(around)
@@ -194,10 +205,13 @@ def row(model, seeds, refuse, flags):
     by = classified(model, flags) if model != "true" else None
     figures = []
     for seed in seeds:
-        found = town(seed, by, refuse)
-        figures.append([found[f"buildings, step {STEP:g}"][0]["objects"]["f1"], *found["trees"]])
+        objects = town(seed, by, refuse)
+        figures.append(
+            [objects[f"buildings, step {STEP:g}"][0]["objects"]["f1"], *objects["trees"]]
+        )
         print(f"{model}, town {seed}: {np.round(figures[-1], 3)}", flush=True)
-    print(f"{model} {' '.join(flags)}, refuse {','.join(refuse)}: mean {np.round(np.mean(figures, axis=0), 3)}, "
+    print(f"{model} {' '.join(flags)}, refuse {','.join(refuse)}: mean "
+          f"{np.round(np.mean(figures, axis=0), 3)}, "
           f"least {np.min(np.round(figures, 3), axis=0)}", flush=True)  # fmt: skip
 
 
@@ -232,11 +246,14 @@ if __name__ == "__main__":
                 print(f"town {seed}, spans: F1 {value:.3f}")
             else:
                 got, seconds = value
-                of = got["objects"]
+                objects = got["objects"]
                 print(
-                    f"town {seed}, {name}: F1 {of['f1']:.3f} ({of['completeness']:.3f} complete, "
-                    f"{of['correctness']:.3f} correct), area IoU {got['area']['iou']:.3f}, boundary "
-                    f"{got['boundary']['median']:.2f} m, 95 %: {got['boundary']['p95']:.2f} m; {seconds:.2f} CPU s"
+                    f"town {seed}, {name}: F1 {objects['f1']:.3f} ({objects['completeness']:.3f} "
+                    "complete, "
+                    f"{objects['correctness']:.3f} correct), area IoU {got['area']['iou']:.3f}, "
+                    "boundary "
+                    f"{got['boundary']['median']:.2f} m, 95 %: {got['boundary']['p95']:.2f} m; "
+                    f"{seconds:.2f} CPU s"
                 )
     if options.data:
         delft(options.data, options.picture)

@@ -1,7 +1,8 @@
-"""The main job on real clouds, all through PDAL: train, classify, evaluate, and prove what is unchanged.
+"""The main job on real clouds, all through PDAL: train, classify, evaluate, and prove what is
+unchanged.
 
-Does what ``pdal-stages train`` and ``pdal-stages classify`` do, on the fixed train and test parts of Montpellier (classes
-2, 3, 4, 5, 6) and Delft (1, 2, 6). Test parts are scored, never fitted.
+Does what ``pdal-stages train`` and ``pdal-stages classify`` do, on the fixed train and test parts
+of Montpellier (classes 2, 3, 4, 5, 6) and Delft (1, 2, 6). Test parts are scored, never fitted.
 
     python benchmarks/real_clouds.py --data FOLDER [--work FOLDER] [--only delft] [--json FILE]
         [--model-option neighborhoods=blomley2016 ...] [--pictures FOLDER]
@@ -77,8 +78,8 @@ def job(name: str, options: argparse.Namespace, work: Path) -> dict:
     assert total is not None
     done = time.process_time()
     if options.pictures:
-        x, y, z, given, truth = np.concatenate(drawn).T
-        picture = triptych(x, y, z, given.astype(np.uint8), truth.astype(np.uint8))
+        x, y, z, labels, truth = np.concatenate(drawn).T
+        picture = triptych(x, y, z, labels.astype(np.uint8), truth.astype(np.uint8))
         write_png(options.pictures / f"{name}-errors.png", picture)
     return {
         "overall_accuracy": total.overall_accuracy,
@@ -124,20 +125,23 @@ def main() -> None:
     work.mkdir(parents=True, exist_ok=True)
     results = {}
     print(
-        f"pdal_stages {__version__}, PDAL {'.'.join(map(str, pdal_env.version()))}, {platform.platform()}"
+        f"pdal_stages {__version__}, PDAL {'.'.join(map(str, pdal_env.version()))}, "
+        f"{platform.platform()}"
     )
     for name in [options.only] if options.only else CLOUDS:
         results[name] = r = job(name, options, work)
         oa, kappa, f1, joined = PEER[name]
         print(
-            f"{name}: OA {100 * r['overall_accuracy']:.2f} (peer {oa}), kappa {100 * r['kappa']:.2f} (peer {kappa}), "
+            f"{name}: OA {100 * r['overall_accuracy']:.2f} (peer {oa}), kappa "
+            f"{100 * r['kappa']:.2f} (peer {kappa}), "
             f"mean F1 {100 * r['mean_f1']:.2f} (peer {f1})"
             + (
                 f", 3-4-5 merged OA {100 * r['merged_overall_accuracy']:.2f} (peer {joined})"
                 if joined
                 else ""
             )
-            + f"; {r['points']:,} points unchanged but for the class; train {r['train_seconds']:.0f} CPU s, "
+            + f"; {r['points']:,} points unchanged but for the class; train "
+            f"{r['train_seconds']:.0f} CPU s, "
             f"classify and evaluate {r['evaluate_seconds']:.0f}",
             flush=True,
         )

@@ -1,9 +1,10 @@
-"""Whether a survey in files is classified as the whole would be: real clouds cut where houses stand.
+"""Whether a survey in files is classified as the whole would be: real clouds cut where houses
+stand.
 
     python benchmarks/seams.py --data FOLDER
 
-Each cloud is classified as one file and, cut at two lines through buildings, as four in tiles. Prints how many points differ
-in class, height or reliability.
+Each cloud is classified as one file and, cut at two lines through buildings, as four in tiles.
+Prints how many points differ in class, height or reliability.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ DIMENSIONS = ("classification", "HeightAboveGround", "Reliability")
 
 
 def busiest(values: np.ndarray, weights: np.ndarray, low: float, high: float) -> float:
-    """The line, of those at whole meters, on both sides of which the most points of buildings lie."""
+    """The line, of those at whole meters, on both sides of which the most points of buildings
+    lie."""
     edges = np.arange(np.ceil(low), np.floor(high) + 1)
     counts = np.histogram(values[weights], edges)[0]
     return float(edges[np.argmax(counts[:-1] + counts[1:]) + 1])
@@ -36,14 +38,15 @@ def cut(path: Path, folder: Path) -> tuple[Path, list[Path]]:
     at = [busiest(v, building, *third) for v, third in zip((x, y), thirds, strict=True)]
     parts = []
     for number in range(4):
-        mine = ((x >= at[0]) == bool(number & 1)) & ((y >= at[1]) == bool(number & 2))
+        inside = ((x >= at[0]) == bool(number & 1)) & ((y >= at[1]) == bool(number & 2))
         part = laspy.LasData(las.header)
-        part.points = las.points[mine]
+        part.points = las.points[inside]
         parts.append(folder / f"part{number}.laz")
         part.write(parts[-1])
     close = (np.abs(x - at[0]) < 10) | (np.abs(y - at[1]) < 10)
     print(
-        f"{path.name}: {len(x):,} points, {np.count_nonzero(close & building):,} of buildings within 10 m of a cut"
+        f"{path.name}: {len(x):,} points, {np.count_nonzero(close & building):,} of buildings "
+        "within 10 m of a cut"
     )
     return path, parts
 
@@ -89,14 +92,14 @@ def main() -> None:
             whole, parts = cut(path, folder)
             classify(whole, folder / "whole.laz")
             classify(*parts, folder / "tiles/", "--tile", o.tile)
-            one, other = (
+            first, other = (
                 ordered([folder / "whole.laz"]),
                 ordered([folder / "tiles" / p.name for p in parts]),
             )
-            assert np.array_equal(one["xyz"], other["xyz"])
+            assert np.array_equal(first["xyz"], other["xyz"])
             print(
                 "  "
-                + ", ".join(f"{n} {np.count_nonzero(one[n] != other[n]):,}" for n in DIMENSIONS)
+                + ", ".join(f"{n} {np.count_nonzero(first[n] != other[n]):,}" for n in DIMENSIONS)
             )
 
 

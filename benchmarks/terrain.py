@@ -1,19 +1,21 @@
-"""Heights above ground: filters.hag_morphological and filters.hag_minima beside PDAL's filters.smrf with its own heights.
+"""Heights above ground: filters.hag_morphological and filters.hag_minima beside PDAL's filters.smrf
+with its own heights.
 
-Two kinds of clouds with known ground: the ISPRS filter test samples (hand-made, 0.2 to 1 points/m2) and labeled
-tiles of national surveys (training parts and single clouds, never test parts), these also thinned to 2 and 0.5
-points/m2. Nothing is read of the labels but noise (7, 18), which is left out for all. filters.smrf has its defaults,
-and its ground gives PDAL's filters.hag_nn and filters.hag_delaunay their heights; points whose return number is 0
-get 1, or it would stop.
+Two kinds of clouds with known ground: the ISPRS filter test samples (hand-made, 0.2 to 1 points/m2)
+and labeled tiles of national surveys (training parts and single clouds, never test parts), these
+also thinned to 2 and 0.5 points/m2. Nothing is read of the labels but noise (7, 18), which is left
+out for all. filters.smrf has its defaults, and its ground gives PDAL's filters.hag_nn and
+filters.hag_delaunay their heights; points whose return number is 0 get 1, or it would stop.
 
-Ground points should be at height 0. With hag_nn a point that SMRF calls ground is its own nearest one, so its height is
-0 whatever it is; other heights are measured from a surface, and the roughness of ground shows.
+Ground points should be at height 0. With hag_nn a point that SMRF calls ground is its own nearest
+one, so its height is 0 whatever it is; other heights are measured from a surface, and the roughness
+of ground shows.
 
     python benchmarks/terrain.py --data FOLDER [--json FILE] [--only isprs]
     python benchmarks/terrain.py --corners
 
-With --corners: clips of 30, 50 and 100 m of generated woods on slopes, turned at random: ground missed, and where
-the surface is more than 1 m too high.
+With --corners: clips of 30, 50 and 100 m of generated woods on slopes, turned at random: ground
+missed, and where the surface is more than 1 m too high.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ SMRF = [
     {"type": "filters.assign", "assignment": ["Classification[:]=0", "ReturnNumber[0:0]=1", "NumberOfReturns[0:0]=1"]},
     {"type": "filters.smrf"},
 ]  # fmt: skip
-OURS, SMRF_NN = "hag_morphological", "smrf + hag_nn"
+OURS = "hag_morphological"
+SMRF_NN = "smrf + hag_nn"
 METHODS: dict[str, list[dict]] = {
     OURS: [{"type": "filters.hag_morphological", "ground": True}],
     SMRF_NN: [*SMRF, {"type": "filters.hag_nn"}],
@@ -121,10 +124,11 @@ def measure(cloud: np.ndarray, left_out: tuple[int, ...], methods: dict[str, lis
 def figures(
     height: np.ndarray, called: np.ndarray | None, label: np.ndarray, left_out: tuple[int, ...]
 ) -> dict:
-    """Heights of true ground; ground missed (I), objects called ground (II) and all errors; roofs at the ground.
+    """Heights of true ground; ground missed (I), objects called ground (II) and all errors; roofs
+    at the ground.
 
-    Percent; kappa of ground against objects. The label 1 of production classes is whatever is not named, grass and
-    kerbs too, so type II errors of tiles are no errors of the method alone.
+    Percent; kappa of ground against objects. The label 1 of production classes is whatever is not
+    named, grass and kerbs too, so type II errors of tiles are no errors of the method alone.
     """
     ground = label == 2
     scored = ~np.isin(label, left_out)
@@ -222,10 +226,10 @@ def corners() -> None:
                     angle, away = rng.uniform(0, 1.5), xyz[:, :2] - rng.uniform(70, 150, 2)
                     c, s = np.cos(angle), np.sin(angle)
                     inside = (np.abs(away @ np.array([[c, -s], [s, c]])) < side / 2).all(axis=1)
-                    found, seen = ps.filtered_ground(xyz[inside]), ground[inside]
-                    height = found["HeightAboveGround"][seen]
+                    heights, seen = ps.filtered_ground(xyz[inside]), ground[inside]
+                    height = heights["HeightAboveGround"][seen]
                     rows.append([
-                        100 * (found["Ground"][seen] == 0).mean(), 100 * (height < -1).mean(), -height.min(),
+                        100 * (heights["Ground"][seen] == 0).mean(), 100 * (height < -1).mean(), -height.min(),
                         100 * (whole[inside][seen] < -1).mean(),
                     ])  # fmt: skip
             table = np.array(rows)

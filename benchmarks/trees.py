@@ -3,15 +3,20 @@
 python benchmarks/trees.py FOLDER [--part chosen|scored] [--others]
 
 FOLDER holds, as far as they are there,
-- clouds NAME_als_veg.laz in which each point has the number of its tree (`itc_ref`, from terrestrial scans), published with
-  Xi, Hopkinson, Chasmer 2024 (ISPRS Journal of Photogrammetry and Remote Sensing 209, 324-343), MIT license;
-- Demo_Data_1ha_Traunstein.rda, heights above the ground and mapped stems of a hectare of mixed forest, from the package
-  MeanShiftR (Knapp, Fischer, Huth 2018, Remote Sensing of Environment 205, 424-437); it needs `pip install rdata`.
+- clouds NAME_als_veg.laz in which each point has the number of its tree (`itc_ref`, from
+terrestrial scans), published with
+  Xi, Hopkinson, Chasmer 2024 (ISPRS Journal of Photogrammetry and Remote Sensing 209, 324-343), MIT
+  license;
+- Demo_Data_1ha_Traunstein.rda, heights above the ground and mapped stems of a hectare of mixed
+forest, from the package
+  MeanShiftR (Knapp, Fischer, Huth 2018, Remote Sensing of Environment 205, 424-437); it needs `pip
+  install rdata`.
 
-A found tree and a true one are a pair within 4 m and 30 % of height (beside it: 2 m and 15 %), the nearest first, each
-once; trees are those of 5 m or more (Traunstein: of stems of 10 cm or more) in the hull of the true ones. True heights are
-those of the trees' highest points; in Traunstein they are guessed from diameters (Naeslund's curve), so there the stricter
-match says little. `--others` adds methods of other kinds, each with the settings that were best for the chosen plots.
+A found tree and a true one are a pair within 4 m and 30 % of height (beside it: 2 m and 15 %), the
+nearest first, each once; trees are those of 5 m or more (Traunstein: of stems of 10 cm or more) in
+the hull of the true ones. True heights are those of the trees' highest points; in Traunstein they
+are guessed from diameters (Naeslund's curve), so there the stricter match says little. `--others`
+adds methods of other kinds, each with the settings that were best for the chosen plots.
 """
 
 from __future__ import annotations
@@ -32,13 +37,15 @@ from pdal_stages.objects.cells import Kind
 from pdal_stages.objects.comparison import match_by_place
 from pdal_stages.objects.crowns import canopy
 
-#: Plots by which settings were chosen, and those that were only scored; points/m2 where they are thinned, or None.
+#: Plots by which settings were chosen, and those that were only scored; points/m2 where they are
+#: thinned, or None.
 PARTS = {
     "chosen": {"LPine1": 15, "LPine4": None, "LPine5": None, "RPine": None, "Traunstein south": None},
     "scored": {"LPine2": 15, "LPine3": None, "LPine6": None, "LPine7": None, "SMaple": None, "TAspen": None,
                "Traunstein north": None},
 }  # fmt: skip
-LEAST, TOLERANCES = 5.0, ((4.0, 0.3), (2.0, 0.15))
+LEAST = 5.0
+TOLERANCES = ((4.0, 0.3), (2.0, 0.15))
 #: Layers of trees by their share of the height that a tenth of the stand's trees have.
 LAYERS = (0.0, 0.5, 0.75, 0.9, np.inf)
 
@@ -76,7 +83,9 @@ def labeled(path, density=None):
     _, near = scipy.spatial.cKDTree(2 * cell + 1).query(xyz[:, :2], k=5)
     height = xyz[:, 2] - np.median(low[near], axis=1)
     each = [tree == n for n in np.unique(tree[tree > 0])]
-    true = np.array([[*xyz[own, :2].mean(axis=0), height[own].max(), np.nan] for own in each])
+    true = np.array(
+        [[*xyz[members, :2].mean(axis=0), height[members].max(), np.nan] for members in each]
+    )
     true = true[true[:, 2] >= LEAST]
     kept = np.ones(len(xyz), bool)
     if density:
@@ -120,34 +129,36 @@ def windows(plot, base=0.8, slope=0.03):
     near = scipy.spatial.cKDTree(points[:, :2]).query_ball_point(
         points[:, :2], base + slope * points[:, 2]
     )
-    return points[[points[n, 2] >= points[around, 2].max() for n, around in enumerate(near)]]
+    return points[[points[n, 2] >= points[neighbors, 2].max() for n, neighbors in enumerate(near)]]
 
 
 def li(plot, low=1.0, high=1.5, above=15.0, most=10.0):
-    """Growing point by point from the top down (Li, Guo, Jakubowski, Kelly 2012); `low`, `high`: spacing of trees."""
+    """Growing point by point from the top down (Li, Guo, Jakubowski, Kelly 2012); `low`, `high`:
+    spacing of trees."""
     points = plot.canopy()
     points, tops = points[np.argsort(-points[:, 2], kind="stable")], []
     while len(points):
         tops.append(points[0])
         near = np.flatnonzero(np.hypot(*(points[:, :2] - points[0, :2]).T) < most)
-        own = points[near]
-        around = scipy.spatial.cKDTree(own[:, :2]).query_ball_point(own[:, :2], high)
-        highest = np.array([own[n, 2] >= own[a, 2].max() for n, a in enumerate(around)])
-        inside, outside = [0], [own[0, :2] + 100.0]
-        for n in range(1, len(own)):
-            to_tree = np.hypot(*(own[inside, :2] - own[n, :2]).T).min()
-            to_rest = np.hypot(*(np.array(outside) - own[n, :2]).T).min()
-            spacing = high if own[n, 2] > above else low
+        members = points[near]
+        neighbors = scipy.spatial.cKDTree(members[:, :2]).query_ball_point(members[:, :2], high)
+        highest = np.array([members[n, 2] >= members[a, 2].max() for n, a in enumerate(neighbors)])
+        inside, outside = [0], [members[0, :2] + 100.0]
+        for n in range(1, len(members)):
+            to_tree = np.hypot(*(members[inside, :2] - members[n, :2]).T).min()
+            to_rest = np.hypot(*(np.array(outside) - members[n, :2]).T).min()
+            spacing = high if members[n, 2] > above else low
             if to_tree <= to_rest and not (highest[n] and to_tree > spacing):
                 inside.append(n)
             else:
-                outside.append(own[n, :2])
+                outside.append(members[n, :2])
         points = np.delete(points, near[inside], axis=0)
     return np.array(tops)
 
 
 def mean_shift(plot, wide=0.2, deep=0.4, apart=1.0):
-    """Modes under a kernel that grows with height (Ferraz and others 2016); one point a voxel of 0.5 m."""
+    """Modes under a kernel that grows with height (Ferraz and others 2016); one point a voxel of
+    0.5 m."""
     points = plot.canopy()
     _, first = np.unique(np.floor(points / 0.5), axis=0, return_index=True)
     points = points[np.sort(first)]
@@ -173,8 +184,8 @@ def mean_shift(plot, wide=0.2, deep=0.4, apart=1.0):
     pairs = scipy.spatial.cKDTree(modes * [1, 1, 0.5]).query_pairs(apart, output_type="ndarray")
     graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), (len(points), len(points)))
     _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    own = [points[group == n] for n in np.flatnonzero(np.bincount(group) >= 3)]
-    return np.array([[*p[:, :2].mean(axis=0), p[:, 2].max()] for p in own])
+    trees = [points[group == n] for n in np.flatnonzero(np.bincount(group) >= 3)]
+    return np.array([[*p[:, :2].mean(axis=0), p[:, 2].max()] for p in trees])
 
 
 def raster(points, size):
@@ -186,7 +197,8 @@ def raster(points, size):
 
 
 def peaks(image, high, corner, size, radius):
-    """Places where an image is positive and highest within a radius, with the canopy's height there."""
+    """Places where an image is positive and highest within a radius, with the canopy's height
+    there."""
     r, c = np.indices((2 * int(np.ceil(radius)) + 1,) * 2) - int(np.ceil(radius))
     top = (image > 0) & (
         image == scipy.ndimage.maximum_filter(image, footprint=r * r + c * c <= radius * radius)
@@ -200,9 +212,9 @@ def layers(plot, size=0.5, sigma=0.4, radius=1.0, reach=0.6):
     points = plot.canopy(1.0)
     high, corner, at = raster(points, size)
     stack, level = np.zeros(high.shape), np.floor(points[:, 2] - 0.5)
-    for one in np.unique(level):
+    for label in np.unique(level):
         free = np.ones(high.shape, bool)
-        free[at[0][level == one], at[1][level == one]] = False
+        free[at[0][level == label], at[1][level == label]] = False
         stack += scipy.ndimage.distance_transform_edt(free) * size <= reach
     return peaks(
         scipy.ndimage.gaussian_filter(stack, sigma / size), high, corner, size, radius / size
@@ -251,40 +263,45 @@ def main():
         rows, layered, stems = [], [], []
         started = time.process_time()
         for name, plot in plots.items():
-            found, true = method(plot), plot.true
-            found = found[shapely.contains_xy(plot.area, *found[:, :2].T) & (found[:, 2] >= LEAST)]
+            tops, true = method(plot), plot.true
+            tops = tops[shapely.contains_xy(plot.area, *tops[:, :2].T) & (tops[:, 2] >= LEAST)]
             matched = [
-                match_by_place(found[:, :2], found[:, 2], true[:, :2], true[:, 2], *by)
+                match_by_place(tops[:, :2], tops[:, 2], true[:, :2], true[:, 2], *by)
                 for by in TOLERANCES
             ]
-            rows.append([f1(len(pairs), len(found), len(true)) for pairs in matched])
+            rows.append([f1(len(pairs), len(tops), len(true)) for pairs in matched])
             a, b = np.array(matched[0], int).reshape(-1, 2).T
             hit = np.isin(np.arange(len(true)), b)
             layered.append(np.column_stack([true[:, 2] / np.percentile(true[:, 2], 90), hit]))
             if method is package:
-                stems.append(np.column_stack([found[a, 3], true[b, 3]]))
+                stems.append(np.column_stack([tops[a, 3], true[b, 3]]))
                 print(
                     f"{name}: {len(true) / plot.area.area * 1e4:.0f} trees/ha, "
-                    f"{len(plot.xyz) / np.prod(np.ptp(plot.xyz[:, :2], axis=0)):.1f} points/m2, {len(true)} true, "
-                    f"{len(found)} found, {len(a)} pairs: precision {len(a) / max(len(found), 1):.2f}, "
+                    f"{len(plot.xyz) / np.prod(np.ptp(plot.xyz[:, :2], axis=0)):.1f} points/m2, "
+                    f"{len(true)} true, "
+                    f"{len(tops)} found, {len(a)} pairs: precision "
+                    f"{len(a) / max(len(tops), 1):.2f}, "
                     f"recall {hit.mean():.2f}, F1 {rows[-1][0]:.2f} ({rows[-1][1]:.2f})"
                 )
         mean = np.mean(rows, axis=0)
         print(
-            f"{method.__name__}: mean F1 {mean[0]:.3f} ({mean[1]:.3f}); {time.process_time() - started:.1f} CPU s"
+            f"{method.__name__}: mean F1 {mean[0]:.3f} ({mean[1]:.3f}); "
+            f"{time.process_time() - started:.1f} CPU s"
         )
         if method is package:
             share, hit = np.concatenate(layered).T
             for low, high in itertools.pairwise(LAYERS):
-                own = (share >= low) & (share < high)
+                in_band = (share >= low) & (share < high)
                 print(
-                    f"  of {own.sum()} trees at {low:g} to {high:g} of the top height found: {hit[own].mean():.2f}"
+                    f"  of {in_band.sum()} trees at {low:g} to {high:g} of the top height found: "
+                    f"{hit[in_band].mean():.2f}"
                 )
             guess, true = np.concatenate(stems)[~np.isnan(np.concatenate(stems)[:, 1])].T
             if len(true):
                 error = guess - true
                 print(
-                    f"  diameters of {len(true)} stems, {true.mean():.1f} cm in the mean: bias {error.mean():+.1f} cm, "
+                    f"  diameters of {len(true)} stems, {true.mean():.1f} cm in the mean: bias "
+                    f"{error.mean():+.1f} cm, "
                     f"RMSE {np.sqrt(np.mean(error**2)):.1f} cm"
                 )
 

@@ -1,14 +1,19 @@
 """A whole job, from the command to the written file: time, memory, and where both go.
 
-    python benchmarks/whole_job.py                                  # 500,000 points of a generated town
-    python benchmarks/whole_job.py --sizes 0.5 5 20                 # millions of points, peak memory
-    python benchmarks/whole_job.py --densities 1 7 50 200 500       # points per square meter, time per point
-    python benchmarks/whole_job.py --parts                          # CPU seconds of each part, one thread
+    # 500,000 points of a generated town
+    python benchmarks/whole_job.py
+    # millions of points, peak memory
+    python benchmarks/whole_job.py --sizes 0.5 5 20
+    # points per square meter, time per point
+    python benchmarks/whole_job.py --densities 1 7 50 200 500
+    # CPU seconds of each part, one thread
+    python benchmarks/whole_job.py --parts
     python benchmarks/whole_job.py --json FILE
 
-Trains a model with all defaults on one generated town (kept in --folder), classifies another with `pdal-stages classify`,
-and tells least / median / largest of --repeats runs. The command runs as a process of its own, so start, import, reading
-and writing LAZ are in its times; memory is the largest that the process ever held.
+Trains a model with all defaults on one generated town (kept in --folder), classifies another with
+`pdal-stages classify`, and tells least / median / largest of --repeats runs. The command runs as a
+process of its own, so start, import, reading and writing LAZ are in its times; memory is the
+largest that the process ever held.
 """
 
 from __future__ import annotations
@@ -83,10 +88,10 @@ def once(cloud: Path, model: str, out: Path) -> dict[str, float]:
         stderr=subprocess.PIPE,
     )
     assert process.stderr is not None
-    said = process.stderr.read()
+    errors = process.stderr.read()
     _, status, usage = os.wait4(process.pid, 0)
     if status:
-        raise SystemExit(said.decode(errors="replace"))
+        raise SystemExit(errors.decode(errors="replace"))
     wall = time.perf_counter() - began
     return {"wall": wall, "cpu": usage.ru_utime + usage.ru_stime, "memory": usage.ru_maxrss / 1024}
 
@@ -99,22 +104,24 @@ def measured(cloud: Path, model: str, repeats: int) -> dict[str, Any]:
         runs = [once(cloud, model, Path(folder, "out.laz")) for _ in range(repeats)]
     line: dict[str, Any] = {"cloud": cloud.name, "points": points}
     for key in ("wall", "cpu", "memory"):
-        found = [run[key] for run in runs]
-        line[key] = [min(found), statistics.median(found), max(found)]
+        values = [run[key] for run in runs]
+        line[key] = [min(values), statistics.median(values), max(values)]
     return line
 
 
 def table(lines: list[dict[str, Any]]) -> str:
-    """As Markdown."""
+    """Return a Markdown table."""
     out = [
-        "| cloud | points | wall s | CPU s | CPU microseconds a point | memory, MiB | bytes a point |",
+        "| cloud | points | wall s | CPU s | CPU microseconds a point | memory, MiB | bytes a "
+        "point |",
         "|---|---:|---:|---:|---:|---:|---:|",
     ]
     for line in lines:
         wall, cpu = (" / ".join(f"{v:.1f}" for v in line[key]) for key in ("wall", "cpu"))
         memory, points = line["memory"][1], line["points"]
         out.append(
-            f"| {line['cloud']} | {points:,} | {wall} | {cpu} | {1e6 * line['cpu'][1] / points:.1f} | {memory:.0f} | "
+            f"| {line['cloud']} | {points:,} | {wall} | {cpu} | "
+            f"{1e6 * line['cpu'][1] / points:.1f} | {memory:.0f} | "
             f"{memory * 2**20 / points:.0f} |"
         )
     return "\n".join(out)
@@ -145,9 +152,9 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
     las = timed("reading", laspy.read)(cloud)
     xyz = np.column_stack([las.x, las.y, las.z])
     axes = np.ascontiguousarray(xyz.T)
-    some = axes[:, :2000]  # kernels
-    detached_noise(*some)
-    filtered_ground(*some, openings=(5, 17), threads=1)
+    first_points = axes[:, :2000]  # kernels
+    detached_noise(*first_points)
+    filtered_ground(*first_points, openings=(5, 17), threads=1)
     timed("noise", detached_noise)(*axes)
     dimensions = timed("heights", filtered_ground)(*axes, openings=(5, 17), threads=1)
     dimensions["ReturnNumber"] = np.asarray(las.return_number)
@@ -157,20 +164,21 @@ def parts(cloud: Path, model_file: str) -> dict[str, float]:
         model.predict(
             xyz[:2000], {k: v[:2000] for k, v in dimensions.items()}, threads=1
         )  # kernels
-        forest, around, compute = (
+        forest, context, compute = (
             Forest.predict_proba,
             contexts.cell_means,
             feature_engine.Run.compute,
         )
         Forest.predict_proba = timed("forests", forest)  # type: ignore[method-assign]
-        contexts.cell_means = timed("context", around)
+        contexts.cell_means = timed("context", context)
         feature_engine.Run.compute = timed("features", compute)  # type: ignore[method-assign]
         try:
-            found = timed("classification", model.predict)(xyz, dimensions, threads=1)
+            prediction = timed("classification", model.predict)(xyz, dimensions, threads=1)
         finally:
-            Forest.predict_proba, contexts.cell_means = forest, around  # type: ignore[method-assign]
+            # type: ignore[method-assign]
+            Forest.predict_proba, contexts.cell_means = forest, context
             feature_engine.Run.compute = compute  # type: ignore[method-assign]
-        las.classification = found.classification
+        las.classification = prediction.classification
         timed("writing", las.write)(Path(folder, "out.laz"))
     inside = ("features", "forests", "context")
     spent["the rest of classification"] = spent.pop("classification") - sum(
@@ -192,28 +200,28 @@ def main() -> None:
     options.add_argument("--model", help="a model file, or standard; by default one is trained")
     options.add_argument("--repeats", type=int, default=3)
     options.add_argument("--json", type=Path)
-    given = options.parse_args()
-    given.folder.mkdir(parents=True, exist_ok=True)
-    model = given.model or str(trained(given.folder))
-    found: dict[str, Any] = {
+    arguments = options.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    model = arguments.model or str(trained(arguments.folder))
+    result: dict[str, Any] = {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
         "version": __version__,
         "model": Path(model).name,
     }
-    if given.parts:
-        found["parts"] = parts(town(given.folder, 0.5, 7.0, 2), model)
-        for name, seconds in found["parts"].items():
+    if arguments.parts:
+        result["parts"] = parts(town(arguments.folder, 0.5, 7.0, 2), model)
+        for name, seconds in result["parts"].items():
             print(f"{name:<28}{seconds:6.2f} CPU s")
     else:
-        if given.densities:
-            clouds = [town(given.folder, 0.5, density, 2) for density in given.densities]
+        if arguments.densities:
+            clouds = [town(arguments.folder, 0.5, density, 2) for density in arguments.densities]
         else:
-            clouds = [town(given.folder, size, 7.0, 2) for size in given.sizes or [0.5]]
-        found["runs"] = [measured(cloud, model, given.repeats) for cloud in clouds]
-        print(table(found["runs"]))
-    if given.json:
-        given.json.write_text(json.dumps(found, indent=1) + "\n")
+            clouds = [town(arguments.folder, size, 7.0, 2) for size in arguments.sizes or [0.5]]
+        result["runs"] = [measured(cloud, model, arguments.repeats) for cloud in clouds]
+        print(table(result["runs"]))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Closed woods on slopes, where few points reach the ground: what noise.py and terrain.py are tried on."""
+"""Closed woods on slopes, where few points reach the ground: what noise.py and terrain.py are tried
+on."""
 
 from __future__ import annotations
 
@@ -8,8 +9,9 @@ import numpy as np
 def closed_wood(
     slope: float, density: float, seen: float, seed: int, side: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A square of woods and meadows, `side` m wide, on a slope that faces any way: coordinates, which points are ground, and
-    which lie in the woods, of whose points about a share `seen` is ground, more in some cells of 6 m than in others."""
+    """A square of woods and meadows, `side` m wide, on a slope that faces any way: coordinates,
+    which points are ground, and which lie in the woods, of whose points about a share `seen` is
+    ground, more in some cells of 6 m than in others."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0, side, (2, int(side * side * density)))
     turn = np.array([np.cos(0.5 * seed), np.sin(0.5 * seed)])

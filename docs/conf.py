@@ -13,7 +13,8 @@ try:
     from pdal_stages import __version__
 except ModuleNotFoundError as error:
     raise ConfigError(
-        f"The pages of the stages and of the API are made from the package itself, and {error.name} is missing: "
+        "The pages of the stages and of the API are made from the package itself, and "
+        f"{error.name} is missing: "
         "pip install '.[docs]' in the environment that runs sphinx-build"
     ) from None
 

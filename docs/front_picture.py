@@ -1,9 +1,10 @@
-"""The picture of the first page: a real tile as it comes and as ``pdal-stages classify`` gives it back.
+"""The picture of the first page: a real tile as it comes and as ``pdal-stages classify`` gives it
+back.
 
 python docs/front_picture.py --data FOLDER        # writes docs/pictures/raw-and-classified.png
 
-FOLDER holds montpellier/test_*.laz, two adjoining 50 m tiles of the French national survey that the shipped model has
-not seen.
+FOLDER holds montpellier/test_*.laz, two adjoining 50 m tiles of the French national survey that the
+shipped model has not seen.
 """
 
 from __future__ import annotations

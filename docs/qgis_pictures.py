@@ -3,8 +3,8 @@
     PDAL_STAGES_DATA=FOLDER xvfb-run -s "-screen 0 1500x950x24" \
         qgis --nologo --noversioncheck --profiles-path /tmp/profile --code docs/qgis_pictures.py
 
-Run it in the checkout, with PDAL_STAGES_PROGRAM=.venv/bin/pdal-stages, in a shell where no virtual environment is active:
-QGIS would take its Python. QGIS closes by itself.
+Run it in the checkout, with PDAL_STAGES_PROGRAM=.venv/bin/pdal-stages, in a shell where no virtual
+environment is active: QGIS would take its Python. QGIS closes by itself.
 """
 
 import os
@@ -84,8 +84,8 @@ def the_map(plugin, folder):
     processing.run(
         "pdalstages:classify", {"INPUT": TILE, "OUTPUT": cloud, "MAP": classes, "SHOW": False}
     )
-    asked = {"INPUT": cloud, "RESOLUTION": 0.5, "TERRAIN": None, "SURFACE": surface}
-    processing.run("pdalstages:terrainmodels", asked)
+    parameters = {"INPUT": cloud, "RESOLUTION": 0.5, "TERRAIN": None, "SURFACE": surface}
+    processing.run("pdalstages:terrainmodels", parameters)
     processing.run("pdalstages:objects", {"INPUTS": [cloud], "OUTPUT": objects, "SHOW": False})
     layers = [QgsRasterLayer(classes, "Map of classes"), QgsRasterLayer(surface, "Surface model")]
     results.classes_of(plugin.provider.forms()["classes"])(layers[0])

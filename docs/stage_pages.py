@@ -1,4 +1,5 @@
-"""Pages of stages: a text of docs/stage_texts or the docstring of the class, with tables of declarations.
+"""Pages of stages: a text of docs/stage_texts or the docstring of the class, with tables of
+declarations.
 
 python docs/stage_pages.py        # writes docs/stages/*.md
 """
@@ -14,7 +15,8 @@ from pdal_stages.stages.base import Stage
 from pdal_stages.stages.registry import stage_types
 
 FOLDER = Path(__file__).resolve().parent / "stages"
-#: What is written by hand of each stage: what it does, an example; the dimensions, where that needs files.
+#: What is written by hand of each stage: what it does, an example; the dimensions, where that needs
+#: files.
 TEXTS = FOLDER.with_name("stage_texts")
 
 
@@ -26,15 +28,16 @@ def page(stage: type[Stage]) -> str:
         lines += [f"Source: {stage.source} (see [the papers](../papers.md)).", ""]
     lines += [text, ""]
     if "## Dimensions" not in text:
-        made = stage({name: value for name, value in example(stage).items() if name != "type"})
-        reads, creates = made.reads(), made.creates()
+        instance = stage({name: value for name, value in example(stage).items() if name != "type"})
+        reads, creates = instance.reads(), instance.creates()
         lines += [
             "## Dimensions",
             "",
             f"- Reads: X, Y, Z{''.join(f', {name}' for name in reads)}",
-            f"- Writes: {', '.join(f'`{name}` ({kind})' for name, kind in list(creates.items())[:8]) or 'none'}"
+            "- Writes: "
+            f"{', '.join(f'`{name}` ({kind})' for name, kind in list(creates.items())[:8]) or 'none'}"
             + (f" and {len(creates) - 8} more" if len(creates) > 8 else ""),
-            f"- Halo: {made.halo_m():g} m round a tile, with the example's options",
+            f"- Halo: {instance.halo_m():g} m round a tile, with the example's options",
             "",
         ]
     lines += ["## Options", "", "| option | default | meaning |", "|---|---|---|"]
@@ -55,7 +58,11 @@ def text_of(stage: type[Stage]) -> str:
 def example(stage: type[Stage]) -> dict[str, Any]:
     """The stage in the pipeline that its text shows."""
     pipeline = json.loads(text_of(stage).partition("```json\n")[2].partition("\n```")[0])
-    return next(one for one in pipeline if isinstance(one, dict) and one.get("type") == stage.type)
+    return next(
+        stage_json
+        for stage_json in pipeline
+        if isinstance(stage_json, dict) and stage_json.get("type") == stage.type
+    )
 
 
 def _row(option) -> str:

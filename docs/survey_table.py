@@ -1,4 +1,5 @@
-"""The model's accuracy on places it had not seen, in a few lines, from ``benchmarks/surveys/leave_one_out.py``.
+"""The model's accuracy on places it had not seen, in a few lines, from
+``benchmarks/surveys/leave_one_out.py``.
 
 python docs/survey_table.py        # prints what the README says
 """

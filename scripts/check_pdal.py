@@ -2,10 +2,11 @@
 
     python scripts/check_pdal.py [--quiet] [--program PDAL] [--driver-path]
 
-Runs a pipeline whose Python step changes three points, which no broken mixture of versions survives; with
-``--program`` also through that ``pdal`` program, which must run this very interpreter's packages. Exit status 0:
-it works. 1: it does not, and standard error says why. Needs nothing but python-pdal. With ``--driver-path``
-only print the folder of this interpreter's PDAL plugins.
+Runs a pipeline whose Python step changes three points, which no broken mixture of versions
+survives; with ``--program`` also through that ``pdal`` program, which must run this very
+interpreter's packages. Exit status 0: it works. 1: it does not, and standard error says why. Needs
+nothing but python-pdal. With ``--driver-path`` only print the folder of this interpreter's PDAL
+plugins.
 """
 
 from __future__ import annotations
@@ -100,7 +101,8 @@ def main() -> int:
         import pdal
 
         print(
-            f"PDAL {pdal.info.version}, python-pdal {pdal.__version__}, Python {sys.version.split()[0]}"
+            f"PDAL {pdal.info.version}, python-pdal {pdal.__version__}, Python "
+            f"{sys.version.split()[0]}"
         )
     return 0
 

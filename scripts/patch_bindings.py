@@ -2,8 +2,8 @@
 
     python patch_bindings.py PDAL_SOURCES PLUGINS_SOURCES PDAL_PROGRAM [PLUGIN_FOLDER]
 
-Each patch says how often it must apply, so another release of the sources is refused, not half patched.
-Called by scripts/install-pdal, which chooses the releases.
+Each patch says how often it must apply, so another release of the sources is refused, not half
+patched. Called by scripts/install-pdal, which chooses the releases.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from pathlib import Path
 
 def substitute(file: Path, pattern: str, replacement: str, times: int) -> None:
     """Replace ``pattern`` in ``file``; stop unless it is found exactly ``times`` times."""
-    text, found = re.subn(
+    text, count = re.subn(
         pattern, replacement, file.read_text(encoding="utf-8"), flags=re.MULTILINE
     )
-    if found != times:
+    if count != times:
         raise SystemExit(
-            f"{file}: {pattern!r} found {found} times, not {times}: not the expected release"
+            f"{file}: {pattern!r} found {count} times, not {times}: not the expected release"
         )
     file.write_text(text, encoding="utf-8")
 
 
 def numpy_2(bindings: Path, plugins: Path) -> None:
-    """Let python-pdal 3.1 and pdal-plugins 1.0 compile with NumPy 2, whose array descriptor is opaque.
+    """Let python-pdal 3.1 and pdal-plugins 1.0 compile with NumPy 2, whose array descriptor is
+    opaque.
 
     Compiled so, they run with NumPy 1 and 2. Later releases have this.
     """
@@ -73,10 +74,12 @@ def inject_pdal_drivers() -> None:
 
 
 def one_program(bindings: Path, program: str) -> None:
-    """Let python-pdal 3.1 ask the PDAL it was compiled for, whatever PATH says, once, and only for what needs it.
+    """Let python-pdal 3.1 ask the PDAL it was compiled for, whatever PATH says, once, and only for
+    what needs it.
 
-    It learns the drivers by running ``pdal --drivers`` and ``pdal --options``, the second one twice, whenever it is
-    imported: a tenth of a second, and pipelines given as JSON need none of it.
+    It learns the drivers by running ``pdal --drivers`` and ``pdal --options``, the second one
+    twice, whenever it is imported: a tenth of a second, and pipelines given as JSON need none of
+    it.
     """
     drivers = bindings / "pdal/drivers.py"
     second = r"^    command = 'pdal --options all --showjson'\n(?:.*\n)*?    options = dict\(.*\)\n"
@@ -103,7 +106,8 @@ def plugin_folder(bindings: Path, source: str, folder: str) -> None:
 def exception_references(plugins: Path, source: str) -> None:
     """Mend a crash when the interpreter ends after a Python step raised.
 
-    PyTuple_SetItem takes over the references to the exception, which are released once more further down.
+    PyTuple_SetItem takes over the references to the exception, which are released once more further
+    down.
     """
     substitute(
         plugins / source / "plang/Environment.cpp",

@@ -8,15 +8,17 @@ Fixtures
     write_las      function: ``write_las(path, arrays, point_format=3, ...) -> Path``
 
 Markers
-    ``@pytest.mark.pdal``  needs PDAL with ``filters.python``; the test skips (or fails, see below) without it
+    ``@pytest.mark.pdal``  needs PDAL with ``filters.python``; the test skips (or fails, see below)
+                           without it
     ``@pytest.mark.data``  needs the real clouds; the test skips without them
     ``@pytest.mark.slow``  more than about ten seconds; ``-m "not slow"`` leaves it out
 
 Environment
     PDAL_STAGES_DATA     folder of the real clouds; default ``../shared/data`` beside the checkout
-    PDAL_STAGES_REQUIRE  comma-separated: ``pdal`` makes a skip for want of PDAL a failure, ``data`` one for want of
-                         the real clouds, ``torch`` one for want of PyTorch (continuous integration sets ``pdal``,
-                         and ``torch`` where it can be installed)
+    PDAL_STAGES_REQUIRE  comma-separated: ``pdal`` makes a skip for want of PDAL a failure, ``data``
+                         one for want of the real clouds, ``torch`` one for want of PyTorch
+                         (continuous integration sets ``pdal``, and ``torch`` where it can be
+                         installed)
 """
 
 from __future__ import annotations
@@ -37,14 +39,15 @@ import pytest
 from block_scene import ground_and_block
 from hypothesis import HealthCheck, settings
 
-# nohup and background jobs of scripts ignore signals, and so would all that tests start and interrupt.
+# nohup and background jobs of scripts ignore signals, and so would all that tests start and
+# interrupt.
 for _ignored, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
     _number = getattr(signal, _ignored, None)
     if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _usual)
 
-# A slow or busy machine is no failure. Continuous integration draws the same examples every time, so that a change is
-# judged by what it changed.
+# A slow or busy machine is no failure. Continuous integration draws the same examples every time,
+# so that a change is judged by what it changed.
 settings.register_profile(
     "any machine",
     deadline=None,
@@ -63,8 +66,8 @@ REQUIRED = {
 NO_DATA = "real clouds not found"
 NO_TORCH = "PyTorch is not installed"
 
-# A skip reason that names PDAL itself. "PDAL 2.5" or "PDAL >= 2.5" asks for a version, which is another
-# matter, and PDAL_STAGES_DATA is another word.
+# A skip reason that names PDAL itself. "PDAL 2.5" or "PDAL >= 2.5" asks for a version, which is
+# another matter, and PDAL_STAGES_DATA is another word.
 WANT_OF_PDAL = re.compile(
     r"(\bpdal\b(?!\s*(>=|<=|>|<|\d))|filters\.python|readers\.numpy)", re.IGNORECASE
 )
@@ -75,7 +78,7 @@ WANT_OF_PDAL = re.compile(
 
 @cache
 def find_pdal() -> tuple[Path | None, str]:
-    """Find a ``pdal`` program with ``filters.python``: this environment's own first, then PATH's."""
+    """Find a ``pdal`` program with ``filters.python``, in this environment, then on PATH."""
     seen = []
     names = [
         Path(sys.prefix) / "bin" / "pdal",
@@ -94,8 +97,8 @@ def find_pdal() -> tuple[Path | None, str]:
         )
         if answer.returncode == 0 and "filters.python" in answer.stdout:
             return program, ""
-        said = answer.stderr.strip().splitlines()[-1:] or ["no filters.python among its drivers"]
-        seen.append(f"{program}: {said[0]}")
+        lines = answer.stderr.strip().splitlines()[-1:] or ["no filters.python among its drivers"]
+        seen.append(f"{program}: {lines[0]}")
     return None, "PDAL with filters.python not found (" + (
         "; ".join(seen) or "no pdal program on PATH"
     ) + ")"
@@ -206,7 +209,8 @@ def random_cloud():
     """Return a function that makes uniform random clouds.
 
     ``random_cloud(n, seed=0, extent=(20, 20, 5), origin=(0, 0, 0), decimals=3) -> (n, 3) float64``;
-    ``origin=(500000, 6000000, 100)`` gives UTM-sized coordinates, ``decimals=None`` leaves them unrounded.
+    ``origin=(500000, 6000000, 100)`` gives UTM-sized coordinates, ``decimals=None`` leaves them
+    unrounded.
     """
 
     def make(n, seed=0, extent=(20.0, 20.0, 5.0), origin=(0.0, 0.0, 0.0), decimals=3):
@@ -243,12 +247,13 @@ LASPY_NAMES = {
 def write_las():
     """Return a function that writes LAS or LAZ with laspy, independent of PDAL.
 
-    ``write_las(path, arrays, point_format=3, minor_version=None, scale=0.001, offset=None, wkt=None)``
-    returns the path. ``arrays`` maps PDAL's dimension names (``X``, ``Y``, ``Z``, ``Classification``, ...) to
-    equally long arrays; a name LAS does not know becomes an extra-bytes dimension of the array's type.
-    ``ScanAngleRank`` is in degrees in every format. ``minor_version`` defaults to 2 for formats 0-3, else 4.
-    ``offset`` defaults to the floored minimum. ``wkt`` adds an OGC WKT record and sets the header's WKT bit.
-    A path ending in .laz is compressed.
+    ``write_las(path, arrays, point_format=3, minor_version=None, scale=0.001, offset=None,
+    wkt=None)`` returns the path. ``arrays`` maps PDAL's dimension names (``X``, ``Y``, ``Z``,
+    ``Classification``, ...) to equally long arrays; a name LAS does not know becomes an extra-bytes
+    dimension of the array's type. ``ScanAngleRank`` is in degrees in every format.
+    ``minor_version`` defaults to 2 for formats 0-3, else 4. ``offset`` defaults to the floored
+    minimum. ``wkt`` adds an OGC WKT record and sets the header's WKT bit. A path ending in .laz is
+    compressed.
     """
     import laspy
 
@@ -291,7 +296,7 @@ def write_las():
 
 @pytest.fixture
 def run(capsys):
-    """Return a function that runs a command of ours: ``run(*words) -> (exit code, output, errors)``."""
+    """Return a function ``run(*words) -> (exit code, output, errors)`` of our command."""
     from pdal_stages.cli import main
 
     def go(*words):
@@ -303,7 +308,7 @@ def run(capsys):
 
 @pytest.fixture
 def run_job(tmp_path, run):
-    """Return a function that writes a pipeline and runs a command on it: ``run_job(stages, *words, command="pipeline")``."""
+    """Return ``run_job(stages, *words, command="pipeline")``, which writes a pipeline first."""
 
     def go(stages, *words, command="pipeline"):
         path = tmp_path / "job.json"
@@ -361,8 +366,8 @@ def ready_halves(ready_town, tmp_path_factory) -> Path:
 
     folder, las = tmp_path_factory.mktemp("halves"), laspy.read(ready_town)
     west = np.asarray(las.x) <= 500_030
-    for name, mine in (("west", west), ("east", ~west)):
-        las[mine].write(folder / f"{name}.laz")
+    for name, side in (("west", west), ("east", ~west)):
+        las[side].write(folder / f"{name}.laz")
     return folder
 
 

@@ -14,12 +14,12 @@ def ended(*words, env=None, **how) -> subprocess.CompletedProcess[str]:
 
 
 def printed(*words, **how) -> str:
-    """What a program printed, which must have succeeded."""
+    """Run a program that must succeed; return what it printed."""
     done = ended(*words, **how)
     assert done.returncode == 0, (done.returncode, done.stdout, done.stderr)
     return done.stdout
 
 
 def python(code: str, **how) -> str:
-    """What Python code printed in a process of its own, which must have succeeded."""
+    """Run Python code in a new process; return what it printed, which must have succeeded."""
     return printed(sys.executable, "-X", "faulthandler", "-c", code, **how)

@@ -1,12 +1,14 @@
-"""[B16]'s experiments on real production clouds: seven neighborhoods x three feature sets on each scene.
+"""[B16]'s experiments on real production clouds: seven neighborhoods x three feature sets on each
+scene.
 
     python benchmarks/papers/b16_experiments.py --data DIR --cache DIR
 
-DIR holds montpellier/ and delft/ (train*.laz, test*.laz), or any folder of ``.pts`` text (see pts_input.py).
-Measures are the covariance and geometric features and the point's own height Z; distributions are the shape
-distributions. 1,000 samples per class, a forest of fully grown trees, all test points of the classes. The number of
-trees is searched in a grid, as the paper does; it does not say by what. Here it is the one of TREES whose forest is right
-about the most of its out-of-bag samples.
+DIR holds montpellier/ and delft/ (train*.laz, test*.laz), or any folder of ``.pts`` text (see
+pts_input.py). Measures are the covariance and geometric features and the point's own height Z;
+distributions are the shape distributions. 1,000 samples per class, a forest of fully grown trees,
+all test points of the classes. The number of trees is searched in a grid, as the paper does; it
+does not say by what. Here it is the one of TREES whose forest is right about the most of its
+out-of-bag samples.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ NEIGHBORHOODS = {
     "all": ("c1", "c2", "c3", "c5", "kopt"),
 }
 SETS = ("measures", "distributions", "both")
-COUNT, TREES = 1000, (50, 100, 200)
+COUNT = 1000
+TREES = (50, 100, 200)
 EXPERIMENT = 3  # raised when runs mean something else than before, so that none is resumed
 
 
@@ -65,8 +68,10 @@ def experiment(
     forest = search_trees(
         np.clip(chosen, low, high), scene.train.labels[rows], TREES, seed=seed, threads=threads
     )
-    found = predict(forest, scenes.Columns(scene.test_values, columns), scene.classes, low, high)
-    result = Accuracy.from_labels(scene.test.labels, found, classes=scene.classes)
+    prediction = predict(
+        forest, scenes.Columns(scene.test_values, columns), scene.classes, low, high
+    )
+    result = Accuracy.from_labels(scene.test.labels, prediction, classes=scene.classes)
     return {**figures(result), "features": len(names), "trees": len(forest.estimators_)}
 
 
@@ -90,8 +95,8 @@ def report(runs: list[dict[str, Any]]) -> str:
                 [
                     hood,
                     *(
-                        spread(values(choose(here, neighborhood=hood, set=one), key))
-                        for one in SETS
+                        spread(values(choose(here, neighborhood=hood, set=kind), key))
+                        for kind in SETS
                     ),
                 ]
                 for hood in NEIGHBORHOODS
@@ -103,8 +108,8 @@ def report(runs: list[dict[str, Any]]) -> str:
                     [
                         hood,
                         *(
-                            spread(values(choose(here, neighborhood=hood, set=one), key, code), 1)
-                            for one in SETS
+                            spread(values(choose(here, neighborhood=hood, set=kind), key, code), 1)
+                            for kind in SETS
                         ),
                     ]
                     for hood in NEIGHBORHOODS
@@ -124,7 +129,7 @@ def report(runs: list[dict[str, Any]]) -> str:
 
 
 def _findings(runs: list[dict[str, Any]]) -> str:
-    """How often each of the paper's three findings holds, seed against seed."""
+    """Return how often each of the paper's three findings holds, seed against seed."""
 
     def better(first: tuple[str, str], second: tuple[str, str]) -> str:
         pairs = []
@@ -145,16 +150,19 @@ def _findings(runs: list[dict[str, Any]]) -> str:
     singles = ("c1", "c2", "c3", "c5")
     rows += [
         [
-            f"all cylinders beat {one}, {feature_set}",
-            better(("all cylinders", feature_set), (one, feature_set)),
+            f"all cylinders beat {neighborhood}, {feature_set}",
+            better(("all cylinders", feature_set), (neighborhood, feature_set)),
         ]
         for feature_set in SETS
-        for one in singles
+        for neighborhood in singles
     ]
     rows += [
-        [f"all beat {one}, {feature_set}", better(("all", feature_set), (one, feature_set))]
+        [
+            f"all beat {neighborhood}, {feature_set}",
+            better(("all", feature_set), (neighborhood, feature_set)),
+        ]
         for feature_set in SETS
-        for one in ("all cylinders", "kopt")
+        for neighborhood in ("all cylinders", "kopt")
     ]
     head = ("Finding", "Gain in kappa, mean over seeds (seeds where it holds)")
     return "The paper's findings, tested\n\n" + table(head, rows)
@@ -168,10 +176,10 @@ def run_scene(
         for feature_set in SETS:
             for hood in NEIGHBORHOODS:
                 run = {"scene": scene.name, "neighborhood": hood, "set": feature_set, "seed": seed}
-                made = results.get(
+                tables = results.get(
                     run, lambda h=hood, f=feature_set, s=seed: experiment(scene, h, f, s, threads)
                 )
-                runs.append({**run, **made})
+                runs.append({**run, **tables})
     return runs
 
 

@@ -14,7 +14,8 @@ from pdal_stages.terrain.minima import hag_minima
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A labeled cloud: (n, 3) coordinates in meters, (n,) class codes, and the points' own dimensions."""
+    """A labeled cloud: (n, 3) coordinates in meters, (n,) class codes, and the points' own
+    dimensions."""
 
     name: str
     xyz: np.ndarray
@@ -47,8 +48,8 @@ def read_cloud(paths: Iterable[Path], name: str) -> Cloud:
 
 def with_height(cloud: Cloud) -> Cloud:
     """The cloud with HeightAboveGround [W18 3.2]."""
-    made = hag_minima(*cloud.xyz.T)
-    height = made[0] if isinstance(made, tuple) else made
+    heights = hag_minima(*cloud.xyz.T)
+    height = heights[0] if isinstance(heights, tuple) else heights
     return Cloud(
         cloud.name, cloud.xyz, cloud.labels, {**cloud.dimensions, "HeightAboveGround": height}
     )

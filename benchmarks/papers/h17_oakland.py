@@ -2,15 +2,16 @@
 
     python benchmarks/papers/h17_oakland.py --data DIR --cache DIR
 
-DIR holds oakland/train/*.laz and oakland/test/*.laz; points of class 0 are left out, as neighbors too. Six features of
-one neighborhood each, 1,000 samples per class, 200 trees, at the paper's depth (the root of the number of features) and
-without a limit. The curvature threshold is fitted to the test clouds and as many points of each class of the training cloud
-as the paper's has, together. Then the overall accuracy over the threshold (their Figure 4), each class's share of scattered
-points (their Table 1), the other entropy that the paper may mean for v_r, what is averaged, and departures from the paper:
-other height differences, other training points.
+DIR holds oakland/train/*.laz and oakland/test/*.laz; points of class 0 are left out, as neighbors
+too. Six features of one neighborhood each, 1,000 samples per class, 200 trees, at the paper's depth
+(the root of the number of features) and without a limit. The curvature threshold is fitted to the
+test clouds and as many points of each class of the training cloud as the paper's has, together.
+Then the overall accuracy over the threshold (their Figure 4), each class's share of scattered
+points (their Table 1), the other entropy that the paper may mean for v_r, what is averaged, and
+departures from the paper: other height differences, other training points.
 
-Neighborhood features are computed once: a point's curvature-adaptive features are either those of the scattered or
-those of the regular kind, so any threshold is a choice between two tables.
+Neighborhood features are computed once: a point's curvature-adaptive features are either those of
+the scattered or those of the regular kind, so any threshold is a choice between two tables.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ from pdal_stages.features.neighborhoods import LEAST_MEMBERS
 CLASSES = {2: "Ground", 5: "Vegetation", 6: "Facade", 14: "Wire", 15: "Pole/trunk"}
 SIX = ("Verticality", "HeightRange", "Linearity", "Planarity", "Scattering", "SurfaceVariation")
 TOKENS = {"v_k": "kopt", "v_r": "ropt", "v_c": "copt"}
-#: v_r, its radius chosen by the entropy of dimensionality [Demantke et al. 2011] instead of the eigenentropy.
+#: v_r, its radius chosen by the entropy of dimensionality [Demantke et al. 2011] instead of the
+#: eigenentropy.
 BY_DIMENSIONALITY = "v_r by dimensionality"
 #: v_c, whose regular half is v_r within other radii, read the same way.
 V_C_BY_DIMENSIONALITY = "v_c by dimensionality"
@@ -56,8 +58,8 @@ DIMENSIONALITY = {BY_DIMENSIONALITY: "rdim", V_C_BY_DIMENSIONALITY: "rdim(0.5,2,
 #: What v_c takes for scattered and for regular points, each for all points.
 HALVES = {"scattered": "k in 10..50 within 3 m", "regular": "r in 0.5..2.0 m"}
 EVERY = {*TOKENS, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY, *HALVES}
-#: Column 1 of the six, height difference, as ...; "range" is the paper's (trees see no difference between a height and
-#: its multiple), the others are departures.
+#: Column 1 of the six, height difference, as ...; "range" is the paper's (trees see no difference
+#: between a height and its multiple), the others are departures.
 HEIGHTS = ("range", "range/diameter", "range of c1", "above ground", "none")
 #: Mean precision, mean recall, mean F1 as published.
 PUBLISHED = {
@@ -65,14 +67,16 @@ PUBLISHED = {
     "v_r": (84.76, 69.29, 70.11),
     "v_c": (87.34, 72.66, 74.43),
 }
-#: Table 1: points of each class, training and test clouds together, and how many of them are scattered.
+#: Table 1: points of each class, training and test clouds together, and how many of them are
+#: scattered.
 PUBLISHED_SHARES = {
     2: (948_267, 10_535), 5: (281_766, 271_703), 6: (115_825, 24_061), 14: (6_455, 2_105), 15: (9_019, 4_261),
 }  # fmt: skip
 #: Recall of ground as published (the words exchanged).
 PUBLISHED_GROUND = 0.9970
 CURVE = (0.01, 0.02, 0.03, 0.04, 0.05)
-COUNT, TREES = 1000, 200
+COUNT = 1000
+TREES = 200
 EXPERIMENT = 3  # raised when runs mean something else than before, so that none is resumed
 #: Points of each class in the training cloud of the papers; ours has more ground and vegetation.
 PAPERS_CLOUD = {2: 14_121, 5: 14_441, 6: 4_713, 14: 2_571, 15: 1_086}
@@ -87,7 +91,8 @@ OTHERS = (("as it lies", "range"), ("as it lies", "above ground"), ("whole", "ra
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """All clouds of a part together: labels, number of the cloud, curvature, heights, tables (n, 7) of features."""
+    """All clouds of a part together: labels, number of the cloud, curvature, heights, tables (n, 7)
+    of features."""
 
     labels: np.ndarray
     cloud: np.ndarray
@@ -97,7 +102,8 @@ class Part:
     tables: dict[str, np.ndarray]
 
     def adaptive(self, threshold: float, regular: str = "regular") -> np.ndarray:
-        """The curvature-adaptive table at a threshold; `regular` names the table of regular points."""
+        """The curvature-adaptive table at a threshold; `regular` names the table of regular
+        points."""
         scattered = self.curvature >= threshold
         return np.where(scattered[:, None], self.tables["scattered"], self.tables[regular])
 
@@ -142,9 +148,9 @@ def compute(
         )
         kept = {"kopt": "kopt", "ropt": "ropt", "copt": "regular"}
         kept |= {token: name for name, token in DIMENSIONALITY.items()}
-        for one in plans[""][0].neighborhoods:
-            if name := kept.get(one.token):
-                columns = [names.index(f"{word}_{one.suffix}") for word in words]
+        for neighborhood in plans[""][0].neighborhoods:
+            if name := kept.get(neighborhood.token):
+                columns = [names.index(f"{word}_{neighborhood.suffix}") for word in words]
                 parts.setdefault(name, []).append(np.array(first[:, columns]))
         columns = [
             plans["scattered"][0].names.index(f"{word}_copt") for word in words
@@ -197,10 +203,10 @@ def score(
     forest = grow_forest(
         chosen, train.labels[rows], trees=TREES, depth=depth, seed=seed, threads=threads
     )
-    found = predict(forest, matrix(test, test.table(name, threshold), height), list(CLASSES))
-    result = figures(Accuracy.from_labels(test.labels, found, classes=list(CLASSES)))
+    predicted = predict(forest, matrix(test, test.table(name, threshold), height), list(CLASSES))
+    result = figures(Accuracy.from_labels(test.labels, predicted, classes=list(CLASSES)))
     clouds = [
-        _matrix(test.labels[test.cloud == k], found[test.cloud == k])
+        _matrix(test.labels[test.cloud == k], predicted[test.cloud == k])
         for k in range(test.cloud[-1] + 1)
     ]
     return {**result, "clouds": clouds, "over_clouds": over_clouds(clouds)}
@@ -214,7 +220,8 @@ def _matrix(truth: np.ndarray, found: np.ndarray) -> list[list[int]]:
 
 
 def samples(labels: np.ndarray, sampling: str, seed: int) -> np.ndarray:
-    """Training points: 1,000 per class; as many in all, drawn as they lie; or the papers' training cloud."""
+    """Training points: 1,000 per class; as many in all, drawn as they lie; or the papers' training
+    cloud."""
     if sampling == "balanced":
         return draw(labels, list(CLASSES), COUNT, seed)
     random = np.random.default_rng(seed)
@@ -229,7 +236,8 @@ def samples(labels: np.ndarray, sampling: str, seed: int) -> np.ndarray:
 
 
 def pooled(train: Part, test: Part) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and curvatures of the test clouds and of as many points of each class as the paper's training cloud has."""
+    """Labels and curvatures of the test clouds and of as many points of each class as the paper's
+    training cloud has."""
     rows = samples(train.labels, "whole", 0)
     return np.concatenate([test.labels, train.labels[rows]]), np.concatenate(
         [test.curvature, train.curvature[rows]]
@@ -258,20 +266,22 @@ def ground_lost(run: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def averages_of(run: Mapping[str, Any]) -> list[float] | None:
-    """Those of :func:`over_clouds`: of the run's own matrices, or as results that were taken over have them, if any do."""
+    """Those of :func:`over_clouds`: of the run's own matrices, or as results that were taken over
+    have them, if any do."""
     return over_clouds(run["clouds"]) if "clouds" in run else run.get("over_clouds")
 
 
 def over_clouds(clouds: Iterable[Any]) -> list[float]:
-    """Mean precision, recall, F1 and OA, each computed of one cloud's confusion matrix and then averaged."""
+    """Mean precision, recall, F1 and OA, each computed of one cloud's confusion matrix and then
+    averaged."""
     each = []
     for counts in clouds:
         counts = np.asarray(counts)
-        true, said, right = counts.sum(axis=1), counts.sum(axis=0), counts.diagonal()
+        true, predicted, right = counts.sum(axis=1), counts.sum(axis=0), counts.diagonal()
         shares = [
-            right / np.maximum(said, 1),
+            right / np.maximum(predicted, 1),
             right / np.maximum(true, 1),
-            2 * right / np.maximum(true + said, 1),
+            2 * right / np.maximum(true + predicted, 1),
         ]
         # Means are of the classes that a cloud has.
         each.append((*np.mean(shares, axis=1, where=true > 0), right.sum() / counts.sum()))
@@ -288,12 +298,14 @@ def _scores(some: list[Mapping[str, Any]]) -> list[str]:
     return [spread(values(some, key)) for key in ("mcp", "mcr", "mf1", "oa")]
 
 
-def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
+def report(runs: list[dict[str, Any]], curvature: dict[str, Any]) -> str:
     """All tables as Markdown."""
-    main = {"height": "range", "threshold": found["pooled"], "sampling": None}
+    main = {"height": "range", "threshold": curvature["pooled"], "sampling": None}
     text = [
-        f"Threshold found by 2-means: {found['pooled']:.4f} (test and training points together, used below), "
-        f"{found['train']:.4f} (training cloud alone), {found['test']:.4f} (test clouds alone); published 0.03\n"
+        f"Threshold found by 2-means: {curvature['pooled']:.4f} (test and training points "
+        "together, used below), "
+        f"{curvature['train']:.4f} (training cloud alone), {curvature['test']:.4f} (test clouds "
+        "alone); published 0.03\n"
     ]
     rows = []
     for name in (*PUBLISHED, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY):
@@ -304,36 +316,37 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
             best = "96.1 (best)" if name == "v_c" else "–"
             rows.append([f"{name} published", "2", recall, precision, f1, best, "–"])
         for depth in (2, 3, None):
-            some = choose(runs, **main, name=name, depth=depth)
-            if some:
-                cells = [*_scores(some), spread(values(some, "kappa"))]
-                words = f"{name} ours, {len(some)} seed{'s' * (len(some) > 1)}"
+            chosen = choose(runs, **main, name=name, depth=depth)
+            if chosen:
+                cells = [*_scores(chosen), spread(values(chosen, "kappa"))]
+                words = f"{name} ours, {len(chosen)} seed{'s' * (len(chosen) > 1)}"
                 rows.append([words, str(depth or "unlimited"), *cells])
     text.append(
-        "Precision and recall of the published rows stand exchanged, as they must be (published.md)\n"
+        "Precision and recall of the published rows stand exchanged, as they must be "
+        "(published.md)\n"
     )
     text.append(table(("Neighborhood", "Depth", *SCORES, "Kappa"), rows))
     rows = []
     for name in PUBLISHED:
-        some = [averages_of(run) for run in choose(runs, **main, name=name, depth=None)]
-        rows.append([name, *(spread(column) for column in zip(*filter(None, some), strict=True))])
+        chosen = [averages_of(run) for run in choose(runs, **main, name=name, depth=None)]
+        rows.append([name, *(spread(column) for column in zip(*filter(None, chosen), strict=True))])
     if rows := [row for row in rows if len(row) == 5]:
         words = "Averaged over the test clouds, not over the points, unlimited depth\n\n"
         text.append(words + table(("", *SCORES), rows))
     for key in ("recall", "precision"):
         rows = []
         for name in (*PUBLISHED, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY):
-            some = choose(runs, **main, name=name, depth=None)
-            rows.append([name, *(spread(values(some, key, str(code))) for code in CLASSES)])
+            chosen = choose(runs, **main, name=name, depth=None)
+            rows.append([name, *(spread(values(chosen, key, str(code))) for code in CLASSES)])
         text.append(f"Per-class {key}, unlimited depth\n\n" + table(("", *CLASSES.values()), rows))
     rows = []
     for name in (*PUBLISHED, BY_DIMENSIONALITY, V_C_BY_DIMENSIONALITY):
         for depth in (2, None):
-            some = choose(runs, **main, name=name, depth=depth)
-            if some:
-                lost = np.array([ground_lost(run) for run in some]).mean(axis=0)
+            chosen = choose(runs, **main, name=name, depth=depth)
+            if chosen:
+                lost = np.array([ground_lost(run) for run in chosen]).mean(axis=0)
                 rows.append([name, str(depth or "unlimited"), *(f"{v:,.0f}" for v in lost)])
-    ground = found["shares"]["test"]["2"]["points"]
+    ground = curvature["shares"]["test"]["2"]["points"]
     rows.append(["v_c published", "2", f"{(1 - PUBLISHED_GROUND) * ground:,.0f}", "–"])
     text.append(
         "Ground points lost\n\n"
@@ -343,8 +356,8 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
     for threshold in CURVE:
         row = [f"{threshold:.2f}"]
         for depth in (2, None):
-            some = choose(runs, **{**main, "threshold": threshold}, name="v_c", depth=depth)
-            row += [spread(values(some, "oa")), spread(values(some, "mf1")), str(len(some))]
+            chosen = choose(runs, **{**main, "threshold": threshold}, name="v_c", depth=depth)
+            row += [spread(values(chosen, "oa")), spread(values(chosen, "mf1")), str(len(chosen))]
         rows.append(row)
     head: tuple[str, ...] = (
         "c_t",
@@ -358,7 +371,7 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
     text.append("## Over the curvature threshold (Figure 4)\n\n" + table(head, rows))
     rows = []
     for code, name in CLASSES.items():
-        ours, (points, part) = found["shares"]["pooled"][str(code)], PUBLISHED_SHARES[code]
+        ours, (points, part) = curvature["shares"]["pooled"][str(code)], PUBLISHED_SHARES[code]
         rows.append(
             [
                 name,
@@ -383,9 +396,9 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
     rows = []
     for height in HEIGHTS:
         for name in PUBLISHED:
-            some = choose(runs, **{**main, "height": height}, name=name, depth=None)
-            if some:
-                rows.append([height, name, str(len(some)), *_scores(some)])
+            chosen = choose(runs, **{**main, "height": height}, name=name, depth=None)
+            if chosen:
+                rows.append([height, name, str(len(chosen)), *_scores(chosen)])
     text.append(
         "## Departures from the paper\n\n"
         + table(("Height difference", "", "Seeds", *SCORES), rows)
@@ -394,18 +407,23 @@ def report(runs: list[dict[str, Any]], found: dict[str, Any]) -> str:
     for sampling, height in (("balanced", "range"), ("balanced", "above ground"), *OTHERS):
         for name in PUBLISHED:
             kind = None if sampling == "balanced" else sampling
-            some = choose(
+            chosen = choose(
                 runs, **{**main, "sampling": kind, "height": height}, name=name, depth=None
             )
-            if some:
+            if chosen:
                 rows.append(
-                    [f"{SAMPLINGS[sampling]}, {height}", name, str(len(some)), *_scores(some)]
+                    [f"{SAMPLINGS[sampling]}, {height}", name, str(len(chosen)), *_scores(chosen)]
                 )
     for half, words in HALVES.items():
-        some = choose(runs, **main, name=half, depth=None)
-        if some:
+        chosen = choose(runs, **main, name=half, depth=None)
+        if chosen:
             rows.append(
-                [SAMPLINGS["balanced"], f"{words} for all points", str(len(some)), *_scores(some)]
+                [
+                    SAMPLINGS["balanced"],
+                    f"{words} for all points",
+                    str(len(chosen)),
+                    *_scores(chosen),
+                ]
             )
     text.append(table(("Training", "", "Seeds", *SCORES), rows))
     return "\n".join(text)
@@ -427,7 +445,7 @@ def thresholds(train: Part, test: Part) -> dict[str, Any]:
 
 
 def _key(run: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What a run is, whatever came of it."""
+    """Return what identifies a run, without its results."""
     return tuple(
         run.get(name) for name in ("name", "seed", "depth", "height", "sampling", "threshold")
     )
@@ -464,12 +482,13 @@ def main() -> None:
             )
         return parts
 
-    found: dict[str, Any] = known.get("found") or thresholds(*computed(EVERY))
+    curvature: dict[str, Any] = known.get("found") or thresholds(*computed(EVERY))
     note(
-        f"2-means threshold: {found['train']:.4f} on the training cloud, {found['test']:.4f} on the test clouds, "
-        f"{found['pooled']:.4f} on both"
+        f"2-means threshold: {curvature['train']:.4f} on the training cloud, "
+        f"{curvature['test']:.4f} on the test clouds, "
+        f"{curvature['pooled']:.4f} on both"
     )
-    both = {"threshold": found["pooled"]}
+    both = {"threshold": curvature["pooled"]}
     todo: list[dict[str, Any]] = []
     for seed in range(args.seeds):
         for depth in (None, 2, 3)[: 2 if seed else 3]:
@@ -480,7 +499,7 @@ def main() -> None:
     more = {"depth": None, **both}
     for seed in range(args.other_seeds):
         kinds = [
-            one for one in OTHERS if not (seed and one[0] == "whole")
+            variant for variant in OTHERS if not (seed and variant[0] == "whole")
         ]  # all points: seeds differ little
         todo += [
             {"name": n, "seed": seed, "height": height, "sampling": sampling, **more}
@@ -506,12 +525,12 @@ def main() -> None:
         if _key(run) in earlier:
             runs.append(earlier[_key(run)])
             continue
-        made = results.get(
+        entry = results.get(
             run, lambda run=run: score(*computed(missing), threads=args.threads, **run)
         )
-        runs.append({**run, **made})
+        runs.append({**run, **entry})
     runs += [run for key, run in earlier.items() if key not in set(map(_key, todo))]
-    finish(args, runs, "[H17] on Oakland", report(runs, found), found=found)
+    finish(args, runs, "[H17] on Oakland", report(runs, curvature), found=curvature)
 
 
 if __name__ == "__main__":

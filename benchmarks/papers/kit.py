@@ -39,7 +39,7 @@ def code_fingerprint() -> str:
 
 
 def fingerprint(*arrays: np.ndarray) -> str:
-    """Of the content of arrays."""
+    """Return a digest of the content of arrays."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(str((array.shape, array.dtype.str)).encode())
@@ -48,7 +48,8 @@ def fingerprint(*arrays: np.ndarray) -> str:
 
 
 class Cache:
-    """Arrays in a folder, each keyed by everything it was made from; files appear whole or not at all.
+    """Arrays in a folder, each keyed by everything it was made from; files appear whole or not at
+    all.
 
     Parameters
     ----------
@@ -90,9 +91,10 @@ def features(
     seed: int = 0,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Features of a cloud's points (or of those at `queries`), (m, F) float32, from the cache where it has them."""
+    """Features of a cloud's points (or of those at `queries`), (m, F) float32, from the cache where
+    it has them."""
     rows = np.arange(len(cloud)) if queries is None else queries
-    given = {
+    options = {
         name: np.asarray(cloud.dimensions[name])[rows]
         for name in plan.dimensions
         if name not in "XYZ"
@@ -102,7 +104,7 @@ def features(
         "plan": plan.to_dict(),
         "cloud": fingerprint(cloud.xyz),
         "queries": None if queries is None else fingerprint(queries),
-        "dimensions": {name: fingerprint(value) for name, value in given.items()},
+        "dimensions": {name: fingerprint(value) for name, value in options.items()},
         "bins": None if bins is None else bins.to_dict(),
         "copt": copt_threshold,
         "seed": seed,
@@ -115,7 +117,7 @@ def features(
         )
         label = f"features of {cloud.name}"
         with Progress(len(rows), label) as progress:
-            table = engine.table(queries, dimensions=given or None, progress=progress)
+            table = engine.table(queries, dimensions=options or None, progress=progress)
         note(
             f"{label}: {len(rows):,} x {len(plan.names)} in {time.process_time() - start:.1f} CPU s"
         )
@@ -145,7 +147,8 @@ def fitted_bins(
 
 
 def draw(labels: np.ndarray, classes: Sequence[int], count: int, seed: int) -> np.ndarray:
-    """`count` random points of each class; a class that has fewer gives each of its points about equally often."""
+    """`count` random points of each class; a class that has fewer gives each of its points about
+    equally often."""
     random = np.random.default_rng(seed)
     rows = []
     for code in classes:
@@ -160,7 +163,8 @@ def draw(labels: np.ndarray, classes: Sequence[int], count: int, seed: int) -> n
 
 
 def limits(values: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """1st and 99th percentile of each shape measure, heights among them; histograms are not cut [B16 3.3, W18 3.2].
+    """1st and 99th percentile of each shape measure, heights among them; histograms are not cut
+    [B16 3.3, W18 3.2].
 
     Trees need no scaling, but values beyond are cut off.
     """
@@ -197,7 +201,8 @@ def search_trees(
     seed: int,
     threads: int | None = None,
 ):
-    """The forest of as many trees as are right about the most out-of-bag samples; of equals the smallest."""
+    """The forest of as many trees as are right about the most out-of-bag samples; of equals the
+    smallest."""
     from sklearn.ensemble import RandomForestClassifier
 
     forest = RandomForestClassifier(
@@ -313,20 +318,20 @@ def note(text: str) -> None:
 
 def parser(description: str | None) -> argparse.ArgumentParser:
     """With the options all commands have."""
-    made = argparse.ArgumentParser(
+    parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    made.add_argument(
+    parser.add_argument(
         "--data", type=Path, default=os.environ.get("PDAL_STAGES_DATA"), help="folder of the clouds"
     )
-    made.add_argument(
+    parser.add_argument(
         "--cache", type=Path, help="folder for features and finished runs: makes a run resumable"
     )
-    made.add_argument("--seeds", type=int, default=5)
-    made.add_argument("--threads", type=int)
-    made.add_argument("--json", type=Path, help="results")
-    made.add_argument("--tables", type=Path, help="Markdown tables; printed where not given")
-    return made
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--json", type=Path, help="results")
+    parser.add_argument("--tables", type=Path, help="Markdown tables; printed where not given")
+    return parser
 
 
 def opened(
@@ -342,8 +347,8 @@ def finish(
 ) -> None:
     """Write results and tables where the user wants them; lists of one run stand on one line."""
     command = Path(sys.argv[0]).name
-    made = f"Written by `benchmarks/papers/{command}`; figures in per cent, mean ± deviation over seeds."
-    text = f"# {title}\n\n{made}\n\n{text}"
+    note = f"Written by `benchmarks/papers/{command}`; figures in per cent, mean ± deviation over seeds."
+    text = f"# {title}\n\n{note}\n\n{text}"
     if args.json:
         lines = ",\n".join(
             json.dumps({k: v for k, v in run.items() if k not in BULKY}) for run in runs

@@ -1,9 +1,10 @@
-"""An error map of each paper's recipe: train, classify the test part, draw heights, classes and errors side by side.
+"""An error map of each paper's recipe: train, classify the test part, draw heights, classes and
+errors side by side.
 
     python benchmarks/papers/maps.py --data DIR --out docs/pictures [--only NAME ...]
 
-Prints overall accuracy and mean F1 of each, which the pictures show. [W18] takes 10,000 samples per class; [WM19]'s network
-is the small configuration, which trains on a CPU.
+Prints overall accuracy and mean F1 of each, which the pictures show. [W18] takes 10,000 samples per
+class; [WM19]'s network is the small configuration, which trains on a CPU.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ COLORS = 64
 DELFT = ("delft/train.laz", "delft/test.laz", (1, 2, 6))
 MONTPELLIER = ("montpellier/train_*.laz", "montpellier/test_*.laz", (2, 3, 4, 5, 6))
 OAKLAND = ("oakland/train/*.laz", "oakland/test/oakland_part2_ac.laz", (2, 5, 6, 14, 15))
-#: By recipe: training and test parts with their classes, and options that make it fit a small machine.
+#: By recipe: training and test parts with their classes, and options that make it fit a small
+#: machine.
 MAPS: dict[str, tuple[tuple[str, str, tuple[int, ...]], dict[str, Any]]] = {
     "blomley2016": (DELFT, {}),
     "weinmann2018": (MONTPELLIER, {"count": 10_000}),
@@ -69,12 +71,12 @@ def main() -> None:
         xyz, labels, dimensions = read(options.data, training)
         model = train(TrainingCloud(xyz, labels, dimensions, name=recipe), chosen)
         xyz, truth, dimensions = read(options.data, test)
-        found = model.predict(xyz, dimensions).classification
+        predicted = model.predict(xyz, dimensions).classification
         scored = np.isin(truth, classes)
-        accuracy = Accuracy.from_labels(truth[scored], found[scored], classes=list(classes))
+        accuracy = Accuracy.from_labels(truth[scored], predicted[scored], classes=list(classes))
         oa, f1 = 100 * (accuracy.overall_accuracy or 0), 100 * (accuracy.mean_f1 or 0)
         print(f"{recipe}: OA {oa:.1f}, mean F1 {f1:.1f}", flush=True)
-        picture = triptych(*xyz[scored].T, found[scored], truth[scored])
+        picture = triptych(*xyz[scored].T, predicted[scored], truth[scored])
         image = Image.fromarray(picture)
         image.thumbnail((WIDTH, WIDTH))
         image.quantize(COLORS).save(options.out / f"paper-{recipe}.png", optimize=True)

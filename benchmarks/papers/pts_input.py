@@ -1,7 +1,7 @@
 """Labeled ``.pts`` text, the format of clouds that may not be passed on (ISPRS Vaihingen, GML).
 
-One point a line, no header: X Y Z intensity return-number number-of-returns label, separated by blanks. Whoever holds
-such files puts them in DIR/NAME/train*.pts and test*.pts and runs
+One point a line, no header: X Y Z intensity return-number number-of-returns label, separated by
+blanks. Whoever holds such files puts them in DIR/NAME/train*.pts and test*.pts and runs
 
     python benchmarks/papers/b16_experiments.py --data DIR --scene NAME
     python benchmarks/papers/w18.py --data DIR --scene NAME --target LABEL
@@ -68,11 +68,11 @@ def read_pts(paths: Iterable[Path], name: str, columns: str = COLUMNS) -> Cloud:
 def write_pts(path: Path, cloud: Cloud) -> None:
     """A cloud in this format; columns it lacks are 1."""
     ones = np.ones(len(cloud))
-    given = {
+    dimensions = {
         **cloud.dimensions,
         **dict(zip("XYZ", cloud.xyz.T, strict=True)),
         "Classification": cloud.labels,
     }
     words = COLUMNS.split()
     form = ["%.3f" if word in "XYZ" else "%d" for word in words]
-    np.savetxt(path, np.column_stack([given.get(word, ones) for word in words]), fmt=form)
+    np.savetxt(path, np.column_stack([dimensions.get(word, ones) for word in words]), fmt=form)

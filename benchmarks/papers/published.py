@@ -1,10 +1,12 @@
-"""What the four papers publish, as numbers, what follows from them, and ours beside: makes docs/papers/published.md.
+"""What the four papers publish, as numbers, what follows from them, and ours beside: makes
+docs/papers/published.md.
 
     python benchmarks/papers/published.py > docs/papers/published.md
     python benchmarks/papers/published.py --ours vaihingen-accuracy.json
 
-The tables stand here so that ours can be held beside them; the sums below check them against themselves. With --ours the
-confusion matrix that vaihingen-evaluate.json writes is printed beside the published ones.
+The tables stand here so that ours can be held beside them; the sums below check them against
+themselves. With --ours the confusion matrix that vaihingen-evaluate.json writes is printed beside
+the published ones.
 """
 
 from __future__ import annotations
@@ -70,9 +72,10 @@ B16 = {
         [41.64, 41.40, 43.60, 57.11, 55.12, 58.87],
     ],
 }
-#: Tables 6 and 7. Rows and columns as above; GML B has no cars. Low vegetation follows from the means (Tables 4 and 5),
-#: since its rows are not legible in the text used here. Two cells of it were misread; they are set so that Tables 3
-#: and 4 come out: recall of trees by measures, GML A all cylinders (63.56) and GML B all (93.65; the copy has 95.05).
+#: Tables 6 and 7. Rows and columns as above; GML B has no cars. Low vegetation follows from the
+#: means (Tables 4 and 5), since its rows are not legible in the text used here. Two cells of it
+#: were misread; they are set so that Tables 3 and 4 come out: recall of trees by measures, GML A
+#: all cylinders (63.56) and GML B all (93.65; the copy has 95.05).
 B16_CLASSES = {
     "recall": {
         "ground": [
@@ -195,8 +198,8 @@ WM19 = [
 ]
 #: Multi-class with 10,000 samples of each class, from the text: overall accuracy, kappa, mean F1.
 W18_TEN_THOUSAND = (68.1, 60.5, 52.6)
-#: Target against background, 100,000 samples of each: recall, precision, F1 of the target and of the background; overall
-#: accuracy, kappa, mean F1.
+#: Target against background, 100,000 samples of each: recall, precision, F1 of the target and of
+#: the background; overall accuracy, kappa, mean F1.
 W18_BINARY = {
     "Car": (44.1, 44.3, 44.2, 99.5, 99.5, 99.5, 99.0, 43.7, 71.9),
     "Building (roof and facade)": (87.7, 83.7, 85.7, 92.9, 94.8, 93.9, 91.4, 79.5, 89.8),
@@ -226,20 +229,20 @@ def our_runs(paper: str, scene: str) -> list[dict[str, Any]]:
 
 def our_mean(scene: str, hood: str, features: str, *keys: str) -> float:
     """Return the mean over seeds of one of our [B16] figures."""
-    found = []
+    tables = []
     for run in our_runs("b16", scene):
         if (run["neighborhood"], run["set"]) == (hood, features):
             value: Any = run
             for key in keys:
                 value = value[key]
-            found.append(value)
-    return float(np.mean(found))
+            tables.append(value)
+    return float(np.mean(tables))
 
 
 def b16_ours(measure: str, scene: str) -> str:
     """Return our half of a table of [B16]."""
     rows = [
-        [hood, *(f"{our_mean(scene, hood, one, MEASURES[measure]):.2f}" for one in SETS)]
+        [hood, *(f"{our_mean(scene, hood, kind, MEASURES[measure]):.2f}" for kind in SETS)]
         for hood in B16_ROWS
     ]
     return table(["Neighborhood", *SETS], rows)
@@ -256,7 +259,8 @@ def f1_over_radii(scene: str) -> str:
 
 
 def w18_ours() -> list[str]:
-    """Return our figures and confusion matrices of [W18]'s multi-class runs, all features, first seed."""
+    """Return our figures and confusion matrices of [W18]'s multi-class runs, all features, first
+    seed."""
     rows, matrices = [], []
     for scene in SCENES:
         for run in our_runs("w18", scene):
@@ -272,7 +276,8 @@ def w18_ours() -> list[str]:
 
 
 def figures(matrix) -> dict[str, np.ndarray | float]:
-    """Overall accuracy, kappa, recall, precision and F1 (per cent) of a confusion matrix, reference in rows."""
+    """Overall accuracy, kappa, recall, precision and F1 (per cent) of a confusion matrix, reference
+    in rows."""
     m = np.asarray(matrix, float)
     total, right = m.sum(), np.diag(m)
     recall, precision = right / m.sum(axis=1), right / m.sum(axis=0)
@@ -289,7 +294,7 @@ def figures(matrix) -> dict[str, np.ndarray | float]:
 
 
 def h17() -> str:
-    """Which word of [H17]'s Table 2 is which: predicted points must add up to all points."""
+    """Say which word of [H17]'s Table 2 is which: predicted points must add up to all points."""
     total = H17_POINTS.sum()
     rows = []
     for name, (precision, recall) in H17.items():
@@ -323,14 +328,15 @@ def b16(measure: str, first: int) -> str:
 
 
 def b16_class(word: str, name: str, first: int) -> np.ndarray:
-    """Recall or precision of a class on a data set, (7, 3): low vegetation is what is left of the mean."""
+    """Recall or precision of a class on a data set, (7, 3): low vegetation is what is left of the
+    mean."""
     if name != "low vegetation":
         rows = [row for row in B16_CLASSES[word][name] if len(row) > first]
         return np.array(rows)[:, first : first + 3]
     others = [
-        b16_class(word, one, first)
-        for one in B16_POINTS
-        if one != name and B16_POINTS[one][first // 3]
+        b16_class(word, scene, first)
+        for scene in B16_POINTS
+        if scene != name and B16_POINTS[scene][first // 3]
     ]
     return (len(others) + 1) * np.array(B16[f"Mean class {word}"])[:, first : first + 3] - np.sum(
         others, axis=0
@@ -338,7 +344,8 @@ def b16_class(word: str, name: str, first: int) -> np.ndarray:
 
 
 def b16_overall(first: int) -> np.ndarray:
-    """Overall accuracy that follows from the classes' recalls and their sizes, (7, 3); sizes are whole thousands."""
+    """Overall accuracy that follows from the classes' recalls and their sizes, (7, 3); sizes are
+    whole thousands."""
     there = {name: sizes[first // 3] for name, sizes in B16_POINTS.items() if sizes[first // 3]}
     right = sum(size * b16_class("recall", name, first) for name, size in there.items())
     return right / sum(there.values())
@@ -350,10 +357,10 @@ def b16_classes(scene: str, first: int) -> list[str]:
     for word in ("recall", "precision"):
         for name, sizes in B16_POINTS.items():
             if sizes[first // 3]:
-                found = b16_class(word, name, first)
+                figure = b16_class(word, name, first)
                 rows = [
                     [hood, *(f"{v:.1f}" for v in row)]
-                    for hood, row in zip(B16_ROWS, found, strict=True)
+                    for hood, row in zip(B16_ROWS, figure, strict=True)
                 ]
                 text += [
                     f"{scene}, {name}: {word}",
@@ -374,7 +381,11 @@ def vaihingen() -> str:
         [
             name,
             f"{sum(WM19[i]):,}",
-            *(f"{one[key][i]:.1f}" for one in (w18, wm19) for key in ("recall", "precision", "f1")),
+            *(
+                f"{entry[key][i]:.1f}"
+                for entry in (w18, wm19)
+                for key in ("recall", "precision", "f1")
+            ),
         ]
         for i, name in enumerate(VAIHINGEN)
     ]
@@ -402,12 +413,16 @@ def page() -> str:
     """The whole page."""
     parts = [
         "# What the papers publish",
-        "The four papers' own figures, to hold [ours](../papers.md) beside. Made by `python benchmarks/papers/published.py`,"
+        "The four papers' own figures, to hold [ours](../papers.md) beside. Made by `python "
+        "benchmarks/papers/published.py`,"
         " which also checks them against themselves. Figures are per cent.",
         "## [H17] Table 2: precision and recall are exchanged",
-        "For every class, true points times recall over precision is the number of points *called* that class, and these"
-        " must add up to all N = 1,324,310. With the two words of the table as printed they do not; exchanged, they do to"
-        " four digits, for all three neighborhoods, and the overall accuracy of v_c comes out as the text states it (96.1).",
+        "For every class, true points times recall over precision is the number of points *called* "
+        "that class, and these"
+        " must add up to all N = 1,324,310. With the two words of the table as printed they do "
+        "not; exchanged, they do to"
+        " four digits, for all three neighborhoods, and the overall accuracy of v_c comes out as "
+        "the text states it (96.1).",
         h17(),
     ]
     for number, measure in enumerate(B16, 2):
@@ -429,10 +444,13 @@ def page() -> str:
         for first in (0, 3)
     )
     parts.append(
-        "Low vegetation is what the means of Tables 4 and 5 leave, since its rows are not legible in the copy of the text"
-        " used here; the recall of trees by measures (all cylinders on GML A, all on GML B) is set so that Tables 3 and 4"
+        "Low vegetation is what the means of Tables 4 and 5 leave, since its rows are not legible "
+        "in the copy of the text"
+        " used here; the recall of trees by measures (all cylinders on GML A, all on GML B) is set "
+        "so that Tables 3 and 4"
         " come out."
-        f" With these, recalls and sizes of the classes give all 42 overall accuracies of Table 3 to {worst:.2f}."
+        " With these, recalls and sizes of the classes give all 42 overall accuracies of Table 3 "
+        f"to {worst:.2f}."
     )
     for first, scene in ((0, "GML A"), (3, "GML B")):
         parts += b16_classes(scene, first)
@@ -467,9 +485,10 @@ def page() -> str:
 
 
 def beside(path: Path) -> str:
-    """Our confusion matrix of Vaihingen, as filters.accuracy writes it, beside the published ones."""
+    """Our confusion matrix of Vaihingen, as filters.accuracy writes it, beside the published
+    ones."""
     report = json.loads(path.read_text())
-    codes = [one["code"] for one in report["classes"]]
+    codes = [entry["code"] for entry in report["classes"]]
     lost = set(VAIHINGEN_CODES) - set(codes)
     if lost:
         raise SystemExit(
@@ -478,7 +497,7 @@ def beside(path: Path) -> str:
     at = [codes.index(code) for code in VAIHINGEN_CODES]
     matrix = np.array(report["confusion"]["counts"])[np.ix_(at, at)]
     rows = [
-        [name, *(f"{one['f1'][i]:.1f}" for one in map(figures, (W18, WM19, matrix)))]
+        [name, *(f"{entry['f1'][i]:.1f}" for entry in map(figures, (W18, WM19, matrix)))]
         for i, name in enumerate(VAIHINGEN)
     ]
     return "\n".join(

@@ -31,7 +31,7 @@ class Scene:
     test_values: np.ndarray
 
     def columns(self, names: list[str]) -> np.ndarray:
-        """Where features stand in the tables."""
+        """Return the columns of features in the tables."""
         at = {name: number for number, name in enumerate(self.plan.names)}
         return np.array([at[name] for name in names])
 
@@ -51,7 +51,8 @@ class Columns:
 
 
 def read_scene(data: Path, scene: str, part: str, columns: str | None = None) -> Cloud:
-    """A part (train, test) of one of the airborne scenes: a folder of LAZ, or ``.pts`` text (see pts_input)."""
+    """A part (train, test) of one of the airborne scenes: a folder of LAZ, or ``.pts`` text (see
+    pts_input)."""
     folder = data / scene
     text = sorted(folder.glob(f"{part}*.pts"))
     if text:
@@ -71,8 +72,8 @@ def load(
 ) -> Scene:
     """Read a scene, compute its features where the cache has none.
 
-    Shape thresholds come from the training cloud and serve both parts [B16 3.2.2]. Every point of a cloud
-    is a neighbor; only points of the classes are queries.
+    Shape thresholds come from the training cloud and serve both parts [B16 3.2.2]. Every point of a
+    cloud is a neighbor; only points of the classes are queries.
     """
     parts = {part: with_height(read_scene(data, name, part, columns)) for part in ("train", "test")}
     if classes is None:
@@ -91,8 +92,8 @@ def load(
 def chequerboard(scene: Scene, size: float = 25.0) -> Scene:
     """The training part alone, cut into fields: white ones train, black ones are scored.
 
-    Training and scored points then come from the same buildings and trees, as they do where a survey is classified
-    from samples all over it; the scene's own test part is another place.
+    Training and scored points then come from the same buildings and trees, as they do where a
+    survey is classified from samples all over it; the scene's own test part is another place.
     """
     fields = np.floor(scene.train.xyz[:, :2] / size).astype(np.int64).sum(axis=1)
     white = fields % 2 == 0
@@ -102,7 +103,7 @@ def chequerboard(scene: Scene, size: float = 25.0) -> Scene:
 
 
 def context(scene: Scene) -> dict:
-    """What all runs on a scene depend on."""
+    """Return what all runs on a scene depend on."""
     return {
         "scene": scene.name,
         "data": fingerprint(scene.train.xyz, scene.test.xyz),

@@ -1,14 +1,16 @@
-"""[W18]'s questions on real production clouds: how many samples, binary or multi-class, and which features carry it.
+"""[W18]'s questions on real production clouds: how many samples, binary or multi-class, and which
+features carry it.
 
     python benchmarks/papers/w18.py --data DIR --cache DIR
 
-All 560 features (nine neighborhoods and the height above ground). As many random samples of each class, those of a class
-with fewer points counted several times; trees are fully grown on bootstraps of all samples, with the root of the number of
-features tried at a node; covariance features, geometric properties and the height are cut off at the 1st and 99th
-percentile of the samples, histograms are not [W18 3.2]. Binary runs draw as many samples of the target as of everything
-else. Beside the paper's questions, one of our own: how much of the result a tenth of the features carries. Importances
-come from the training samples alone; the tenth they pick is then trained and scored by itself, beside a tenth drawn by
-chance.
+All 560 features (nine neighborhoods and the height above ground). As many random samples of each
+class, those of a class with fewer points counted several times; trees are fully grown on bootstraps
+of all samples, with the root of the number of features tried at a node; covariance features,
+geometric properties and the height are cut off at the 1st and 99th percentile of the samples,
+histograms are not [W18 3.2]. Binary runs draw as many samples of the target as of everything else.
+Beside the paper's questions, one of our own: how much of the result a tenth of the features
+carries. Importances come from the training samples alone; the tenth they pick is then trained and
+scored by itself, beside a tenth drawn by chance.
 """
 
 from __future__ import annotations
@@ -62,7 +64,8 @@ class Trainer:
         target: tuple[int, ...] | None = None,
         chosen: list[str] | None = None,
     ) -> dict[str, Any]:
-        """Train on `count` samples per class; `target`: these labels as one class against all others."""
+        """Train on `count` samples per class; `target`: these labels as one class against all
+        others."""
         scene, names = self.scene, chosen or self.names
         codes, train, test = self._labels(target)
         columns = scene.columns(names)
@@ -71,8 +74,8 @@ class Trainer:
         low, high = limits(x, names)
         np.clip(x, low, high, out=x)
         forest = grow_forest(x, train[rows], trees=self.trees, seed=seed, threads=self.threads)
-        found = predict(forest, scenes.Columns(scene.test_values, columns), codes, low, high)
-        result = Accuracy.from_labels(test, found, classes=codes)
+        predicted = predict(forest, scenes.Columns(scene.test_values, columns), codes, low, high)
+        result = Accuracy.from_labels(test, predicted, classes=codes)
         ranked = sorted(zip(forest.feature_importances_.tolist(), names, strict=True), reverse=True)
         return {
             **figures(result),
@@ -115,9 +118,11 @@ def report(runs: list[dict[str, Any]]) -> str:
         for what in dict.fromkeys(
             (run["kind"], run["count"]) for run in here if run["target"] is None
         ):
-            some = choose(here, kind=what[0], count=what[1], target=None)
-            cells = [spread(values(some, key)) for key in ("oa", "kappa", "mcr", "mcp", "mf1")]
-            rows.append([what[0], f"{what[1]:,}", str(some[0]["features"]), str(len(some)), *cells])
+            chosen = choose(here, kind=what[0], count=what[1], target=None)
+            cells = [spread(values(chosen, key)) for key in ("oa", "kappa", "mcr", "mcp", "mf1")]
+            rows.append(
+                [what[0], f"{what[1]:,}", str(chosen[0]["features"]), str(len(chosen)), *cells]
+            )
         scores = ("OA", "Kappa", "Mean recall", "Mean precision", "Mean F1")
         head = ("Features", "Samples per class", "Number", "Seeds", *scores)
         text.append(table(head, rows))
@@ -126,9 +131,9 @@ def report(runs: list[dict[str, Any]]) -> str:
         for what in dict.fromkeys(
             (run["kind"], run["count"]) for run in here if run["target"] is None
         ):
-            some = choose(here, kind=what[0], count=what[1], target=None)
+            chosen = choose(here, kind=what[0], count=what[1], target=None)
             rows.append(
-                [f"{what[0]}, {what[1]:,}", *(spread(values(some, "f1", code)) for code in codes)]
+                [f"{what[0]}, {what[1]:,}", *(spread(values(chosen, "f1", code)) for code in codes)]
             )
         text.append(
             "F1 by class\n\n" + table(("", *(class_name(int(code)) for code in codes)), rows)
@@ -147,13 +152,13 @@ def _binary(runs: list[dict[str, Any]]) -> str:
         multi = choose(runs, target=None, kind="all", count=count)
         codes = [int(code) for code in target.split("+")]
         label = " and ".join(class_name(code) for code in codes)
-        for words, some in (("binary", ours), ("multi-class", multi)):
+        for words, chosen in (("binary", ours), ("multi-class", multi)):
             if words == "multi-class" and len(codes) > 1:
                 continue  # the multi-class runs have no such class
             cells = [
-                spread(values(some, key, str(codes[0]))) for key in ("recall", "precision", "f1")
+                spread(values(chosen, key, str(codes[0]))) for key in ("recall", "precision", "f1")
             ]
-            rows.append([f"{label}, {words}", f"{count:,}", str(len(some)), *cells])
+            rows.append([f"{label}, {words}", f"{count:,}", str(len(chosen)), *cells])
     return (
         table(("Target", "Samples per class", "Seeds", "Recall", "Precision", "F1"), rows)
         if rows
@@ -162,7 +167,7 @@ def _binary(runs: list[dict[str, Any]]) -> str:
 
 
 def _carriers(runs: list[dict[str, Any]]) -> str:
-    """Where the best tenth comes from, and its share of all importance."""
+    """Say where the best tenth comes from, and its share of all importance."""
     text = []
     for label, part in (("Neighborhood", neighborhood), ("Kind", group)):
         share: Counter[str] = Counter()

@@ -27,9 +27,11 @@ model = ps.train(
     [ps.TrainingCloud(xyz, points.classification[west], dimensions)], options, progress=False
 )
 xyz, dimensions = cloud(east)
-found = model.predict(xyz, dimensions, margin=True)
+prediction = model.predict(xyz, dimensions, margin=True)
 truth = points.classification[east].copy()
 truth[(truth == 3) | (truth == 4)] = 5
 known = (truth == 2) | (truth == 5) | (truth == 6)
-print(ps.Accuracy.from_labels(truth[known], found.classification[known]).table())
-save("4_train_and_classify", triptych(*xyz[known].T, found.classification[known], truth[known]))
+print(ps.Accuracy.from_labels(truth[known], prediction.classification[known]).table())
+save(
+    "4_train_and_classify", triptych(*xyz[known].T, prediction.classification[known], truth[known])
+)

@@ -1,4 +1,5 @@
-"""Where the classifier is in doubt: reliability from above, and the share of errors among doubtful points."""
+"""Where the classifier is in doubt: reliability from above, and the share of errors among doubtful
+points."""
 
 import numpy as np
 from _common import halves, save, top_view, town
@@ -21,16 +22,17 @@ training = ps.TrainingCloud(
     points.xyz[west], points.classification[west], {"HeightAboveGround": height[west]}
 )
 model = ps.train([training], options, progress=False)
-found = model.predict(points.xyz[east], {"HeightAboveGround": height[east]})
+prediction = model.predict(points.xyz[east], {"HeightAboveGround": height[east]})
 truth = points.classification[east]
 known = np.isin(truth, (2, 5, 6))
-wrong = found.classification != truth
+wrong = prediction.classification != truth
 for low, high in ((0.0, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 1.01)):
-    inside = known & (found.reliability >= low) & (found.reliability < high)
+    inside = known & (prediction.reliability >= low) & (prediction.reliability < high)
     print(
-        f"reliability {low:.2f} to {min(high, 1):.2f}: {inside.sum():7,} points, {100 * wrong[inside].mean():5.1f} % wrong"
+        f"reliability {low:.2f} to {min(high, 1):.2f}: {inside.sum():7,} points, "
+        f"{100 * wrong[inside].mean():5.1f} % wrong"
     )
 save(
     "5_reliability",
-    top_view(*points.xyz[east].T, values=found.reliability, limits=(0.4, 1.0), width=900),
+    top_view(*points.xyz[east].T, values=prediction.reliability, limits=(0.4, 1.0), width=900),
 )

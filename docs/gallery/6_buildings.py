@@ -24,7 +24,7 @@ model = ps.train(
     options,
     progress=False,
 )
-found = model.predict(other.xyz, with_height(other)).classification == 6
+predicted = model.predict(other.xyz, with_height(other)).classification == 6
 true = other.classification == 6
-print(f"recall {np.mean(found[true]):.3f}, precision {np.mean(true[found]):.3f}")
-save("6_buildings", top_view(other.x, other.y, other.z, np.where(found, 6, 1)))
+print(f"recall {np.mean(predicted[true]):.3f}, precision {np.mean(true[predicted]):.3f}")
+save("6_buildings", top_view(other.x, other.y, other.z, np.where(predicted, 6, 1)))

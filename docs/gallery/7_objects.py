@@ -1,4 +1,5 @@
-"""Buildings, trees, wires and decks as objects: outlines along walls, crowns with their tops; to be checked in yellow."""
+"""Buildings, trees, wires and decks as objects: outlines along walls, crowns with their tops; to be
+checked in yellow."""
 
 import numpy as np
 import shapely
