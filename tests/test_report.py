@@ -89,9 +89,7 @@ def scene():
 @pytest.fixture(scope="module")
 def accuracy(scene):
     _, reference, predicted, reliability = scene
-    return Accuracy.from_labels(
-        reference, predicted, ignore=[1], reliability=reliability, margin=2 * reliability - 1
-    )
+    return Accuracy.from_labels(reference, predicted, ignore=[1], reliability=reliability)
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +162,7 @@ def test_every_figure_is_there(full, accuracy):
     "a",
     [
         Accuracy.from_labels([6, 6], [6, 6]),  # one class, all right
-        Accuracy.from_labels([2, 6], [2, 2], classes=[2, 6, 17], reliability=[1, 0], margin=[1, 0]),
+        Accuracy.from_labels([2, 6], [2, 2], classes=[2, 6, 17], reliability=[1, 0]),
         Accuracy.from_labels(np.arange(40), np.arange(40)[::-1], names={3: "<i>"}),
     ],
 )

@@ -67,13 +67,6 @@ def code_list(codes: Iterable[Any], option: str) -> list[int]:
     return [code_of(f"a class in '{option}'", code) for code in codes]
 
 
-def class_names(codes: Iterable[int], names: Mapping[Any, str] | None) -> dict[int, str]:
-    """Return the names of codes: those in `names`, whose keys may be text, or ASPRS's."""
-    names = names or {}
-    custom = dict(zip(code_list(names, "names"), map(str, names.values()), strict=True))
-    return {code: custom.get(code) or class_name(code) for code in sorted(set(codes))}
-
-
 @dataclass(frozen=True)
 class Merge:
     """Classes taken as one, on both sides of a comparison."""

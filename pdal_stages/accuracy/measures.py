@@ -17,6 +17,7 @@ Rules for what is not defined, so that no measure is ever NaN:
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -27,12 +28,10 @@ import numpy.typing as npt
 
 from ..base.asprs import class_name
 from ..base.errors import StageError
-from .calibration import ConfidenceHistogram
 from .labels import (
     ComparedClasses,
     Merge,
     as_codes,
-    class_names,
     code_list,
     pair_counts,
     refuse_other_lengths,
@@ -40,10 +39,115 @@ from .labels import (
 )
 from .text import table
 
-FORMAT = "pdal-stages accuracy"
-VERSION = 1
 #: Points graded at a time, which bounds the memory.
 CHUNK = 1 << 20
+#: Bins of a reliability between 0 and 1; areas are exact to one of them.
+BINS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class ReliabilityHistogram:
+    """Histogram of reliabilities and of the points whose class is right, in bins of 0.001.
+
+    Histograms add, so those of tiles give the measures of the whole.
+    """
+
+    count: npt.NDArray[np.int64]  #: (1000,) points of each bin
+    right: npt.NDArray[np.int64]  #: (1000,) points of each bin with the right class
+    total: npt.NDArray[np.float64]  #: (1000,) sum of the reliability of each bin
+
+    @classmethod
+    def from_values(cls, values: npt.ArrayLike, right: npt.ArrayLike) -> ReliabilityHistogram:
+        """Return the histogram of reliabilities (n,) and of those whose class is right, (n,) bool.
+
+        Raises
+        ------
+        StageError
+            Where a reliability is not a number between 0 and 1.
+        """
+        v, is_right = np.asarray(values, dtype=np.float64), np.asarray(right, dtype=bool)
+        bad = ~((v >= 0) & (v <= 1 + 1e-6))
+        if bad.any():
+            raise StageError(
+                f"{int(bad.sum()):,} of {len(v):,} values of reliability are not between 0 and 1",
+                found=float(v[bad][0]),
+                cure="Give the classifier's probabilities, unscaled, for every compared point",
+            )
+        place = np.minimum((v * BINS).astype(np.int64), BINS - 1)
+        return cls(
+            np.bincount(place, minlength=BINS),
+            np.bincount(place[is_right], minlength=BINS),
+            np.bincount(place, weights=v, minlength=BINS).astype(np.float64),
+        )
+
+    def __add__(self, other: ReliabilityHistogram) -> ReliabilityHistogram:
+        """Return the histogram of both sets of points together."""
+        return ReliabilityHistogram(
+            self.count + other.count, self.right + other.right, self.total + other.total
+        )
+
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return int(self.count.sum())
+
+    @property
+    def mean(self) -> float | None:
+        """Mean reliability of all points, None without points."""
+        return float(self.total.sum() / self.points) if self.points else None
+
+    def curve(self) -> list[dict[str, Any]]:
+        """Return ten equally wide bins: the reliability curve (reliability against share right)."""
+        counts, rights, totals = (a.reshape(10, -1) for a in (self.count, self.right, self.total))
+        bins = []
+        for k in range(10):
+            n, right = int(counts[k].sum()), int(rights[k].sum())
+            bins.append(
+                {
+                    "lower": k / 10,
+                    "upper": (k + 1) / 10,
+                    "points": n,
+                    "right": right,
+                    "mean": float(totals[k].sum() / n) if n else None,
+                    "share_right": right / n if n else None,
+                    "share_wrong": (n - right) / n if n else None,
+                }
+            )
+        return bins
+
+    def expected_calibration_error(self) -> float | None:
+        """Return the mean distance of reliability and share right, over bins weighted by points.
+
+        None without points. Source: Naeini, Cooper, Hauskrecht 2015, AAAI (ECE).
+        """
+        filled = [b for b in self.curve() if b["points"]]
+        error = sum(b["points"] * abs(b["mean"] - b["share_right"]) for b in filled)
+        return float(error / self.points) if filled else None
+
+    def separation(self) -> float | None:
+        """Return the area under the ROC curve.
+
+        It is the chance that a right point has a higher reliability than a wrong one: 0.5 means no
+        information, 1 that every error has a lower reliability than any right point; None where
+        all points are right or all are wrong.
+        """
+        right, wrong = self.right.astype(np.float64), (self.count - self.right).astype(np.float64)
+        if wrong.sum() == 0 or right.sum() == 0:
+            return None
+        below = np.cumsum(wrong) - wrong
+        return float((right * (below + 0.5 * wrong)).sum() / (right.sum() * wrong.sum()))
+
+    def to_dict(self) -> dict[str, Any] | None:
+        """Return measures as JSON types; None without points."""
+        if not self.points:
+            return None
+        error = self.expected_calibration_error()
+        return {
+            "mean": self.mean,
+            "separation": self.separation(),
+            "expected_calibration_error": error,
+            "curve": self.curve(),
+        }
 
 
 @dataclass(frozen=True)
@@ -72,10 +176,9 @@ class Accuracy:
     classes: tuple[int, ...]  #: codes of the rows: the classes of the reference, ascending
     extra: tuple[int, ...]  #: codes of further columns: predicted, but not in the reference
     matrix: npt.NDArray[np.int64]  #: (K, K + E) points; rows are the reference
-    names: Mapping[int, str] = field(default_factory=dict)
+    names: Mapping[int, str] = field(default_factory=dict)  #: of classes that ASPRS names otherwise
     left_out: Mapping[int, int] = field(default_factory=dict)  #: points by class before any merge
-    reliability: ConfidenceHistogram | None = None  #: how well it separates right from wrong
-    margin: ConfidenceHistogram | None = None
+    reliability: ReliabilityHistogram | None = None  #: how well it separates right from wrong
     merged: Mapping[int, int] = field(default_factory=dict)  #: classes taken as another one
 
     @classmethod
@@ -85,7 +188,6 @@ class Accuracy:
         predicted: npt.ArrayLike,
         *,
         reliability: npt.ArrayLike | None = None,
-        margin: npt.ArrayLike | None = None,
         allow_empty: bool = False,
         **rules: Any,
     ) -> Accuracy:
@@ -95,8 +197,8 @@ class Accuracy:
         ----------
         reference, predicted : (n,) arrays
             Class codes, whole numbers from 0 to 65535.
-        reliability, margin : (n,) arrays, optional
-            Winning probability, and winning minus second, both from 0 to 1.
+        reliability : (n,) array, optional
+            Winning probability, 0 to 1.
         allow_empty : bool
             Whether no point to compare is allowed (a tile without reference points).
         **rules
@@ -108,9 +210,9 @@ class Accuracy:
             Arrays of different lengths, labels that are not class codes, or nothing to compare.
         """
         true, labels = as_codes(reference, "reference"), as_codes(predicted, "prediction")
-        values = {"reliability": reliability, "margin": margin}
-        confidences = {key: np.asarray(v).reshape(-1) for key, v in values.items() if v is not None}
-        refuse_other_lengths(true, {"prediction": labels, **confidences})
+        rated = true[:0] if reliability is None else np.asarray(reliability).reshape(-1)
+        others = {"prediction": labels} | ({} if reliability is None else {"reliability": rated})
+        refuse_other_lengths(true, others)
         compared = ComparedClasses(**rules)
         merge = Merge.parse(compared.merge)
         codes, predicted_codes, counts = pair_counts(true, labels)
@@ -118,40 +220,43 @@ class Accuracy:
         points = dict(zip(codes.tolist(), counts.sum(axis=1).tolist(), strict=True))
         left_out = {code: points[code] for code in codes[~kept].tolist()}
         if not allow_empty and not kept.any():
-            raise _nothing_to_compare(points, left_out)
+            raise StageError(
+                "no point to compare" + ": every reference point is left out" * bool(left_out),
+                found=", ".join(f"class {c}: {n:,} points" for c, n in [*points.items()][:12])
+                or "0 points",
+                cure="Name classes the reference has, or ignore fewer" if left_out else None,
+            )
         occurs = counts[kept].any(axis=0)
         merged_rows = merge.target_of[codes[kept]]
         merged_columns = merge.target_of[predicted_codes[occurs]]
         columns, matrix = sum_tables(rows, (counts[kept][:, occurs], merged_rows, merged_columns))
         is_compared = np.isin(np.arange(len(merge.target_of)), codes[kept])
-        graded = {key: ConfidenceHistogram.empty() for key in confidences}
-        for start in range(0, len(true) if graded else 0, CHUNK):
+        histogram = ReliabilityHistogram.from_values([], [])
+        for start in range(0, len(rated), CHUNK):
             part = slice(start, start + CHUNK)
             chosen = is_compared[true[part]]
             right = np.equal(*(merge.target_of[side[part][chosen]] for side in (true, labels)))
-            for key, confidence in confidences.items():
-                graded[key] += ConfidenceHistogram.from_values(confidence[part][chosen], right, key)
-        names = class_names((*columns, *left_out), {**merge.names, **(compared.names or {})})
+            histogram += ReliabilityHistogram.from_values(rated[part][chosen], right)
+        named = compared.names or {}
+        names = dict(zip(code_list(named, "names"), map(str, named.values()), strict=True))
         return cls(
-            *(rows, columns[len(rows) :], matrix, names, left_out),
-            *(graded.get("reliability"), graded.get("margin"), merge.changed),
+            *(rows, columns[len(rows) :], matrix, {**merge.names, **names}, left_out),
+            *(None if reliability is None else histogram, merge.changed),
         )
 
     @classmethod
     def from_confusion(cls, matrix: npt.ArrayLike, classes: Sequence[int]) -> Accuracy:
         """Take a confusion matrix of counts; rows are the reference, columns the prediction."""
         rows, counts = code_list(classes, "classes"), np.asarray(matrix)
-        if counts.shape != (len(rows), len(rows)) or len(set(rows)) != len(rows) or not rows:
-            raise StageError(
-                "the confusion matrix does not fit its classes",
-                found=f"shape {counts.shape} for classes {rows}",
-                cure="Give one row and one column per class",
-            )
         whole = counts.astype(np.int64)
-        if (whole != counts).any() or (whole < 0).any():
-            raise StageError("a confusion matrix holds counts: whole numbers of 0 or more")
+        fits = counts.shape == (len(rows), len(rows)) and len(set(rows)) == len(rows) > 0
+        if not fits or (whole != counts).any() or (whole < 0).any():
+            raise StageError(
+                "a confusion matrix holds counts, with one row and one column per class",
+                found=f"shape {counts.shape} for classes {rows}",
+            )
         columns, whole = sum_tables(sorted(rows), (whole, rows, rows))
-        return cls(columns, (), whole, class_names(columns, None))
+        return cls(columns, (), whole)
 
     def __add__(self, other: Accuracy) -> Accuracy:
         """Return the accuracy of both sets of points together."""
@@ -160,10 +265,7 @@ class Accuracy:
         rows = tuple(sorted(set(self.classes) | set(other.classes)))
         tables = ((each.matrix, each.classes, each.columns) for each in (self, other))
         columns, matrix = sum_tables(rows, *tables)
-        left = {
-            c: self.left_out.get(c, 0) + other.left_out.get(c, 0)
-            for c in sorted(set(self.left_out) | set(other.left_out))
-        }
+        left = dict(sorted((Counter(self.left_out) + Counter(other.left_out)).items()))
         # A merge target may be both: its own points left out, those merged into it compared.
         if clash := sorted(set(left) & set(rows) - set(self.merged.values())):
             raise StageError(
@@ -178,13 +280,13 @@ class Accuracy:
                 cure="Compare both with the same 'merge'",
             )
         # An empty tile has no calibration; where another part lacks one, the sum has none either.
-        graded: dict[str, ConfidenceHistogram | None] = {}
-        for key in ("reliability", "margin"):
-            both = ((each.points, getattr(each, key)) for each in (self, other))
-            parts = [value for points, value in both if points or value is not None]
-            graded[key] = None if None in parts or not parts else sum(parts[1:], parts[0])
+        first, second = self.reliability, other.reliability
+        if first is not None and second is not None:
+            histogram: ReliabilityHistogram | None = first + second
+        else:
+            histogram = first if not other.points else second if not self.points else None
         names, merged = {**other.names, **self.names}, {**other.merged, **self.merged}
-        return Accuracy(rows, columns[len(rows) :], matrix, names, left, **graded, merged=merged)
+        return Accuracy(rows, columns[len(rows) :], matrix, names, left, histogram, merged)
 
     def __radd__(self, other: object) -> Accuracy:
         """Return itself added to 0, which sum() starts with."""
@@ -304,8 +406,8 @@ class Accuracy:
             return [{"code": c, "name": self.name(c)} for c in codes]
 
         return {
-            "format": FORMAT,
-            "version": VERSION,
+            "format": "pdal-stages accuracy",
+            "version": 1,
             "points": self.points,
             "correct": self.correct,
             "left_out": {
@@ -330,20 +432,9 @@ class Accuracy:
                 "counts": self.matrix.tolist(),
                 "by_reference": self.by_reference.tolist(),
             },
-            "reliability": self.reliability.to_dict("curve") if self.reliability else None,
-            "margin": self.margin.to_dict("deciles") if self.margin else None,
+            "reliability": self.reliability.to_dict() if self.reliability else None,
         }
 
     def table(self) -> str:
         """Return the measures as aligned text, in percent."""
         return table(self.to_dict(), self.name)
-
-
-def _nothing_to_compare(points: Mapping[int, int], left_out: Mapping[int, int]) -> StageError:
-    listed = ", ".join(f"{code}: {n:,}" for code, n in list(points.items())[:12])
-    more = ", ..." * (len(points) > 12)
-    return StageError(
-        "no point to compare" + ": every reference point is left out" * bool(left_out),
-        found=f"reference classes {listed}{more}" if points else "0 points",
-        cure="Name classes the reference has, or ignore fewer" if left_out else None,
-    )

@@ -23,7 +23,8 @@ def summary(accuracy: Any) -> dict[str, Any]:
 def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
     """Return a table with a line for each file, the worst first."""
     rows = [(name, summary(accuracy)) for name, accuracy in zip(names, each, strict=True)]
-    rows.sort(key=lambda row: (_share_or_last(row[1]["overall_accuracy"]), row[0]))
+    # Files without points to compare come last.
+    rows.sort(key=lambda row: (not row[1]["points"], row[1]["overall_accuracy"], row[0]))
     header = ["", "File", "Points", "Accuracy %", "Kappa %", "Mean F1 %"]
     lines = [
         ["", name, f"{d['points']:,}", *(percent(d[key]) for key in _MAIN)] for name, d in rows
@@ -31,14 +32,13 @@ def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
     return _aligned(header, lines) + "\n"
 
 
-def _share_or_last(share: float | None) -> float:
-    return 2.0 if share is None else share
-
-
 def table(figures: Mapping[str, Any], name: Callable[[int], str]) -> str:
     """Return the measures of ``Accuracy.to_dict`` as aligned text, in percent."""
     blocks = [_headline(figures, name), _classes(figures), _confusion(figures["confusion"])]
-    return "\n\n".join([*blocks, *_confidence(figures)])
+    if rated := figures["reliability"]:
+        mean, error = (percent(rated[key]) for key in ("mean", "expected_calibration_error"))
+        blocks.append(f"Reliability: mean {mean} %, expected calibration error {error} %")
+    return "\n\n".join(blocks)
 
 
 def _headline(d: Mapping[str, Any], name: Callable[[int], str]) -> str:
@@ -93,27 +93,6 @@ def _confusion(d: Mapping[str, Any]) -> str:
     text = "Confusion: rows reference, columns prediction, % of the reference class; "
     note = "\n* not a class of the reference" * (len(d["columns"]) > known)
     return f"{text}the diagonal is recall\n{_aligned(header, rows)}{note}"
-
-
-def _confidence(d: Mapping[str, Any]) -> list[str]:
-    lines = []
-    if d["reliability"]:
-        mean, error = (
-            percent(d["reliability"][key]) for key in ("mean", "expected_calibration_error")
-        )
-        lines.append(f"Reliability: mean {mean} %, expected calibration error {error} %")
-    if d["margin"]:
-        groups = d["margin"]["deciles"]
-        total = sum(g["points"] for g in groups)
-        (least, wrong), (most, wrong_of_most) = (
-            (percent(g["points"] / total, 0), percent(g["share_wrong"]))
-            for g in (groups[0], groups[-1])
-        )
-        lines.append(
-            f"Margin: of the {least} % least certain points {wrong} % are wrong, "
-            f"of the {most} % most certain {wrong_of_most} %"
-        )
-    return ["\n".join(lines)] if lines else []
 
 
 def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

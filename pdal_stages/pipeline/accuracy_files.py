@@ -60,7 +60,7 @@ def compare_files(
     check_outputs(stage.outputs(), read)
     others = tuple(each for each in overrides if each not in of_accuracy)
     parts = []
-    kept = {"X", "Y", "Z", "Reliability", "Margin"}
+    kept = {"X", "Y", "Z", "Reliability"}
     kept |= {span.dimension for span in stage.ignore.spans} if stage.ignore else set()
     with Progress(len(pairs), "reading" if not model else "classifying", "files") as bar:
         for source, reference in pairs:

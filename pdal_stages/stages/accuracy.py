@@ -32,11 +32,11 @@ LOWER = (LOW, MEDIUM)
 
 
 class Sides(NamedTuple):
-    """Classes of points on both sides, confidences, and which of the given points these are."""
+    """Classes of points on both sides, reliabilities, and which of the given points these are."""
 
     reference: NDArray
     predicted: NDArray
-    confidence: dict[str, Any]
+    reliability: NDArray | None
     inside: NDArray
 
 
@@ -125,9 +125,13 @@ class AccuracyStage(Stage):
         rule = self._rule(sides, report)
         each = [
             Accuracy.from_labels(
-                reference, predicted, **rule, **confidence, allow_empty=len(parts) > 1
+                side.reference,
+                side.predicted,
+                **rule,
+                reliability=side.reliability,
+                allow_empty=len(parts) > 1,
             )
-            for reference, predicted, confidence, _ in sides
+            for side in sides
         ]
         accuracy = each[0] if len(each) == 1 else sum(each[1:], each[0])
         if not accuracy.points:
@@ -162,15 +166,13 @@ class AccuracyStage(Stage):
         """Return the classes of both sides, of the points that are compared."""
         chosen = Selection.parse(["withheld"], "ignore") if self.ignore is None else self.ignore
         inside = points.usable(replace(chosen, codes=()))  # codes are of the reference
-        confidence: dict[str, Any] = {
-            name.lower(): np.asarray(points.arrays[name])[inside]
-            for name in ("Reliability", "Margin")
-            if name in points.arrays
-        }
+        reliability = None
+        if "Reliability" in points.arrays:
+            reliability = np.asarray(points.arrays["Reliability"])[inside]
         reference, predicted = (
             points.codes_of(name)[inside] for name in (self.reference, self.dimension)
         )
-        return Sides(reference, predicted, confidence, inside)
+        return Sides(reference, predicted, reliability, inside)
 
     def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
         """Return `classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`."""
