@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.base import polygons as overlays
+from pdal_stages.base import vector as overlays
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.base.polygons import Overlay, points_inside
+from pdal_stages.base.vector import Overlay, points_inside
 from pdal_stages.stages.base import WHOLE_CLOUD
 from pdal_stages.stages.polygons import Polygons
 

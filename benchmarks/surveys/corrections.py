@@ -24,7 +24,7 @@ from clouds import model_without, true_classes
 from surveys import SURVEYS
 
 from pdal_stages import cli
-from pdal_stages.base.polygons import points_inside
+from pdal_stages.base.vector import points_inside
 from pdal_stages.pipeline.spatial_reference import reference_of_file
 from pdal_stages.reports.vector_files import Layer, write_layers
 from pdal_stages.review.review_files import review_files

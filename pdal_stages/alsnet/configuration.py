@@ -14,8 +14,8 @@ from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import Any
 
 from ..base import checks
+from ..base.checks import Settings, setting
 from ..base.errors import OptionError, suggest
-from ..base.settings import Settings, setting
 
 #: A configuration's largest number of shared layers: a model file holds 63 arrays.
 MAX_LAYERS = 60

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from .errors import StageError
-from .extra_bytes import ExtraField, description, fields_of
 from .files import disk_is_full
 from .las import (
     POINT_BYTES,
@@ -26,6 +25,7 @@ from .las import (
     read_header,
     records,
 )
+from .las_repair import ExtraField, description, fields_of
 
 #: What to do about a damaged file.
 DAMAGED = (

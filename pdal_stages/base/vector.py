@@ -1,4 +1,4 @@
-"""Vector data through shapely, pyogrio and pyproj (extra ``vector``): import, names, processes."""
+"""Vector data through shapely, pyogrio and pyproj (extra ``vector``); points inside polygons."""
 
 from __future__ import annotations
 
@@ -11,11 +11,16 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from .errors import StageError, optional_import
+import numpy as np
+from numpy.typing import NDArray
+
+from .asprs import GROUND
+from .errors import OptionError, StageError, optional_import
 
 
 def vector(name: str) -> Any:
@@ -88,3 +93,144 @@ def _interpreter() -> str:
         [sys.executable] if os.path.basename(sys.executable or "").startswith("python") else []
     )
     return next((path for path in (*running, *inside) if os.access(path, os.X_OK)), "python3")
+
+
+#: Between a file and a layer of it, as QGIS writes them.
+_LAYER = "|layername="
+#: Types of layers that may hold polygons.
+_POLYGONS = re.compile("Polygon|Surface|^Unknown$|^GeometryCollection$")
+#: West, south, east, north.
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """A file of polygons, the class for points inside, and the classes it replaces (empty: all)."""
+
+    file: str
+    layer: str
+    code: int
+    over: tuple[int, ...]
+
+    @classmethod
+    def parse(cls, text: str) -> Overlay:
+        """Parse ``FILE=CODE``, ``FILE=CODE:FROM,FROM`` or ``FILE=CODE:all``.
+
+        FILE may be ``FILE|layername=NAME``.
+        """
+        source, _, codes = text.rpartition("=")
+        file, _, layer = source.partition(_LAYER)
+        code, colon, over = codes.partition(":")
+        replaced = [each.strip() for each in over.split(",")] if colon else [str(GROUND)]
+        replaced = [] if replaced == ["all"] else replaced
+        if not file.strip() or not all(
+            c.strip().isdecimal() and int(c) <= 255 for c in [code, *replaced]
+        ):
+            raise OptionError(
+                "polygons are written FILE=CODE",
+                found=text,
+                cure="For example lakes.gpkg=9, which makes ground inside water; "
+                "bridges.gpkg=17:2,6 is for ground and buildings, 17:all for all classes; a layer "
+                "is named as in lakes.gpkg|layername=canals=9",
+            )
+        return cls(file.strip(), layer.strip(), int(code), tuple(map(int, replaced)))
+
+    def check(self) -> str:
+        """Return the layer to read; StageError where there is not exactly one."""
+        if "://" not in self.file and not Path(self.file).exists():
+            raise StageError(
+                "the file of polygons does not exist", where=self.file, cure="Check the path"
+            )
+        with reading(self.file) as name:
+            listed = vector("pyogrio").list_layers(name)
+        layers = [str(name) for name, kind in listed if _POLYGONS.search(str(kind))]
+        layer = self.layer or (layers[0] if len(layers) == 1 else "")
+        if layer not in layers:
+            raise StageError(
+                "the file has no such layer of polygons"
+                if self.layer
+                else "the file must have one layer of polygons",
+                where=self.file,
+                found=", ".join(layers) or "none",
+                cure=f"Name one: {self.file}{_LAYER}NAME={self.code}",
+            )
+        return layer
+
+
+def inside_of(
+    overlay: Overlay, wkt: str, x: NDArray[np.float64], y: NDArray[np.float64], box: Box
+) -> tuple[NDArray[np.bool_], int, str]:
+    """Return which points (n,) lie inside polygons, the number of polygons, and a warning."""
+    shapes, note = polygons_of(overlay, wkt, box)
+    return points_inside(x, y, shapes), len(shapes), note
+
+
+def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[list[Any], str]:
+    """Return the polygons near a box, and a warning or an empty text.
+
+    Polygons and box are in the reference system `wkt`. `where` is a condition on the file's
+    columns, in SQL.
+    """
+    pyogrio, shapely = vector("pyogrio"), vector("shapely")
+    layer = overlay.check()
+    note, forward = "", None
+    with reading(overlay.file) as name:
+        crs = pyogrio.read_info(name, layer=layer)["crs"]
+    if crs and wkt:
+        forward, box = _transform(overlay.file, crs, wkt, box)
+    else:
+        side = "the points have" if crs else "it has"
+        note = f"{overlay.file}: {side} no reference system: the same was assumed"
+    with reading(overlay.file) as name:
+        _, _, geometry, _ = pyogrio.raw.read(
+            name, layer=layer, columns=[], bbox=box, where=where or None
+        )
+        shapes = shapely.force_2d(shapely.get_parts(shapely.get_parts(shapely.from_wkb(geometry))))
+        shapes = shapes[shapely.get_type_id(shapes) == shapely.GeometryType.POLYGON]
+        if forward is not None:
+            shapes = shapely.transform(shapes, forward, interleaved=False)
+        return list(shapely.make_valid(shapes)), note
+
+
+def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
+    """Return the transformation from the file's reference system to the points', and the box in it.
+
+    The transformation is None where both are the same.
+    """
+    pyproj = vector("pyproj")
+    try:
+        to, theirs = (_horizontal(pyproj.CRS.from_user_input(each)) for each in (wkt, crs))
+        if to.equals(theirs, ignore_axis_order=True):
+            return None, box
+        forward = pyproj.Transformer.from_crs(theirs, to, always_xy=True)
+        west, south, east, north = forward.transform_bounds(*box, direction="INVERSE")
+    except Exception as error:  # pyproj's own
+        raise StageError(
+            "the polygons' reference system cannot be made the points'",
+            where=file,
+            found=str(error),
+            cure="Reproject the file first: ogr2ogr -t_srs",
+        ) from None
+    rim = 0.01 * max(east - west, north - south)
+    padded = (west - rim, south - rim, east + rim, north + rim)
+    return lambda x, y: forward.transform(x, y), padded
+
+
+def _horizontal(crs: Any) -> Any:
+    """Return the horizontal part of a reference system."""
+    if crs.is_compound:
+        return _horizontal(crs.sub_crs_list[0])
+    return crs.to_2d() if len(crs.axis_info) > 2 else crs
+
+
+def points_inside(
+    x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]
+) -> NDArray[np.bool_]:
+    """Return which points (n,) lie inside polygons, or on their edge."""
+    shapely, inside = vector("shapely"), np.zeros(len(x), bool)
+    whole = shapely.union_all(polygons)
+    west, south, east, north = whole.bounds
+    near = (x >= west) & (x <= east) & (y >= south) & (y <= north)
+    shapely.prepare(whole)
+    inside[near] = shapely.intersects_xy(whole, x[near], y[near])
+    return inside

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..base import checks
 from ..base.asprs import NOISE
+from ..base.checks import Settings, setting
 from ..base.errors import OptionError
-from ..base.settings import Settings, setting
 from ..base.threads import resolve_threads
 from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side

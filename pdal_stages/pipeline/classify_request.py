@@ -10,7 +10,7 @@ from typing import Any
 
 from ..base.asprs import GROUND, OVERLAP
 from ..base.errors import ModelError, OptionError, suggest
-from ..base.extra_bytes import extra_dimensions
+from ..base.las_repair import extra_dimensions
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..stages import preprocessing

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..base.errors import DimensionError, PipelineError, StageError
-from ..base.extra_bytes import extra_dimensions
 from ..base.las import read_header
+from ..base.las_repair import extra_dimensions
 from ..stages import preprocessing
 from ..stages.base import Stage
 from ..stages.points import MAKERS

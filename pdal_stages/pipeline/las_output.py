@@ -13,7 +13,6 @@ from typing import Any
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
-from ..base.extra_bytes import MOST_ENTRIES, extra_dimensions, restore_titles
 from ..base.las import (
     LasHeader,
     header_there,
@@ -22,7 +21,7 @@ from ..base.las import (
     set_geotiff_unit,
     supersede_copc,
 )
-from ..base.las_repair import restore_texts
+from ..base.las_repair import MOST_ENTRIES, extra_dimensions, restore_texts, restore_titles
 from ..stages.registry import stage_types
 from . import pdal as pdal_env
 from .runtime import ExpandedStage, python_filter

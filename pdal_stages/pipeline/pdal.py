@@ -23,10 +23,9 @@ from types import CodeType, FrameType
 from typing import Any, BinaryIO, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
-from ..base.extra_bytes import overwritten
 from ..base.las import geotiff_code, read_header, source_id
 from ..base.las_check import DAMAGED, check_readable
-from ..base.las_repair import LARGEST_HEAD, corrected
+from ..base.las_repair import LARGEST_HEAD, corrected, overwritten
 from .stage_files import reader_files, readers_files, writers_outputs
 
 INSTALL = (

@@ -16,8 +16,7 @@ from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
 from ..base.grid import places_among
 from ..base.las import named_copc
-from ..base.polygons import Overlay, points_inside, polygons_of
-from ..base.vector import reading, vector
+from ..base.vector import Overlay, points_inside, polygons_of, reading, vector
 from ..classifier.input_dimensions import CHECKED
 from ..pipeline.las_chunks import can_read_chunks, laspy_header, read_chunks
 from ..pipeline.las_output import finish

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.polygons import Overlay, inside_of
-from ..base.vector import with_vector
+from ..base.vector import Overlay, inside_of, with_vector
 from .base import ClassStage, StageContext
 from .options import Selection, ignore_option, keep_option, option
 from .points import NO_POLYGON_NEAR, Points, class_counts

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from ..base import checks
+from ..base.checks import Settings, setting
 from ..base.errors import OptionError, StageError, suggest
 from ..base.files import whole_files
 from ..base.las import named_las
 from ..base.progress import Progress
-from ..base.settings import Settings, setting
 from ..base.threads import map_blocks
 from ..base.version import __version__
 from .districts import fill

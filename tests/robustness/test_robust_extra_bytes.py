@@ -13,7 +13,7 @@ from robustness_kit import HAG, job, las, scene
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.extra_bytes import extra_dimensions
+from pdal_stages.base.las_repair import extra_dimensions
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.inputs_outputs import reader_of
 
