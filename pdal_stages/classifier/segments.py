@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from ..base.grid import begins_run, cell_keys, cell_numbers, key_offset, places_among, split_keys
 from ..features.cell_means import WHOLE
+from ..terrain.components import number_sets
 
 
 @dataclass(frozen=True)
@@ -185,9 +186,6 @@ def _count_votes(
 
 def _join_cells(cells: VoteCells) -> Segments:
     """Join neighboring cells that the class wins into segments, in each window by itself."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     is_won = (cells.votes > 0) & (cells.votes >= cells.others)
     won = np.flatnonzero(is_won)
     count, size = len(won), round(RULES.block / RULES.cell)
@@ -213,11 +211,9 @@ def _join_cells(cells: VoteCells) -> Segments:
             both = inside & joined
             number_there = (rows[both] + 1) * 3 + columns[both] + 1
             ends.append(np.stack([node[both], number_there * count + place[other[both]]]))
-    pairs = np.concatenate(ends, axis=1)
-    nodes = len(_BLOCKS) * count
-    graph = coo_array((np.ones(pairs.shape[1], np.int8), tuple(pairs)), shape=(nodes, nodes))
-    _, label = connected_components(graph, directed=False)
-    return Segments(won, label.astype(np.int64), rim)
+    label = np.empty(len(_BLOCKS) * count, np.int64)
+    number_sets(*np.concatenate(ends, axis=1), label)
+    return Segments(won, label, rim)
 
 
 def _measure(cells: VoteCells, segments: Segments) -> npt.NDArray[np.float64]:
