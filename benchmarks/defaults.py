@@ -104,9 +104,7 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
     },
     BASE: {
         "no base": {},
-        "base, one pass on top": {BASE: True, "passes": 1},
-        "base, two passes on top": {BASE: True, "passes": 2},
-        "base, three passes on top": {BASE: True, "passes": 3},
+        "base, one pass on top": {BASE: True},
     },
 }
 CODES = {

@@ -224,8 +224,6 @@ def test_what_is_read_by_default_and_under_a_base(two):
     assert alone.context == DEFAULT_CONTEXT and "own" not in alone.context
     assert on_top.context == CONTEXT_OF_BASE and "own" in on_top.context
     assert (alone.passes, on_top.passes) == (2, 1) and on_top.voxel == two.voxel
-    several = TrainingOptions(base=two, passes=2, voxel=0.5)
-    assert several.context == ("own", *DEFAULT_CONTEXT) and several.voxel == 0.5
     assert replace(alone, seed=3).context == DEFAULT_CONTEXT
     model = learned(context=None)
     assert model.passes[1].context.tokens == DEFAULT_CONTEXT and model.plan.halo_m >= 16.0

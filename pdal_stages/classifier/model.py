@@ -134,13 +134,11 @@ class Model:
         for kind, version in self.algorithm_versions.items():
             if stored.get(kind) == version:
                 continue
-            trained, may = f"version {stored.get(kind)}", ""
-            if kind not in stored:
-                trained, may = "an unknown version", "may "
             warnings.append(
-                f"the model was trained with {trained} of {kind}, and this release has version "
-                f"{version}, whose results {may}differ: expect lower accuracy. Train the model "
-                f"again, or install the release that it was trained with (pdal_stages {release})"
+                f"the model was trained with version {stored.get(kind, 'unknown')} of {kind}, and "
+                f"this release has version {version}, whose results differ: expect lower accuracy. "
+                "Train the model again, or install the release that it was trained with "
+                f"(pdal_stages {release})"
             )
         return warnings
 

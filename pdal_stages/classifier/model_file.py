@@ -37,10 +37,8 @@ Arrays = list[dict[str, npt.NDArray[Any]]]
 STANDARD = "standard"
 #: Value of the manifest's key ``format``.
 FORMAT = "pdal-stages model"
-#: Version of the format that is written.
+#: Version of the format; a file of another one is refused.
 VERSION = 3
-#: Versions that are read; a file of another one is refused.
-READABLE = (2, 3)
 #: Member of the zip that says what is in the others.
 MANIFEST = "manifest.json"
 
@@ -276,28 +274,16 @@ def parse(data: bytes, is_shipped: bool = False) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError("this is not a model file", found="a manifest of something else")
     version = manifest.get("version")
-    if type(version) is not int or version not in READABLE:  # True is 1
+    if type(version) is not int or version != VERSION:  # True is 1
+        is_old = type(version) is int and version < VERSION
         raise ModelError(
-            f"the model file has a version this release does not know (it knows {READABLE})",
+            f"the model file has another version of the format than this release, {VERSION}",
             found=f"version {str(version)[:20]}",
-            cure="Update pdal-stages",
+            cure="Train the model again" if is_old else "Update pdal-stages",
         )
     if not is_shipped:  # the validator takes 0.07 s and 10 MB to import
         validate(manifest)
-    return _upgraded(manifest)
-
-
-def _upgraded(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return a manifest of version 2 as one of version 3.
-
-    Version 2 had groups of features beside their names. The names alone say what a column is.
-    """
-    for entry in manifest["passes"] if manifest["version"] == 2 else ():
-        described = entry.pop("features", {})
-        entry["neighborhoods"] = described.get("neighborhoods")
-        if "least_members" in described:
-            entry["least_members"] = described["least_members"]
-    return {**manifest, "version": VERSION}
+    return manifest
 
 
 def validate(manifest: Mapping[str, Any]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +20,7 @@ from ..features.registry import SHAPE_FEATURES
 from ..features.return_features import SOURCES
 from .auto_context import FoldForests, WeightedPass, sample_context
 from .calibration import Calibration
-from .context_features import OWN, Context
+from .context_features import Context
 from .feature_forest import CloudFeatures, FeatureForest, Features
 from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
 from .interface import PredictRequest, weigh
@@ -95,17 +94,17 @@ class ForestTraining:
         self.values = self._features_of_samples()
         if options.scaling == "percentiles":
             limit_to_percentiles(self.values, self.features.plan)
-        context = Context(tuple(options.context))
+        self.context = Context(tuple(options.context))
+        known = self.codes if self.base is None else self.base.codes.tolist()
         if options.passes > 1 or self.base is not None:
-            codes = self.codes if self.base is None else self.base.codes.tolist()
-            context.check_segments(codes, inputs(options))
-        self.reads: list[Context | None] = [None, *[context] * (options.passes - 1)]
-        self.blends = self._blends()
+            self.context.check_segments(known, inputs(options))
+        self.blend: Blend | None = None
         #: What the first pass reads of the samples.
         self.first = self.values
         if self.base is not None:  # it has not seen the labels, so no ground need be held out
-            self.reads[0] = context if options.passes == 1 else Context((OWN,))
-            self.first = _join_columns(self.values, self._context_of_samples(0))
+            trusted = trust(int(np.bincount(self.samples.label).min()))
+            self.blend = Blend(tuple(known), tuple(self.codes), trusted)
+            self.first = _join_columns(self.values, self._context_of_samples())
         self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
         self.growth = self._growth()
         self.fold_trees = max(1, math.ceil(options.trees * FOLD_TREES))
@@ -180,22 +179,6 @@ class ForestTraining:
             )
         return values
 
-    def _blends(self) -> Sequence[Blend | None]:
-        """Return how each pass on top of a base changes the pass before."""
-        o = self.options
-        out: list[Blend] = []
-        if self.base is None:
-            return [None] * o.passes
-        before = self.base.codes.tolist()
-        trusted = trust(int(np.bincount(self.samples.label).min()))
-        for _ in range(o.passes):
-            out.append(Blend(tuple(before), tuple(self.codes), trusted, o.target))
-            before = out[-1].codes
-        # With one pass labels are few, and tell nothing of how frequent a class is.
-        if o.passes > 1 and self.factors is not None:
-            out[-1] = replace(out[-1], factors=tuple(self.factors.tolist()))
-        return out
-
     def model(self) -> Model:
         """Score, grow all passes, and return the model."""
         o, base = self.options, self.base
@@ -231,17 +214,11 @@ class ForestTraining:
         names = dict(zip(self.codes, self.labeled.classes.names, strict=True))
         if base is None:
             return Model(tuple(forests), list(names.items()), info)
-        codes = self._codes_after(o.passes - 1)
         names |= dict(base.classes)
-        classes = [(code, names[code]) for code in codes]
+        classes = [(code, names[code]) for code in sorted(names)]
         return Model(
-            (*base.passes, *forests), classes, describe_refinement(base, info, names, codes)
+            (*base.passes, *forests), classes, describe_refinement(base, info, names, sorted(names))
         )
-
-    def _codes_after(self, number: int) -> Sequence[int]:
-        """Return the classes of a pass."""
-        blend = self.blends[number]
-        return self.codes if blend is None else blend.codes
 
     def _grow(
         self,
@@ -333,14 +310,12 @@ class ForestTraining:
 
     def _calibrate(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
         """Count right and wrong samples that were held out, by reliability."""
-        blend = self.blends[0]
-        if blend is None:
+        codes: Sequence[int] = self.codes
+        if self.blend is None:
             p = weigh(p, self.factors)
-        elif self.options.target is not None:
-            return  # the true classes of the others are not known
         else:
-            p = replace(blend, factors=None)(self._base_probabilities(rows), p)
-        predicted = np.asarray(self._codes_after(0))[p.argmax(axis=1)]
+            codes, p = self.blend.codes, self.blend(self._base_probabilities(rows), p)
+        predicted = np.asarray(codes)[p.argmax(axis=1)]
         true = np.asarray(self.codes)[self.samples.label[rows]]
         self.calibration.add(predicted, true, p.max(axis=1), self.stands_for[rows])
 
@@ -381,9 +356,7 @@ class ForestTraining:
                 # will see when the model is used.
                 each = self._without_each(values, fold, f"pass {number} without each fold")
                 held_out.append([self._read_by(number - 1, forest) for _, forest in each])
-                values = _join_columns(
-                    self.values, self._context_of_samples(number, held_out, folds)
-                )
+                values = _join_columns(self.values, self._context_of_samples(held_out, folds))
             grid: Sequence[int] = o.trees_grid or (o.trees,)
             with self.progress(grid[-1], f"growing pass {number + 1}", "trees") as bar:
                 forest, shares = self._grow(values, samples.weight, grid, bar)
@@ -393,57 +366,47 @@ class ForestTraining:
 
     def _read_by(self, number: int, forest: Forest) -> FeatureForest:
         """Return a forest with what a pass reads."""
-        return FeatureForest(self.features, forest, self.reads[number], self.blends[number])
+        context = None if number == 0 and self.base is None else self.context
+        return FeatureForest(self.features, forest, context, self.blend)
 
     def _context_of_samples(
-        self,
-        number: int,
-        held_out: Sequence[Sequence[FeatureForest]] = (),
-        folds: Folds | None = None,
+        self, held_out: Sequence[Sequence[FeatureForest]] = (), folds: Folds | None = None
     ) -> npt.NDArray[np.float32]:
         """Return the context (samples, columns) that a pass reads of those before.
 
-        These are the passes of a base, and forests that have not seen the samples.
+        These are the passes of the base, or forests that have not seen the samples.
         """
-        o, context = self.options, self.reads[number]
-        assert context is not None
-        base = [] if self.base is None else self.base.weighted_passes
-        codes = self._codes_after(number - 1) if number else base[-1].codes
+        o, base, context = self.options, self.base, self.context
+        codes = self.codes if base is None else base.codes
+        passes: list[WeightedPass] = [] if base is None else base.weighted_passes
         out = np.empty((len(self.samples), len(context.names(codes))), np.float32)
-        with self.progress(
-            len(out), f"context for pass {number + 1}" if number else "context by the base"
-        ) as bar:
+        what = f"context for pass {len(held_out) + 1}" if base is None else "context by the base"
+        with self.progress(len(out), what) as bar:
             for place, cloud in enumerate(self.clouds):
                 at, rows = self.samples.of_cloud(place)
                 if not len(at):
                     continue
-                later: list[WeightedPass] = []
                 if folds is not None:
                     fold = folds.points(cloud.xyz, self.surveys[place])
-                    later = [
-                        WeightedPass(FoldForests(forests, fold), self._codes_after(k))
-                        for k, forests in enumerate(held_out)
-                    ]
+                    each = (FoldForests(forests, fold) for forests in held_out)
+                    passes = [WeightedPass(forests, self.codes) for forests in each]
                 request = PredictRequest(
                     cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb, bar
                 )
-                out[at] = sample_context([*base, *later], request, context)
+                out[at] = sample_context(passes, request, context)
         return out
 
     def _base_probabilities(self, rows: Any = slice(None)) -> npt.NDArray[np.float64]:
         """Return the probabilities (m, classes) of the base at samples."""
-        context = self.reads[0]
-        assert context is not None
-        return context.own_probabilities(
-            self.first[rows, self.values.shape[1] :], len(self.base.classes)
-        )
+        columns = self.first[rows, self.values.shape[1] :]
+        return self.context.own_probabilities(columns, len(self.base.classes))
 
     def _held_by_base(self) -> dict[str, Any]:
         """Return by new class the samples, and those that the base calls a class without labels.
 
         Such points stay what the base calls them.
         """
-        if self.base is None or self.options.target is not None:
+        if self.base is None:
             return {}
         by_base, out = self.base.codes[self._base_probabilities().argmax(axis=1)], {}
         for place, code in enumerate(self.codes):

@@ -116,5 +116,5 @@ def reach(options: TrainingOptions) -> float:
     halo, context = feature_plan(options).halo_m, Context(tuple(options.context)).reach
     passes = options.passes - 1
     if options.base is not None:
-        halo, passes = max(halo, options.base.plan.halo_m), options.passes
+        halo, passes = max(halo, options.base.plan.halo_m), 1
     return halo + passes * context + 2.0 * options.voxel

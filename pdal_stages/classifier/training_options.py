@@ -30,11 +30,9 @@ LEAST_PER_TREE = 1_000
 PER_TREE = 10_000
 #: Passes by default.
 DEFAULT_PASSES = 2
-#: Passes by default on top of a base, where labels are few.
-PASSES_ON_BASE = 1
 #: Context of passes after the first by default.
 DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8")
-#: Context of a single pass on top of a base by default.
+#: Context of the pass on top of a base by default.
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
@@ -253,7 +251,7 @@ class TrainingOptions(Settings):
         None,
         "integer",
         "Number of forests in succession, each using what the previous one found around a point; "
-        "default 2, or 1 on a base",
+        "default 2; on a base there is one",
         *(1, MOST_PASSES),
     )
     context: Any = setting(
@@ -299,7 +297,16 @@ class TrainingOptions(Settings):
         self._check_algorithm()
         if self.base is not None:
             self._check_base()
-        self._resolve_passes()
+        passes = DEFAULT_PASSES if self.base is None else 1
+        context = DEFAULT_CONTEXT if self.base is None else CONTEXT_OF_BASE
+        self._set(
+            passes=passes if self.passes is None else self.passes,
+            context=Context.parse(context if self.context is None else self.context).tokens,
+        )
+        if self.passes > 1 and not self.context:
+            raise OptionError(
+                "several passes need a context", found="an empty list", cure="Leave 'context' out"
+            )
         if self.strategy == "binary" and self.target is None:
             raise OptionError("the binary strategy needs 'target', the code of the class to find")
         if self.strategy == "multiclass" and self.target is not None:
@@ -335,33 +342,21 @@ class TrainingOptions(Settings):
                 found=len(passes),
                 cure="Start from the model that it was built on, with all labels together",
             )
-        if self.algorithm != FOREST:
+        if (
+            self.algorithm != FOREST
+            or self.strategy != "multiclass"
+            or self.passes not in (None, 1)
+        ):
             raise OptionError(
-                "only a forest is built on a 'base'",
-                found=self.algorithm,
-                cure="Leave 'algorithm' out",
+                "on a 'base' there is one forest that knows all labeled classes",
+                found=f"algorithm {self.algorithm}, strategy {self.strategy}, passes {self.passes}",
+                cure="Leave these options out",
             )
-
-    def _resolve_passes(self) -> None:
-        """Fill in the number of passes and their context, and check that they fit."""
-        base, passes, context = self.base, self.passes, self.context
-        if passes is None:
-            passes = DEFAULT_PASSES if base is None else PASSES_ON_BASE
-        if context is None and base is None:
-            context = DEFAULT_CONTEXT
-        elif context is None:
-            context = CONTEXT_OF_BASE if passes == 1 else (OWN, *DEFAULT_CONTEXT)
-        self._set(passes=passes, context=Context.parse(context).tokens)
-        if base is not None and passes == 1:
-            self._set(voxel=base.voxel)
-        if passes > 1 and not self.context:
+        if self.context is not None and OWN not in Context.parse(self.context).tokens:
             raise OptionError(
-                "several passes need a context", found="an empty list", cure="Leave 'context' out"
+                f"with a 'base', 'context' must have '{OWN}'", found=str(self.context)[:60]
             )
-        if base is not None and OWN not in self.context:
-            raise OptionError(
-                f"with a 'base', 'context' must have '{OWN}'", found=", ".join(self.context)
-            )
+        self._set(voxel=self.base.voxel)
 
     @classmethod
     def from_recipe(cls, recipe: str, **options: Any) -> TrainingOptions:

@@ -304,8 +304,7 @@ class TrainModel(Stage):
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
                 f"the base assigns {held:,} of {all_:,} samples of class {code} to classes "
-                "without labels, where they stay: label some of those classes too, or train this "
-                "class alone (strategy binary, target)"
+                "without labels, where they stay: label some of those classes too"
             )
         if short := model.info["training"].get(SHORT):
             report.warnings.append(
