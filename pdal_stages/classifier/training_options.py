@@ -117,7 +117,7 @@ class TrainingOptions(Settings):
     )
     classes: Any = setting(
         None,
-        "mapping",
+        "classes",
         "Class codes, e.g. 2,5,6, or labels and their classes: "
         '{"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: every label but 0, 1, 7, 12 '
         "and 18, and these where the base has them",
@@ -154,11 +154,12 @@ class TrainingOptions(Settings):
         (),
         "numbers",
         "Numbers of trees to choose from by out-of-bag accuracy on the samples, instead of 'trees'",
+        may_be_empty=True,
         check=_check_tree_numbers,
     )
     max_depth: str | int | None = setting(
         None,
-        "string",
+        "word",
         "Maximum depth of a tree: a number, or sqrt for the root of the number of features; "
         "default: no limit",
         check=_check_max_depth,
@@ -196,7 +197,7 @@ class TrainingOptions(Settings):
     )
     max_features: str | int | float = setting(
         "auto",
-        "string",
+        "word",
         "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a "
         "number or a share",
         check=_check_max_features,
@@ -213,6 +214,7 @@ class TrainingOptions(Settings):
         "numbers",
         "Densities of thinned copies to train on as well, points/m2, so that the model also works "
         "on sparse clouds",
+        may_be_empty=True,
         check=_check_densities,
     )
     voxel: float = setting(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from functools import cached_property
 from typing import Any
 
@@ -19,7 +20,7 @@ from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
 from .base import WHOLE_CLOUD, Stage, StageContext
-from .options import Selection, declared_option, ignore_option, keep_option, option
+from .options import Selection, ignore_option, keep_option, option
 from .points import Points, class_counts
 from .preprocessing import OF_PDAL, as_json, same, with_given_ground
 from .registry import stage_type
@@ -36,7 +37,7 @@ _STEPS = 64
 _HEIGHT_STEPS = 32
 
 
-class ApplyModel(Stage):
+class ApplyModel(Stage, settings=PredictionOptions):
     """Classify points with a model file."""
 
     type = "filters.modelclassifier"
@@ -58,19 +59,16 @@ class ApplyModel(Stage):
         required=True,
         name="model",
     )
-    probabilities: bool = declared_option(PredictionOptions, "probabilities")
-    margin: bool = declared_option(PredictionOptions, "margin")
-    variance: bool = declared_option(PredictionOptions, "variance")
-    device: str = declared_option(PredictionOptions, "device")
-    reject_below: float | None = declared_option(PredictionOptions, "reject_below")
-    rejected_code: int | None = declared_option(PredictionOptions, "rejected_code")
+    variance: bool
+    probabilities: bool
+    reject_below: float | None
+    rejected_code: int | None
     keep_sure: float | None = option(
         "number",
         None,
         "Keep a class only where this share is expected to be right, e.g. 0.98; others get "
         "rejected_code (default 1)",
-        minimum=0.5,
-        maximum=0.999,
+        *(0.5, 0.999),
     )
     ignore: Selection = ignore_option(
         "Points that are left out, even as neighbors, and keep their class"
@@ -104,11 +102,9 @@ class ApplyModel(Stage):
         "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is "
         "1, or without that dimension within 0.5 m of it (HeightAboveGround)",
     )
-    memory: int = option(
-        "integer",
-        256,
-        "Memory for blocks of points, in addition to the cloud itself",
-        minimum=16,
+    memory_mb: int = option(
+        *("integer", 256, "Memory for blocks of points, in addition to the cloud itself", 16),
+        name="memory",
         unit="MB",
     )
 
@@ -232,6 +228,12 @@ class ApplyModel(Stage):
         unsure = UNCLASSIFIED if self.keep_sure is not None else None
         return unsure if self.rejected_code is None else self.rejected_code
 
+    @property
+    def _prediction(self) -> dict[str, Any]:
+        """Return the values of :class:`PredictionOptions`."""
+        values = {field.name: getattr(self, field.name) for field in fields(PredictionOptions)}
+        return values | {"rejected_code": self._rejected}
+
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Classify the points."""
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
@@ -258,16 +260,8 @@ class ApplyModel(Stage):
                 current=current,
                 ignore=ignored if ignored.any() else None,
                 may_be_ground=ground,
-                threads=self.threads,
-                memory_mb=self.memory,
-                probabilities=self.probabilities,
-                margin=self.margin,
-                variance=self.variance,
-                device=self.device,
-                reject_below=self.reject_below,
-                rejected_code=self._rejected,
-                limits=self.limits,
                 progress=progress,
+                **self._prediction,
             )
         rejected = np.zeros(points.count, np.bool_)
         rejected[prediction.unsure] = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
 from ..base.units import named_unit
-from .options import Option, option, parse_options
+from .options import Option, declared_option, option, parse_options
 from .points import Points
 from .where_expression import Expression
 
@@ -68,7 +68,8 @@ class Stage(ABC):
     A subclass declares its type, a summary and its options in its body, describes what it reads
     and creates and how far it looks, and does the work in :meth:`run`. Options are attributes. What
     is costly to derive from them (a plan, a model) is a ``functools.cached_property``. A stage
-    cannot be changed after it is made.
+    cannot be changed after it is made. ``class Mine(Stage, settings=MySettings)`` makes the fields
+    of a dataclass of :class:`..base.checks.Settings` options, too.
 
     Parameters
     ----------
@@ -121,9 +122,7 @@ class Stage(ABC):
     where: str | None = option(
         "expression", None, "A condition on points (PDAL's own filters do not see the others)"
     )
-    threads: int = option(
-        "integer", 0, "Threads to use; 0 takes every available core", minimum=0, maximum=1024
-    )
+    threads: int = option("integer", 0, "Threads to use; 0 takes every available core", 0, 1024)
     horizontal_unit: str = option(
         "string",
         "",
@@ -138,6 +137,12 @@ class Stage(ABC):
     #: The stages before it in the pipeline that create what it reads, as a model's preprocessing
     #: holds them.
     upstream: tuple[Mapping[str, Any], ...] = ()
+
+    def __init_subclass__(cls, settings: Any = None) -> None:
+        """Declare the fields of `settings` as options, but those that the class has already."""
+        for field in fields(settings) if settings is not None else ():
+            if field.metadata and not hasattr(cls, field.name):
+                setattr(cls, field.name, declared_option(settings, field.name, name=field.name))
 
     def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
         self.place = place or self.type

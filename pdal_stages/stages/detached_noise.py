@@ -22,26 +22,23 @@ class DetachedNoise(ClassStage):
         60,
         "Maximum number of points of a noise cluster; clusters with points above them may have "
         "more",
-        minimum=1,
-        maximum=1_000_000,
+        *(1, 1_000_000),
     )
     gap: float = option(
         "number",
         2.5,
         "Minimum height of high noise above everything nearby; more in clouds of less than 3 "
         "points/m2",
-        minimum=0,
+        *(0, 1000),
         exclusive=True,
-        maximum=1000,
         unit="m",
     )
     depth: float = option(
         "number",
         1.0,
         "Minimum depth of low noise below the ground; more where the ground is rough",
-        minimum=0,
+        *(0, 1000),
         exclusive=True,
-        maximum=1000,
         unit="m",
     )
     low_class: int = code_option(NOISE[0], "Class code of low noise")

@@ -29,8 +29,6 @@ from .base import Stage, StageContext
 from .options import Selection, code_option, ignore_option, option
 from .points import Points
 
-#: Settings of the search, each of which is an option.
-_SETTINGS = {field.name: field for field in fields(ObjectSettings)}
 #: Option -> kind of object whose class codes it lists.
 _CODES = {
     "ground": Kind.GROUND,
@@ -69,7 +67,8 @@ class ObjectOptions:
     @cached_property
     def settings(self) -> ObjectSettings:
         """Return the settings of the search."""
-        return ObjectSettings(**{name: self.options[name] for name in _SETTINGS})
+        names = [field.name for field in fields(ObjectSettings)]
+        return ObjectSettings(**{name: self.options[name] for name in names})
 
     @cached_property
     def classes(self) -> dict[Kind, tuple[int, ...]]:
@@ -119,16 +118,12 @@ class ObjectOptions:
         )
 
 
-for _name, _field in _SETTINGS.items():
-    setattr(ObjectOptions, _name, option(name=_name, default=_field.default, **_field.metadata))
-
-
 #: What each kind of object is measured by, as points carry it: height and area or length.
 _HEIGHT = {Kind.BUILDING: "h_ridge", Kind.TREE: "height", Kind.SPAN: "h_low", Kind.DECK: "clear"}
 _EXTENT = {Kind.BUILDING: "area", Kind.TREE: "area", Kind.SPAN: "length", Kind.DECK: "area"}
 
 
-class GroupObjects(ObjectOptions, Stage):
+class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
     """Number the objects that points belong to."""
 
     type = "filters.objects"

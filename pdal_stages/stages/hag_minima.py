@@ -27,16 +27,14 @@ class HagMinima(Stage):
         20.0,
         "Side of the coarse cells whose lowest points form the terrain; more than half the width "
         "of the largest building",
-        minimum=0.05,
-        maximum=10_000,
+        *(0.05, 10_000),
         unit="m",
     )
     resolution: float = option(
         "number",
         0.5,
         "Side of the fine cells on which the terrain is evaluated",
-        minimum=0.05,
-        maximum=10_000,
+        *(0.05, 10_000),
         unit="m",
     )
     ignore: Selection = ignore_option(

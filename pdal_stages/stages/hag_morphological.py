@@ -55,40 +55,31 @@ class HagMorphological(FarReaching):
         "given_ground",
         "where",
     )
-    cell: float = option(
-        "number", 1.0, "Side of the grid's cells", minimum=0.05, maximum=1000, unit="m"
-    )
+    cell: float = option("number", 1.0, "Side of the grid's cells", 0.05, 1000, unit="m")
     slope: float = option(
         "number",
         0.12,
         "Rise over run: a window removes what it lowers by more than this times its radius; raise "
         "it for rugged terrain without buildings",
-        minimum=0,
-        maximum=100,
+        *(0, 100),
     )
     window: float = option(
         "number",
         18.0,
         "Radius of the largest window: half the width of the largest object that is removed",
-        minimum=0,
+        *(0, 10_000),
         exclusive=True,
-        maximum=10_000,
         unit="m",
     )
     threshold: float = option(
         "number",
         0.5,
         "Maximum distance of a ground point from the ground surface",
-        minimum=0,
-        maximum=1000,
+        *(0, 1000),
         unit="m",
     )
     scalar: float = option(
-        "number",
-        1.25,
-        "Added to the threshold per unit of the terrain's slope",
-        minimum=0,
-        maximum=1000,
+        "number", 1.25, "Added to the threshold per unit of the terrain's slope", 0, 1000
     )
     ignore: Selection = ignore_option("Points that are not ground but still receive heights")
     ground: bool = option(

@@ -47,11 +47,7 @@ class MultiscaleFeatures(Stage):
         "...)",
     )
     seed: int = option(
-        "integer",
-        0,
-        "Seed for the random draws of the shape distributions",
-        minimum=0,
-        maximum=2**31 - 1,
+        "integer", 0, "Seed for the random draws of the shape distributions", 0, 2**31 - 1
     )
     bins: str | None = option(
         "filename",
@@ -67,16 +63,14 @@ class MultiscaleFeatures(Stage):
         None,
         "Curvature from which on copt treats a point as scattered; default: by 2-means over the "
         "points, or that of 'bins'",
-        minimum=0,
-        maximum=1,
+        *(0, 1),
     )
     voxel: float = option(
         "number",
         0.0,
         "Voxel size, for very dense clouds: features are computed for one point per voxel, and "
         "its other points get the same; 0 for none",
-        minimum=0,
-        maximum=LARGEST,
+        *(0, LARGEST),
         unit="m",
     )
     memory: int = option(

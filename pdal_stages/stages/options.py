@@ -39,6 +39,8 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
     "selection": _LISTED,
     "numbers": _LISTED,
     "bands": _LISTED,
+    "word": (["string", "number"], "a word or a number"),
+    "classes": (["object", "array", "string"], "a list of class codes, or a mapping of labels"),
     "mapping": (["object", "string"], 'a mapping such as {"2": "Ground"}'),
 }
 
@@ -204,6 +206,20 @@ class Option:
             )
         return value
 
+    def _parse_word(self, value: Any) -> str | int | float:
+        if checks.finite(value) is not None:
+            return value
+        for kind in (int, float):
+            with suppress(ValueError):
+                return kind(self._parse_string(value))
+        return value
+
+    def _parse_classes(self, value: Any) -> Any:
+        """Leave the reading to :class:`..classifier.class_map.ClassMap`."""
+        if not isinstance(value, str | list | dict):
+            raise self._wrong(value)
+        return value
+
     def _parse_list(self, value: Any) -> list:
         if isinstance(value, str):
             value = split_list(value)
@@ -261,13 +277,20 @@ class Option:
         return value
 
 
-def option(kind: str, default: Any, help: str, **more: Any) -> Any:
-    """Declare an option in a stage's class body.
+def option(
+    kind: str,
+    default: Any,
+    help: str,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    **more: Any,
+) -> Any:
+    """Declare an option in a stage's class body, a number with its lower and upper bound.
 
-    ``cell: float = option("number", 20.0, "Side of the cells", unit="m")``: the annotation is the
-    type of the parsed value, all else is as for :class:`Option`.
+    ``cell: float = option("number", 20.0, "Side of the cells", 0.1, 100, unit="m")``: the
+    annotation is the type of the parsed value, all else is as for :class:`Option`.
     """
-    return Option(kind, default, help, **more)
+    return Option(kind, default, help, minimum, maximum, **more)
 
 
 def declared_option(settings: type, name: str, /, **other: Any) -> Any:
@@ -282,7 +305,7 @@ def declared_option(settings: type, name: str, /, **other: Any) -> Any:
 
 def code_option(default: int | None, help: str) -> Any:
     """Declare an option for a class code."""
-    return option("integer", default, help, minimum=0, maximum=255)
+    return option("integer", default, help, 0, 255)
 
 
 def ignore_option(points: str) -> Any:

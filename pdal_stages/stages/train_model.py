@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,6 @@ from .options import UNWANTED, Selection, declared_option, option
 from .points import Points
 from .preprocessing import check
 
-#: The trainer's own options.
-_TRAINING = {field.name: field for field in fields(TrainingOptions)}
 #: The part of a model's description that fits in a pipeline's metadata.
 _SHOWN = ("strategy", "classes", "accuracy", "parameters")
 #: Most files that a model names.
@@ -48,10 +46,7 @@ _NAMED = 20
 AUTO = "auto"
 
 
-trained = partial(declared_option, TrainingOptions)
-
-
-class TrainModel(Stage):
+class TrainModel(Stage, settings=TrainingOptions):
     """Train a model on labeled points."""
 
     type = "writers.classifiermodel"
@@ -68,37 +63,19 @@ class TrainModel(Stage):
         "Set the options as a paper does; options given beside it replace the paper's",
         choices=tuple(RECIPES),
     )
-    base: str | None = trained("base")
-    algorithm: str = trained("algorithm", choices=tuple(kinds()))
-    alsnet: dict | None = trained("alsnet")
-    neighborhoods: list = trained("neighborhoods")
-    feature_set: list = trained("feature_set")
-    dimensions: list = trained(
+    base: str | None
+    groups: str
+    seed: int
+    algorithm: str = declared_option(TrainingOptions, "algorithm", choices=tuple(kinds()))
+    dimensions: list = declared_option(
+        TrainingOptions,
         "dimensions",
         default=(AUTO,),
-        help=f"{_TRAINING['dimensions'].metadata['help']}; auto: HeightAboveGround and, where the "
-        "points have them, Ground, HeightAboveOpening_5, HeightAboveOpening_17 and returns",
+        help="Dimensions of the points to use as features as well; auto: HeightAboveGround and, "
+        "where the points have them, Ground, HeightAboveOpening_5, HeightAboveOpening_17 and "
+        "returns",
         may_be_empty=True,
     )
-    classes: dict | None = trained("classes")
-    strategy: str = trained("strategy")
-    target: int | None = trained("target")
-    background: int = trained("background")
-    count: int = trained("count")
-    sampling: str = trained("sampling")
-    seed: int = trained("seed")
-    trees: int = trained("trees")
-    trees_grid: list = trained("trees_grid", may_be_empty=True)
-    max_depth: str | None = trained("max_depth")
-    vote: str = trained("vote")
-    scaling: str = trained("scaling")
-    copt_threshold: float | None = trained("copt_threshold")
-    min_samples_leaf: int = trained("min_samples_leaf")
-    max_samples: float | None = trained("max_samples")
-    max_features: str = trained("max_features")
-    prior_weight: float = trained("prior_weight")
-    folds: int | None = trained("folds")
-    groups: str = trained("groups")
     survey: str = option(
         "string",
         "",
@@ -111,8 +88,6 @@ class TrainModel(Stage):
         f"If points have the dimension {CHECKED} (from the command corrections), and it is not 0 "
         "everywhere, draw samples only where it is 1",
     )
-    thin: list = trained("thin", may_be_empty=True)
-    voxel: float = trained("voxel")
     ignore: Selection = option(
         "selection",
         UNWANTED,
@@ -120,34 +95,17 @@ class TrainModel(Stage):
         "other dimensions such as ReturnNumber[0:0], or the word withheld",
         may_be_empty=True,
     )
-    passes: int | None = trained("passes")
-    context: list | None = trained("context")
     files: list = option(
         "list", (), "Input files that the model file names; default: those of the readers"
     )
-    memory: int = trained(
-        "memory_mb",
-        kind="integer",
-        default=512,
+    memory_mb: int = option(
+        *("integer", 512, "Memory for blocks of points, in addition to the samples", 16),
         name="memory",
-        minimum=16,
-        exclusive=False,
-        maximum=None,
+        unit="MB",
     )
 
     def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
-        raw_options = with_recipe(raw_options)
-        classes = raw_options.get("classes")
-        if isinstance(classes, str) and not classes.lstrip().startswith("{"):
-            classes = [code.strip() for code in classes.split(",") if code.strip()]
-        if isinstance(classes, list):  # of codes: as good as a mapping
-            raw_options["classes"] = {str(code): _number(code) for code in classes}
-        for name in ("max_features", "max_depth"):
-            if isinstance(raw_options.get(name), int | float) and not isinstance(
-                raw_options[name], bool
-            ):
-                raw_options[name] = str(raw_options[name])
-        super().__init__(raw_options, place)
+        super().__init__(with_recipe(raw_options), place)
 
     @classmethod
     def from_pipeline(
@@ -183,14 +141,12 @@ class TrainModel(Stage):
     @cached_property
     def training(self) -> TrainingOptions:
         """Return the options of training."""
-        values = {name: value for name, value in self.options.items() if name in _TRAINING}
-        for name in ("max_features", "max_depth"):
-            values[name] = _number(values[name])
+        values = {field.name: getattr(self, field.name) for field in fields(TrainingOptions)}
         if self.automatic:
             values["dimensions"] = DEFAULT_DIMENSIONS
         values["ignore"] = self.ignore.codes
         values["base"] = None if self.base is None else loaded_model(self.base)
-        return TrainingOptions(**values, memory_mb=self.memory)
+        return TrainingOptions(**values)
 
     @property
     def _trainer(self) -> Any:
@@ -361,13 +317,3 @@ class TrainModel(Stage):
             (value, replace(cloud.part(rows), name=f"{name} {value:g}", survey=""))
             for value, rows in parts.items()
         ]
-
-
-def _number(text: Any) -> Any:
-    """Return text as a whole number or a share, ``24`` or ``0.1``, and all else as it is."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except (TypeError, ValueError):
-            continue
-    return text

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from ..base.files import Output
 from ..base.vector import with_vector
 from ..objects.detect import find_objects
+from ..objects.results import ObjectSettings
 from .base import Stage, StageContext
 from .group_objects import ObjectOptions
 from .options import option
@@ -17,7 +18,7 @@ STRAIGHT = "straight"
 CELLS = "cells"
 
 
-class WriteObjects(ObjectOptions, Stage):
+class WriteObjects(ObjectOptions, Stage, settings=ObjectSettings):
     """Write objects as polygons, points and lines."""
 
     type = "writers.objects"
