@@ -17,7 +17,14 @@ from pdal_stages.base.memory import free_memory, parse_size
 from pdal_stages.cli import main
 from pdal_stages.stages.base import Blocks
 from pdal_stages.synthetic.town import WKT
-from pdal_stages.tiling.options import PARENT, Density, Extent, block_bytes, settled, worker_bytes
+from pdal_stages.tiling.options import (
+    PARENT,
+    Density,
+    Extent,
+    block_bytes,
+    choose_tiles,
+    worker_bytes,
+)
 
 pytestmark = pytest.mark.pdal
 OPTIONS = ("--filters.hag_minima.cell=5", "--no-progress")
@@ -259,10 +266,10 @@ def test_the_side_of_tiles_keeps_to_the_memory(density, memory, halo):
         Extent(int(density * 10**6), (i * 1000.0, 0.0, (i + 1) * 1000.0, 1000.0))
         for i in range(100)
     ]
-    found = Density.of(extents)
+    found = Density.measure(extents)
     options = TilingOptions(memory=int(memory), workers=None)
     try:
-        chosen, _ = settled(options, found, halo, True)
+        chosen, _ = choose_tiles(options, found, halo, True)
     except OptionError:
         least = worker_bytes(found.read_by(1.0, halo), found.largest) + PARENT
         assert least > memory  # nothing would have fitted

@@ -78,7 +78,7 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
         wkt=WKT if point_format == 6 else None,
     )
     grid = TileGrid(25.0)
-    index = CloudIndex.of(
+    index = CloudIndex.parse(
         sort_points(str(path), grid, str(tmp_path / "copy")), str(tmp_path / "copy")
     )
     assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)

@@ -1,3 +1,1 @@
-"""Pipelines over any number and size of inputs: tiles with a halo, on one host or several, without
-seams.
-"""
+"""Run pipelines over inputs of any number and size: tiles with a halo, without seams."""

@@ -1,6 +1,4 @@
-"""The working folder of a run beside its outputs: a lock, arrays and records of finished jobs,
-temporary files.
-"""
+"""Keep the working folder of a run beside its outputs: lock, results, temporary files."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ FOLDER = ".pdal-stages"
 
 
 def fingerprint(*parts: Any) -> str:
-    """A digest of JSON-able things."""
+    """Return a digest of JSON-able values."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
@@ -42,6 +40,7 @@ class Store:
         self.scratch = self.folder / "scratch" / secrets.token_hex(4)
 
     def __enter__(self) -> Store:
+        """Create and lock the folder; StageError where another run works in it."""
         self._new = not self.folder.exists()
         try:
             make_own_folder(self.folder)
@@ -71,8 +70,8 @@ class Store:
         return self
 
     def __exit__(self, kind: type | None, *exc: object) -> None:
-        # After an error of a first run there may be nothing to go on from. Whoever locks the
-        # deleted file finds no folder.
+        """Remove temporary files, and all where a first run failed with no result to go on from."""
+        # Another run that locks the deleted file finds no folder.
         failed = self._new and kind is not None and issubclass(kind, StageError)
         useless = failed and not any(self.kept.glob("*.npz"))
         shutil.rmtree(self.folder if useless else self.scratch.parent, ignore_errors=True)
@@ -86,38 +85,37 @@ class Store:
         shutil.rmtree(old, ignore_errors=True)
 
     def path(self, name: str, ending: str = ".npz") -> str:
-        """The path of a file of arrays or points."""
+        """Return the path of a file of arrays or points."""
         return str(self.kept / f"{name}{ending}")
 
     def finish(self, name: str, mark: str, record: Mapping[str, Any]) -> None:
-        """Save the record of a finished job; `mark` is the fingerprint of everything that affects
-        it.
+        """Save the record of a finished job.
+
+        `mark` is the fingerprint of everything that affects it.
         """
         partial = self.kept / f"{name}.partial"
         partial.write_text(json.dumps({**record, "fingerprint": mark}))
         os.replace(partial, self._note(name))
 
     def forget(self, name: str) -> None:
-        """Remove the record of a job that will be run again, so that it cannot match a newer
-        file.
-        """
+        """Remove the record of a job that runs again: it must not match a newer file."""
         self._note(name).unlink(missing_ok=True)
 
     def note(self, name: str) -> dict[str, Any]:
-        """The record of a finished job with its fingerprint; empty where there is none."""
+        """Return the record of a finished job with its fingerprint; empty without one."""
         try:
-            found = strict_json(self._note(name).read_bytes())
-            return found if isinstance(found, dict) else {}
+            record = strict_json(self._note(name).read_bytes())
+            return record if isinstance(record, dict) else {}
         except (OSError, ValueError, RecursionError):
             return {}
 
     def finished(self, name: str, mark: str) -> dict[str, Any] | None:
-        """The record of a job, where `mark` still matches and the files it wrote are unchanged."""
-        found = self.note(name)
+        """Return the record of a job if `mark` matches and the files it wrote are unchanged."""
+        record = self.note(name)
         with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
-            files = found.get("outputs", [])
-            if found.get("fingerprint") == mark and written([path for path, *_ in files]) == files:
-                return found
+            files = record.get("outputs", [])
+            if record.get("fingerprint") == mark and written([path for path, *_ in files]) == files:
+                return record
         return None
 
     def _note(self, name: str) -> Path:
@@ -131,7 +129,7 @@ class Store:
 
 
 def written(outputs: Sequence[str | os.PathLike]) -> list[list[Any]]:
-    """Names, sizes and times of files just written, for a record."""
+    """Return names, sizes and times of files just written, for a record."""
     return [[str(path), s.st_size, s.st_mtime_ns] for path, s in ((p, os.stat(p)) for p in outputs)]
 
 

@@ -1,6 +1,4 @@
-"""Classify a file or a survey: in one piece where it fits into memory, otherwise in seamless
-tiles.
-"""
+"""Classify a file or a survey: in one piece where it fits into memory, else in seamless tiles."""
 
 from __future__ import annotations
 
@@ -35,7 +33,7 @@ class ClassifyTask:
 
     @cached_property
     def files(self) -> list[str]:
-        """All inputs."""
+        """Return all inputs."""
         return input_files(self.inputs)
 
     @cached_property
@@ -56,7 +54,7 @@ class ClassifyTask:
 
     @cached_property
     def outputs(self) -> list[str]:
-        """An output file for each input; empty where each tile is an output."""
+        """Return an output file for each input; empty where each tile is an output."""
         if self._per_tile:
             return []
         target = str(Path(self.output) / "#") if is_folder(self.output) else self.output
@@ -64,10 +62,8 @@ class ClassifyTask:
 
     @contextmanager
     def folders(self) -> Iterator[None]:
-        """Create the output folder, and the folders in it; those that are still empty at the end
-        are removed.
-        """
-        made: list[Path] = []
+        """Create the output folders; remove those that are still empty at the end."""
+        created: list[Path] = []
         names = [f"{self.output}/#", *self.outputs] if is_folder(self.output) else []
         try:
             for folder in sorted({folder for name in names for folder in Path(name).parents}):
@@ -75,14 +71,14 @@ class ClassifyTask:
                     try:
                         folder.mkdir(exist_ok=True)
                     except OSError as error:
-                        found = f"{folder}: {error.strerror}"
                         raise StageError(
-                            "the output folder cannot be created", found=found
+                            "the output folder cannot be created",
+                            found=f"{folder}: {error.strerror}",
                         ) from None
-                    made.append(folder)
+                    created.append(folder)
             yield
         finally:
-            for folder in reversed(made):
+            for folder in reversed(created):
                 with suppress(OSError):
                     folder.rmdir()
 
@@ -136,7 +132,7 @@ class ClassifyTask:
     def run_tiles(
         self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None
     ) -> TiledRun:
-        """Classify all inputs in tiles; `finished` is called with every output that was written."""
+        """Classify all inputs in tiles; call `finished` with every output that was written."""
         from .plan import plan_of_files
         from .tiled_run import run_plan
 

@@ -1,4 +1,4 @@
-"""Tasks on a running Dask scheduler, with workers on this or other hosts."""
+"""Run tasks on a running Dask scheduler, with workers on this or other hosts."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from ..base.version import build
 from ..pipeline import pdal as pdal_env
 from ..pipeline.workers import TaskResult, perform
 
-#: Seconds to wait for the scheduler, and for a worker at the start or after all have gone.
-_CONNECT, _WAIT = 10.0, 120.0
+#: Seconds to wait for the scheduler.
+_CONNECT = 10.0
+#: Seconds to wait for a worker at the start, or after all have gone.
+_WAIT = 120.0
 #: Seconds between checks that scheduler and workers are still there.
 _ASK = 10.0
 _RESUME = "Once it is back, continue with --resume"
@@ -30,6 +32,7 @@ class Cluster(contextlib.AbstractContextManager):
         self.address, self.folder, self.slots = address, folder, 1
 
     def __enter__(self) -> Cluster:
+        """Connect, and wait for the first worker."""
         dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
         try:
             self._client = dask.Client(self.address, timeout=_CONNECT, set_as_default=False)
@@ -55,8 +58,9 @@ class Cluster(contextlib.AbstractContextManager):
         return self
 
     def __exit__(self, *exc: object) -> None:
+        """Cancel what waits, and disconnect."""
         with contextlib.suppress(Exception):
-            self._executor.shutdown(wait=False)  # which cancels what waits
+            self._executor.shutdown(wait=False)
         self._client.close()
 
     def submit(self, task: Callable[[], Any]) -> Future:
@@ -68,10 +72,11 @@ class Cluster(contextlib.AbstractContextManager):
             raise _lost() from None
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """The futures that are done, at least one; StageError where a worker is unsuitable, or the
-        cluster is lost.
+        """Wait for the first futures that are done.
+
+        StageError where a worker is unsuitable, or the cluster is lost.
         """
-        gone: float | None = None
+        last_seen = time.monotonic()
         while True:
             done = wait(list(futures), timeout=_ASK, return_when=FIRST_COMPLETED).done
             if self._client.status != "running" or any(future.cancelled() for future in done):
@@ -83,8 +88,9 @@ class Cluster(contextlib.AbstractContextManager):
                 return done
             with contextlib.suppress(OSError, TimeoutError):
                 self.slots = len(self._client.nthreads())
-            gone = None if self.slots else gone or time.monotonic()
-            if gone is not None and time.monotonic() - gone > _WAIT:
+            if self.slots:
+                last_seen = time.monotonic()
+            elif time.monotonic() - last_seen > _WAIT:
                 raise StageError("all workers of the Dask scheduler are gone", cure=_RESUME)
 
 
@@ -93,19 +99,18 @@ def _lost() -> StageError:
 
 
 def _versions() -> tuple[str, str]:
-    """Of this package and of PDAL, where it is called."""
+    """Return the versions of this package and of PDAL in this process."""
     return build(), pdal_env.dotted_version()
 
 
 def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) -> TaskResult | str:
     """Do a task on a worker for the program on `host`, or return why the worker is unsuitable."""
-    here, theirs = socket.gethostname(), _versions()
-    if theirs != wanted:
+    here, versions = socket.gethostname(), _versions()
+    if versions != wanted:
         return (
             "a worker of the scheduler runs other versions than this program (found pdal-stages "
-            f"{theirs[0]} and PDAL "
-            f"{theirs[1]} on {here}, here {wanted[0]} and {wanted[1]}). Install the same on all "
-            "hosts"
+            f"{versions[0]} and PDAL {versions[1]} on {here}, here {wanted[0]} and {wanted[1]}). "
+            "Install the same on all hosts"
         )
     for _ in range(5):  # network file systems may show a new folder late
         if os.path.isdir(folder):
@@ -114,8 +119,7 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
     else:
         return (
             f"a worker of the scheduler does not see the output folder (found no {folder} on "
-            f"{here}). Inputs, model and "
-            "outputs must have the same paths on all hosts"
+            f"{here}). Inputs, model and outputs must have the same paths on all hosts"
         )
     answer = perform(pickle.loads(task))
     if answer.reason and here != host:

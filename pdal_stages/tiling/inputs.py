@@ -1,6 +1,4 @@
-"""The inputs of a tiled run, checked before any tile: whether they can be read, their extent and
-unit.
-"""
+"""Find and check the inputs of a tiled run before any tile: readable, extent, unit."""
 
 from __future__ import annotations
 
@@ -26,15 +24,12 @@ from ..pipeline.las_output import replaced
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
 from ..pipeline.stage_files import LAS_READERS, named_files
 from .checkpoint import fingerprint
-from .options import Density, Extent, TilingOptions, block_bytes, settled, tiles_per_square
+from .options import Density, Extent, TilingOptions, block_bytes, choose_tiles, tiles_per_square
 from .plan import TilePlan, outputs_for
 from .tile_grid import Box, TileGrid, check_number, touching, union
 
 #: Options of readers.tindex that select files or points, or change them.
-_NAME_IT = "--readers.las.default_srs=EPSG:CODE names it in both"
 _TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
-#: Bytes of the digest, at the beginning and the end.
-_ENDS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -50,61 +45,70 @@ class InputSource:
         """A short identifier, the same in every run."""
         return hashlib.sha1(os.fsencode(self.path)).hexdigest()[:12]
 
-    def within(self, box: Box) -> dict[str, Any]:
-        """The reader of an EPT source, restricted to a box."""
+    def clip(self, box: Box) -> dict[str, Any]:
+        """Return the reader of an EPT source, restricted to a box."""
         x0, y0, x1, y1 = box
-        return {
-            **self.reader,
-            "filename": self.path,
-            "bounds": f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])",
-        }
+        bounds = f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])"
+        return {**self.reader, "filename": self.path, "bounds": bounds}
 
 
 def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
-    """The inputs of readers: names, patterns, EPT addresses, tile indexes; PipelineError where one
-    cannot be cut.
+    """Return the inputs of readers: names, patterns, EPT addresses, tile indexes.
+
+    PipelineError where one cannot be cut.
     """
-    found: dict[str, InputSource] = {}
+    sources: dict[str, InputSource] = {}
     for reader in readers:
-        given, kind = reader.get("filename", ""), reader["type"]
-        name = str(given)
         options = {k: v for k, v in reader.items() if k not in ("filename", "tag", "inputs")}
-        paths = given if isinstance(given, list) else [name]  # from a command all are files
-        if kind == "readers.ept":
-            for path in paths:
-                path = ept_address(path)
-                found.setdefault(path, InputSource(path, options, "ept"))
-            continue
-        if kind == "readers.tindex":
-            if ignored := [o for o in _TINDEX_QUERIES if o in reader]:
+        name = reader.get("filename", "")
+        paths: list[str] = name if isinstance(name, list) else [str(name)]
+        kind = "ept" if reader["type"] == "readers.ept" else "las"
+        if kind == "ept":
+            paths = [ept_address(path) for path in paths]
+        else:
+            if reader["type"] == "readers.tindex":
+                paths, options = _indexed_files(reader, options)
+            elif reader["type"] not in LAS_READERS:
                 raise PipelineError(
-                    "in tiles, all files of a tile index are read whole and in their own spatial "
-                    "reference",
-                    where=kind,
-                    found=", ".join(ignored),
-                    cure="Leave these options out, or make an index of the files you mean",
+                    f"{reader['type']} cannot read a part of a file, so it cannot be cut into "
+                    "tiles",
+                    found=name,
+                    cure="Convert the input first: pdal translate INPUT input.laz",
                 )
-            paths = locations(name, str(options.pop("tindex_name", "location")))
-            options = {k: v for k, v in options.items() if k in ("override_srs", "default_srs")}
-        elif kind not in LAS_READERS:
-            raise PipelineError(
-                f"{kind} cannot read a part of a file, so it cannot be cut into tiles",
-                found=name,
-                cure="Convert the input first: pdal translate INPUT input.laz",
-            )
-        elif paths == [name] and not os.path.exists(name) and any(c in name for c in "*?["):
-            paths = sorted(glob.glob(name, recursive=True))
-            if not paths:
-                raise PipelineError("no file matches the reader's pattern", where=kind, found=name)
-        for path in map(os.path.abspath, paths):
-            las.refuse_pipe(path)
-            found.setdefault(path, InputSource(path, {**options, "type": "readers.las"}, "las"))
-    return list(found.values())
+            elif isinstance(name, str) and not os.path.exists(name) and glob.has_magic(name):
+                paths = sorted(glob.glob(name, recursive=True))
+                if not paths:
+                    raise PipelineError(
+                        "no file matches the reader's pattern", where=reader["type"], found=name
+                    )
+            paths = [os.path.abspath(path) for path in paths]
+            for path in paths:
+                las.refuse_pipe(path)
+            options["type"] = "readers.las"
+        for path in paths:
+            sources.setdefault(path, InputSource(path, options, kind))
+    return list(sources.values())
+
+
+def _indexed_files(
+    reader: dict[str, Any], options: dict[str, Any]
+) -> tuple[list[str], dict[str, Any]]:
+    """Return the files of a tile index, and the options for their readers."""
+    if queries := [name for name in _TINDEX_QUERIES if name in reader]:
+        raise PipelineError(
+            "in tiles, all files of a tile index are read whole and in their own spatial reference",
+            where="readers.tindex",
+            found=", ".join(queries),
+            cure="Leave these options out, or make an index of the files you mean",
+        )
+    paths = locations(str(reader["filename"]), str(options.get("tindex_name", "location")))
+    return paths, {k: v for k, v in options.items() if k in ("override_srs", "default_srs")}
 
 
 def read_extent(source: InputSource) -> Extent:
-    """Number of points and bounding box, from the first bytes; StageError where these cannot be
-    read.
+    """Return the number of points and the bounding box of an input, from its header.
+
+    StageError where these cannot be read.
     """
     if source.kind != "ept":
         return las_extent(source.path)
@@ -114,26 +118,26 @@ def read_extent(source: InputSource) -> Extent:
 
 
 def las_extent(path: str) -> Extent:
-    """Number of points and bounding box in the header of a LAS or LAZ file."""
+    """Return the number of points and the bounding box in the header of a LAS or LAZ file."""
     try:
-        found = las.read_header(path)
+        header = las.read_header(path)
     except OSError as error:
         raise StageError("the input cannot be read", where=path, found=error) from None
-    if found is None:
+    if header is None:
         raise StageError("the input is not a LAS or LAZ file", where=path)
-    x0, y0, x1, y1 = found.box
-    if found.count and not (math.isfinite(x1 - x0 + y1 - y0) and x0 <= x1 and y0 <= y1):
+    x0, y0, x1, y1 = header.box
+    if header.count and not (math.isfinite(x1 - x0 + y1 - y0) and x0 <= x1 and y0 <= y1):
         raise StageError(
             "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
         )
-    return Extent(found.count, found.box)
+    return Extent(header.count, header.box)
 
 
-# ---- EPT sources ---------------------------------------------------------------------------------------------
+# ---- EPT sources ---------------------------------------------------------------------------------
 
 
 def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of ``writers.las`` for an EPT source: its scales, offsets and colors."""
+    """Return options of ``writers.las`` for an EPT source: its scales, offsets and colors."""
     axes = {dimension["name"]: dimension for dimension in described["schema"]}
     colored = 8 if "Infrared" in axes else 7 if "Red" in axes else 6
     form: dict[str, Any] = {"minor_version": 4, "dataformat_id": colored}
@@ -144,19 +148,19 @@ def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
-    """Read the points of an EPT source in a box into a LAS file; whether there are any.
+    """Read the points of an EPT source in a box into a LAS file; return whether there are any.
 
     Scales and offsets are the source's, so coordinates do not change; other dimensions become extra
     dimensions.
     """
     form = {**ept_form(read_ept(source.path)), "extra_dims": "all"}
     run = pdal_env.execute(
-        [source.within(box), {"type": "writers.las", "filename": target, **form}], arrays=False
+        [source.clip(box), {"type": "writers.las", "filename": target, **form}], arrays=False
     )
     return bool(run.count and las_extent(target).count)
 
 
-# ---- all of them ---------------------------------------------------------------------------------------------
+# ---- all inputs ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -166,9 +170,8 @@ class CloudIndex:
     count: int
     box: Box  #: of all points
     tiles: list[tuple[int, int, int]]  #: column, row and number of points of each tile
-    cells: NDArray[
-        np.int64
-    ]  #: (n, 4): column, row, index of the first point in the copy, number of points
+    #: (n, 4): column, row, index of the first point in the copy, number of points
+    cells: NDArray[np.int64]
     grid: TileGrid  #: of the cells
     copy: str  #: the file with the points
     checksum: int  #: CRC-32 of the copy
@@ -176,8 +179,8 @@ class CloudIndex:
     changed_ns: int  #: time of the input's last change of content or status, which no program sets
 
     @classmethod
-    def of(cls, record: dict[str, Any], copy: str) -> CloudIndex:
-        """From what :func:`sort_points` found."""
+    def parse(cls, record: dict[str, Any], copy: str) -> CloudIndex:
+        """Return the index that :func:`sort_points` has described."""
         cells = np.array(record["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in record["tiles"]]
         sums = int(record["checksum"]), str(record["digest"]), int(record["changed_ns"])
@@ -206,20 +209,21 @@ class Survey:
     def __init__(
         self, plan: TilePlan, options: TilingOptions, earlier: Mapping[str, Any] | None = None
     ) -> None:
-        """`earlier`: the :attr:`layout` of the run that this one resumes, where the user gives no
+        """Find and check the inputs, and choose tiles.
+
+        `earlier` is the :attr:`layout` of the run that this one resumes, where the user gives no
         tile size.
         """
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
         self.unreadable: dict[str, str] = {}  #: unreadable inputs by path, and why
         self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
-        self.indexes: dict[
-            str, CloudIndex
-        ] = {}  #: of LAS and LAZ files by path, once they were read
+        #: of LAS and LAZ files by path, once they were read
+        self.indexes: dict[str, CloudIndex] = {}
         self.sources = find_sources(plan.readers)
         self.paths = [source.path for source in self.sources]
         others = named_files([*plan.head, *plan.tail])
-        #: Fingerprints of inputs, and of other files that stages read, at the start of the run.
+        #: Sizes and times of inputs, and of other files that stages read, at the start of the run.
         self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
         self._read_headers()
         files_of_las = [source.path for source in self.sources if source.kind == "las"]
@@ -234,13 +238,13 @@ class Survey:
         self.unit = self._unit(plan)  #: meters per unit of the coordinates
         self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
         self.place()
-        self.density = Density.of(self.extents.values())
+        self.density = Density.measure(self.extents.values())
         #: Memory of a worker for the rounds before the tiles.
         self.block_bytes = (
             block_bytes(plan.first.blocks, self.density.area * self.unit**2) if plan.first else 0.0
         )
         sized = replace(options, tile=earlier["tile"]) if earlier else options
-        self.options, self.grid = settled(
+        self.options, self.grid = choose_tiles(
             sized, self.density, self.halo_units, self.per == "file", self.block_bytes
         )
         if earlier:
@@ -267,7 +271,7 @@ class Survey:
             except StageError as error:
                 self.unreadable[source.path] = str(error)
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
-        self.messages += [f"{said}{more}" for said in odd[:1]]
+        self.messages += [f"{message}{more}" for message in odd[:1]]
         if lost := len(self.sources) - len(self.extents):
             self.messages.append(
                 f"{lost:,} of the inputs have no readable header: where they lie is not known, and "
@@ -276,51 +280,53 @@ class Survey:
             )
 
     def _unit(self, plan: TilePlan) -> float:
-        """Meters per unit of the coordinates; inputs that stages see together must have the same
-        reference.
+        """Return meters per unit of the coordinates.
+
+        Inputs that stages see together must have the same reference.
         """
         needed = bool(plan.head and plan.sees_m)
-        of_kind: dict[str, Reference] = {}  # PDAL is asked once for equal references
-        found: dict[str, Reference] = {}
+        known: dict[str, Reference] = {}  # PDAL is asked once for equal references
+        references: dict[str, Reference] = {}
         for source in self.sources:
             if source.path in self.unreadable:
                 continue
             ept = source.kind == "ept"
-            own = read_ept(source.path).get("srs") if ept else las.projection(source.path)
-            kind = fingerprint(source.reader, own)
+            projection = read_ept(source.path).get("srs") if ept else las.projection(source.path)
+            kind = fingerprint(source.reader, projection)
             try:
-                if kind not in of_kind:
-                    of_kind[kind] = self._reference_of(source, plan.unit)
+                if kind not in known:
+                    known[kind] = self._reference_of(source, plan.unit)
             except PipelineError as error:
                 self.unreadable[source.path] = str(error)
                 continue
             except StageError:
                 if needed:
                     raise
-                of_kind[kind] = Reference(Units())  # nobody asks
-            found[source.path] = of_kind[kind]
-        if not found:
+                known[kind] = Reference(Units())  # no stage needs it
+            references[source.path] = known[kind]
+        if not references:
             reasons = iter(self.unreadable.values())
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if needed:
-            said = check_one_reference(found)
-            if said and self.per == "file":
-                said[0] += f", and the output gets none: {_NAME_IT}"
-            self.messages += said
-        return next(iter(found.values())).units.horizontal
+            messages = check_one_reference(references)
+            if messages and self.per == "file":
+                messages[0] += (
+                    ", and the output gets none: --readers.las.default_srs=EPSG:CODE names it in "
+                    "both"
+                )
+            self.messages += messages
+        return next(iter(references.values())).units.horizontal
 
     def _reference_of(self, source: InputSource, horizontal: str) -> Reference:
-        """The reference of an input, according to PDAL's reader, with as few points read as
-        possible.
-        """
+        """Return the reference of an input, as PDAL's reader reports it after few points."""
         if source.kind == "las":
             return reference_of({**source.reader, "filename": source.path, "count": 1}, horizontal)
         x, y, _, _ = self.extents[source.path].box
-        return reference_of(source.within((x, y, x + 1, y + 1)), horizontal)
+        return reference_of(source.clip((x, y, x + 1, y + 1)), horizontal)
 
     @property
     def layout(self) -> dict[str, float]:
-        """The grids of the run, for one that resumes it: the free memory may be another by then."""
+        """The grids, for a run that resumes this one with another amount of free memory."""
         square = round(self.squares.size / self.grid.size)
         return {"tile": self.grid.size, "origin": self.grid.origin, "square": square}
 
@@ -337,23 +343,24 @@ class Survey:
         self.bounds: Box = union(boxes)
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
-        """Names and fingerprints of the files that stages read."""
+        """Return names, sizes and times of the files that stages read."""
         return [[path, self.stamps.get(path)] for path in named_files(stages)]
 
     def seen(self, sources: list[InputSource]) -> list[Any]:
-        """Return names, fingerprints, digests and readers of inputs."""
-        indexes = [self.indexes.get(source.path) for source in sources]
+        """Return names, readers and contents of inputs: digests, or sizes and times without."""
         return [
-            [source.path, self.stamps[source.path], index and index.digest, source.reader]
-            for source, index in zip(sources, indexes, strict=True)
+            [source.path, source.reader, self.indexes[source.path].digest]
+            if source.path in self.indexes
+            else [source.path, source.reader, self.stamps[source.path]]
+            for source in sources
         ]
 
     def changed(self) -> list[str]:
-        """Inputs and other files that changed since the run began."""
-        return [path for path, then in self.stamps.items() if stamp(path) != then]
+        """Return the inputs and other files that changed since the run began."""
+        return [path for path, before in self.stamps.items() if stamp(path) != before]
 
     def near(self, tile: tuple[int, int], halo_units: float) -> list[InputSource]:
-        """Inputs that may have points in a tile or its halo."""
+        """Return the inputs that may have points in a tile or its halo."""
         return self.near_box(self.grid.box(tile, halo_units))
 
     def near_box(self, box: Box) -> list[InputSource]:
@@ -361,13 +368,11 @@ class Survey:
         return [self.placed[n] for n in touching(self._boxes, box)]
 
     def readable(self, sources: list[InputSource]) -> list[IndexedSource]:
-        """The readable ones, with the index of their points."""
+        """Return the inputs that are readable, with the index of their points."""
         return [(s, self.indexes.get(s.path)) for s in sources if s.path not in self.unreadable]
 
     def tiles(self) -> dict[tuple[int, int], int]:
-        """Every tile that may have own points, row by row, and their number where known (else
-        0).
-        """
+        """Return all tiles that may have points, row by row, with their number (0: unknown)."""
         counts: dict[tuple[int, int], int] = {}
         for path, header in self.extents.items():
             if path in self.indexes:
@@ -380,7 +385,7 @@ class Survey:
         return dict(sorted(counts.items(), key=lambda item: (item[0][1], item[0][0])))
 
     def figures(self, plan: TilePlan) -> dict[str, Any]:
-        """Figures of the pipeline, its models, the inputs and the tiles for the report."""
+        """Return what the report tells about the pipeline, its models, the inputs and the tiles."""
         return {
             "pipeline": plan.name,
             "models": [str(stage["model"]) for stage in plan.head if "model" in stage],
@@ -403,26 +408,17 @@ def digest_of(path: str | os.PathLike) -> str:
     return digest.hexdigest()
 
 
-def stamp(path: str | os.PathLike) -> list[Any]:
-    """A fingerprint: size, time of change, and a digest of both ends. Copies and changes of mode
-    keep it.
-
-    It also detects a file that was replaced by one with the same size and time.
-    """
+def stamp(path: str | os.PathLike) -> list[int]:
+    """Return the size and time of a file; -1 where there is none."""
     try:
-        with open(path, "rb") as file:
-            status, digest = os.fstat(file.fileno()), hashlib.sha256()
-            for at in (0, max(0, status.st_size - _ENDS)):
-                file.seek(at)
-                digest.update(file.read(_ENDS))
+        status = os.stat(path)
     except OSError:
-        return [-1, -1, ""]  # not there, or not a file
-    return [status.st_size, status.st_mtime_ns, digest.hexdigest()[:16]]
+        return [-1, -1]
+    return [status.st_size, status.st_mtime_ns]
 
 
 def one_format(paths: Sequence[str]) -> dict[str, Any]:
-    """Options of ``writers.las`` that can hold the points of all inputs; none where these are LAS
-    files of one form.
+    """Return options of ``writers.las`` for the points of all inputs; empty for LAS of one form.
 
     The finest scale of each axis with its offset, and the first format of LAS 1.4 with all colors
     of the inputs: PDAL only forwards what all inputs of a tile share, and otherwise uses scales of
@@ -450,9 +446,9 @@ def one_format(paths: Sequence[str]) -> dict[str, Any]:
     for axis, name in enumerate("xyz"):
         along = {(place[axis], place[3 + axis]) for place in places}
         if len(along) > 1:
-            scale, offset = min(along, key=lambda one: (one[0], -abs(one[1])))
+            scale, offset = min(along, key=lambda place: (place[0], -abs(place[1])))
             # Of newer PDAL "auto" is the tile's middle, off the grid of the coordinates: only for
             # what lies too far apart.
-            far = any(abs(one - offset) > 2**30 * scale for _, one in along)
+            far = any(abs(other - offset) > 2**30 * scale for _, other in along)
             options |= {f"scale_{name}": scale, f"offset_{name}": "auto" if far else offset}
     return options

@@ -19,16 +19,13 @@ if TYPE_CHECKING:
 _MOST_MESSAGES = 20
 _CHANGED = (
     "it changed during the run, so outputs may hold results from before and after. Once it no "
-    "longer changes, run "
-    "it again with --resume"
+    "longer changes, run it again with --resume"
 )
 
 
 @dataclass
 class Job:
-    """A task of a run and its state: a tile, an output to be assembled from tiles, or a task of the
-    first round.
-    """
+    """A task of a run and its state: a tile, an output of tiles, or a part of the first round."""
 
     name: str  #: its key in the work folder
     points: int = 0  #: its own; 0 where unknown before it is read
@@ -49,7 +46,7 @@ class Job:
 
     @property
     def is_output(self) -> bool:
-        """Whether it is an output that is assembled from tiles."""
+        """Return whether it is an output that is assembled from tiles."""
         return self.source is not None and self.outputs is not None
 
     def fail(self, reason: str, blocked_by: str = "") -> None:
@@ -60,6 +57,12 @@ class Job:
         """Mark it as failed where any job that it needs has failed."""
         if reason := next((job.reason for job in needed if job.reason), ""):
             self.fail(reason)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what a report tells of it, as of all jobs."""
+        reason = {"reason": self.reason} if self.reason else {}
+        known = {k: v for k, v in self.record.items() if k not in ("fingerprint", "outputs")}
+        return {"state": self.state, **known, **reason}
 
 
 class InterruptedRun(KeyboardInterrupt):
@@ -72,7 +75,7 @@ class InterruptedRun(KeyboardInterrupt):
 
 @dataclass
 class TiledRun:
-    """The result of a tiled run."""
+    """The result of a run."""
 
     tiles: list[Job]
     outputs: list[Job]  #: empty where each tile is an output
@@ -87,149 +90,128 @@ class TiledRun:
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """What failed, and why: inputs with the jobs that depend on them, then other tiles and
-        outputs.
-        """
+        """Return what failed, and why: inputs, then tiles and outputs with other reasons."""
         jobs = [(f"tile {job.name}", job) for job in self.tiles]
         jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
         return [
             *(
-                (p, why.removeprefix(f"{p}: ") + self._blocked_by(p))
+                (p, why.removeprefix(f"{p}: ") + self._blocked(p))
                 for p, why in self.unreadable.items()
             ),
             *((path, _CHANGED) for path in self.changed),
-            *(
-                (what, job.reason)
-                for what, job in jobs
-                if job.state == "failed" and not job.blocked_by
-            ),
+            *((what, job.reason) for what, job in jobs if job.reason and not job.blocked_by),
         ]
 
-    def _blocked_by(self, path: str) -> str:
-        """A remark on the jobs that depend on an unreadable input."""
+    def _blocked(self, path: str) -> str:
+        """Return a remark on the jobs that an unreadable input blocks."""
         tiles, outputs = (
-            sum(j.blocked_by == path for j in jobs) for jobs in (self.tiles, self.outputs)
+            sum(job.blocked_by == path for job in jobs) for jobs in (self.tiles, self.outputs)
         )
         if not tiles and not outputs:
             return ""
         return (
             f" ({count_of(tiles, 'tile')} and {count_of(outputs, 'output')} depend on it and are "
-            "not made. Remove it from "
-            "the inputs to make them without it)"
+            "not made. Remove it from the inputs to make them without it)"
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON-able report."""
-        told = ("written", "classes", "seconds", "cpu_seconds", "peak_mb")
+        """Return a JSON-able report."""
         return {
             "pdal_stages": __version__,
             **self.summary,
             "messages": self.messages,
             "failures": [{"what": what, "reason": reason} for what, reason in self.failures],
             "tiles": [
-                {"name": j.name, "tile": list(j.tile), "state": j.state, "points": j.points}
-                | {
-                    k: v
-                    for k, v in j.record.items()
-                    if k != "fingerprint" and (k != "outputs" or j.outputs)
-                }
-                | ({"reason": j.reason} if j.reason else {})
-                for j in self.tiles
+                {"name": job.name, "tile": list(job.tile), "points": job.points}
+                | job.to_dict()
+                | ({"outputs": job.outputs} if job.outputs else {})
+                for job in self.tiles
             ],
             "outputs": [
-                {"input": o.source and o.source.path, "output": o.outputs, "state": o.state}
-                | ({"reason": o.reason} if o.reason else {})
-                | {k: o.record[k] for k in told if k in o.record}
-                for o in self.outputs
+                {"input": job.source and job.source.path, "output": job.outputs} | job.to_dict()
+                for job in self.outputs
             ],
             **({"objects": self.objects} if self.objects else {}),
         }
 
 
 def summarize(tiles: list[Job], cpu_seconds: float, seconds: float) -> dict[str, Any]:
-    """Figures of all tiles together, for :attr:`TiledRun.summary`."""
+    """Return the figures of all tiles together, for :attr:`TiledRun.summary`."""
     worked = [job.record for job in tiles if job.state == "done"]
     classes: Counter[str] = Counter()
-    alone: Counter[str] = Counter()
+    left_alone: Counter[str] = Counter()
     for job in tiles:
         classes.update(job.record.get("classes") or {})
-        alone.update(job.record.get("left_alone") or {})
-
-    def total(key: str) -> int:
-        return sum(record.get(key, 0) for record in worked)
-
+        left_alone.update(job.record.get("left_alone") or {})
+    points, read, dropped = (
+        sum(record.get(key, 0) for record in worked) for key in ("points", "read", "dropped")
+    )
     return {
-        "points": total("points"),
-        "points_read": total("read"),
-        "dropped": total("dropped"),
+        "points": points,
+        "points_read": read,
+        "dropped": dropped,
         "seconds": seconds,
-        "points_per_second": total("points") / seconds if seconds else 0.0,
+        "points_per_second": points / seconds if seconds else 0.0,
         "cpu_seconds": cpu_seconds,
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
-        "left_alone": dict(alone),
+        "left_alone": dict(left_alone),
     }
 
 
 def messages_on_folders(
     outputs: Iterable[str], inputs: Iterable[str], resumed: bool = False
 ) -> list[str]:
-    """Return what the user should know of LAS and LAZ files that are in the folders of outputs
-    before a run.
+    """Return messages on LAS and LAZ files in the output folders before a run.
 
     Outputs that are there will be replaced, unless the run is `resumed` and may keep them; others
     stay.
     """
     names = {os.path.realpath(name) for name in outputs}
-    known = names | {os.path.realpath(name) for name in inputs}
-    there = {
+    present = {
         entry.path
-        for folder in {os.path.dirname(name) for name in names}
-        if os.path.isdir(folder)
+        for folder in filter(os.path.isdir, {os.path.dirname(name) for name in names})
         for entry in os.scandir(folder)
         if entry.name.lower().endswith((".las", ".laz")) and entry.is_file()
     }
-    told = []
-    if (replaced := names & there) and not resumed:
-        told.append(
-            f"{count_of(len(replaced), 'existing output file')} replaced: {_some(replaced)}"
-        )
-    if others := there - known:
-        told.append(
-            f"{count_of(len(others), 'LAS or LAZ file')} in the folder of the outputs not written "
-            "by this run, left as "
-            f"before: {_some(others)}"
-        )
-    return told
-
-
-def _some(paths: Iterable[str]) -> str:
-    """Return the names of a few files, in alphabetical order."""
-    names = sorted(map(os.path.basename, paths))
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    kinds = (
+        (set() if resumed else names & present, "existing output file", "replaced"),
+        (
+            present - names - {os.path.realpath(name) for name in inputs},
+            "LAS or LAZ file",
+            "in the folder of the outputs not written by this run, left as before",
+        ),
+    )
+    messages = []
+    for paths, kind, fate in kinds:
+        listed = sorted(map(os.path.basename, paths))
+        more = ", ..." if len(listed) > 3 else ""
+        if listed:
+            messages.append(f"{count_of(len(listed), kind)} {fate}: {', '.join(listed[:3])}{more}")
+    return messages
 
 
 def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> list[str]:
-    """Warnings and notes of tiles and of the first round, once each, the most frequent first."""
+    """Return warnings and notes of tiles and of the first round, once each, frequent ones first."""
     done = [job for job in tiles if job.state == "done"]
-    found: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for lines in ([j.record.get("messages", []) for j in done if j.record.get("points")], before):
         for text, n in Counter(text for each in lines for text in set(each)).items():
             if not text.startswith((NO_POINT_MATCHES, NO_POLYGON_NEAR)):
-                found[text] += n
+                counts[text] += n
             elif n == len(lines):  # that there is nothing to do in some tiles is normal
-                found[text] = max(found[text], n)
+                counts[text] = max(counts[text], n)
     # Messages of one stage that several stages report, too.
-    for text in [text for text in found if text.partition(": ")[2] in found]:
-        del found[text]
-    told = [f"{text} ({count_of(n, 'tile')})" for text, n in found.most_common(_MOST_MESSAGES)]
-    if len(found) > _MOST_MESSAGES:
-        told.append(f"and {len(found) - _MOST_MESSAGES} more; see --report")
+    for text in [text for text in counts if text.partition(": ")[2] in counts]:
+        del counts[text]
+    messages = [f"{text} ({count_of(n, 'tile')})" for text, n in counts.most_common(_MOST_MESSAGES)]
+    if len(counts) > _MOST_MESSAGES:
+        messages.append(f"and {len(counts) - _MOST_MESSAGES} more; see --report")
     if short := [job.name for job in done if job.record.get("short")]:
-        told.append(
+        messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
             "or terrain reach farther "
             f"than could be read within {most_points:,} points; they may differ from an untiled "
             "run: " + ", ".join(short[:5])
         )
-    return told
+    return messages

@@ -1,5 +1,4 @@
-"""The command ``pdal-stages objects``: from classified files to one vector file, with objects whole
-across file borders.
+"""Find objects in classified files, whole across file borders, and write one vector file.
 
 Each file is read once into records of cells; then objects are found in all.
 """
@@ -7,7 +6,7 @@ Each file is read once into records of cells; then objects are found in all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from ..base.units import Units
 from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
 from ..objects.detect import find_objects
-from ..objects.results import Objects, ObjectSettings
+from ..objects.results import Objects
 from ..pipeline.inputs_outputs import input_files, stage_files
 from ..pipeline.las_chunks import can_read_chunks, read_columns
 from ..pipeline.overrides import Override
@@ -52,20 +51,18 @@ def refuse_tiles(task: ClassifyTask) -> None:
 def objects_of_files(
     names: Sequence[str], stage: WriteObjects, workers: int = 1, metadata: str | None = None
 ) -> dict[str, Any]:
-    """Find objects in classified files, write and summarize them; returns the files, and counts by
-    kind.
-    """
+    """Find objects in classified files, write and print them; return the files, counts by kind."""
     inputs = input_files(names)
     more = [Output(metadata, "metadata", JSON)] if metadata else []
     check_outputs([*stage.outputs(), *more], [*inputs, *names, *stage_files(stage)])
-    found, units, wkt = _find_in_files(inputs, stage, workers)
-    found, refused = found.without(stage.refuse)
-    files = write_objects(stage.filename, found, stage.outlines == STRAIGHT, units, wkt)["files"]
-    summary = found.summary()
-    for kind, one in summary.items():
-        word = kind if one["objects"] != 1 else kind.removesuffix("s")
-        print(f"{one['objects']:,} {word}, {one['to_be_checked']:,} to be checked")
-        for reason, count in one["reasons"].items():
+    objects, units, wkt = _find_in_files(inputs, stage, workers)
+    objects, refused = objects.without(stage.refuse)
+    files = write_objects(stage.filename, objects, stage.outlines == STRAIGHT, units, wkt)["files"]
+    summary = objects.summary()
+    for kind, counts in summary.items():
+        word = kind if counts["objects"] != 1 else kind.removesuffix("s")
+        print(f"{counts['objects']:,} {word}, {counts['to_be_checked']:,} to be checked")
+        for reason, count in counts["reasons"].items():
             print(f"  {reason:28s} {count:>10,}")
     if stage.refuse:
         print(f"{refused:,} left out (refuse: {', '.join(stage.refuse)})")
@@ -75,9 +72,7 @@ def objects_of_files(
             "version": __version__,
             "inputs": inputs,
             "files": files,
-            "settings": {
-                one.name: getattr(found.settings, one.name) for one in fields(ObjectSettings)
-            },
+            "settings": asdict(objects.settings),
             "objects": summary,
             "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
@@ -85,57 +80,57 @@ def objects_of_files(
     return {"files": files, **summary}
 
 
-def writer(output: str, overrides: Sequence[Override] = (), **given: Any) -> WriteObjects:
-    """The stage with the options of the command: ``--writers.objects.NAME=``, or
-    ``--filters.objects.NAME=``.
-    """
-    for one in overrides:
-        if one.by_tag or one.selector not in OPTIONS_OF:
+def writer(output: str, overrides: Sequence[Override] = (), **options: Any) -> WriteObjects:
+    """Return the stage with the options of the command, ``--writers.objects.NAME=VALUE``."""
+    for override in overrides:
+        if override.by_tag or override.selector not in OPTIONS_OF:
             raise OptionError(
-                "objects takes only options of writers.objects and filters.objects", found=one.flag
+                "objects takes only options of writers.objects and filters.objects",
+                found=override.flag,
             )
-        given[one.option] = one.value
-    return WriteObjects({**given, "filename": output})
+        options[override.option] = override.value
+    return WriteObjects({**options, "filename": output})
 
 
 def _find_in_files(
     inputs: Sequence[str], stage: WriteObjects, workers: int
 ) -> tuple[Objects, Units, str]:
-    """The objects of all files together; the units of the coordinates and their reference (WKT)."""
+    """Return the objects of all files together, units of the coordinates, and reference (WKT)."""
     units = (stage.horizontal_unit, stage.vertical_unit)
     references = {path: reference_of_file(path, *units) for path in inputs}
     print_messages(*check_one_reference(references))
     wkt = references[inputs[0]].wkt
     cells = _all_cells(inputs, stage, wkt, workers)
-    size, thin = cells.size, cells.sparse_kind()
-    widens = "cell" not in stage.set_options
-    while widens and cells.sparse_kind() and cells.size < LARGEST:
-        cells = cells.doubled()
-    if thin:
-        too_few = f"cells of {size:g} m hold {thin[1]:.1f} points of {thin[0]} on average"
-        print_messages(
-            f"{too_few}, so cells of {cells.size:g} m are used, where roofs look rougher; --cell "
-            f"{size:g} keeps smaller ones"
-            if widens
-            else f"{too_few}, so objects may fall apart: try --cell {2 * size:g}"
-        )
-    found = find_objects(cells, replace(stage.settings, cell=cells.size))
-    return found, references[inputs[0]].units, wkt
+    if sparse := cells.sparse_kind():
+        size = cells.size
+        message = f"cells of {size:g} m hold {sparse[1]:.1f} points of {sparse[0]} on average, so "
+        if "cell" in stage.set_options:
+            message += f"objects may fall apart: try --cell {2 * size:g}"
+        else:
+            while cells.sparse_kind() and cells.size < LARGEST:
+                cells = cells.doubled()
+            message += (
+                f"cells of {cells.size:g} m are used, where roofs look rougher; --cell {size:g} "
+                "keeps smaller ones"
+            )
+        print_messages(message)
+    objects = find_objects(cells, replace(stage.settings, cell=cells.size))
+    return objects, references[inputs[0]].units, wkt
 
 
 def _all_cells(inputs: Sequence[str], stage: WriteObjects, wkt: str, workers: int) -> Cells:
-    """The cells of all files."""
+    """Return the cells of all files."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
-    for found, codes in each_file(_cells_of, [(path, stage, wkt) for path in inputs], workers):
-        cells = Cells.join([cells, found])
+    for part, codes in each_file(_cells_of, [(path, stage, wkt) for path in inputs], workers):
+        cells = Cells.join([cells, part])
         seen += codes
     refuse_unclassified(cells, np.flatnonzero(seen).astype(np.uint8))
     return cells
 
 
 def _cells_of(path: str, stage: WriteObjects, wkt: str) -> tuple[Cells, NDArray[np.int64]]:
-    """The cells of a file, and its number of points by class code."""
+    """Return the cells of a file, and its numbers of points (256,) by class code."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
     for arrays, flags in read_columns(path, ("Reliability",), _ONLY):

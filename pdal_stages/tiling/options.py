@@ -1,4 +1,4 @@
-"""Tiles: the user's options, and the size that memory allows."""
+"""Check the user's options of tiles, and choose the size that memory allows."""
 
 from __future__ import annotations
 
@@ -21,9 +21,14 @@ PER = ("auto", "file", "tile")
 #: Largest side of a tile, in units of the coordinates, and buffer: more than the Earth's
 #: circumference in feet.
 LARGEST_TILE = 1e9
-#: Memory of a worker: programs and model, a point of a tile with its halo, a point of an output
-#: file that is assembled, and the `memory` option of our stages. See docs/large-areas.md.
-BASE, TILE_POINT, FILE_POINT, STAGES = 350 << 20, 285, 250, 512 << 20
+#: Bytes of a worker for programs and model; all memory is described in docs/large-areas.md.
+BASE = 350 << 20
+#: Bytes of a point of a tile with its halo.
+TILE_POINT = 285
+#: Bytes of a point of an output file that is assembled.
+FILE_POINT = 250
+#: Bytes that the `memory` option of our stages allows.
+STAGES = 512 << 20
 #: Memory of a raster cell of a block in the first round.
 _CELL = 200
 #: Larger output files are assembled in parts of this many points, so that memory does not grow with
@@ -64,6 +69,7 @@ class TilingOptions:
     most_points: int = 5_000_000  #: most points of a tile that is read again with a wider halo
 
     def __post_init__(self) -> None:
+        """Check the options; OptionError where they are wrong or contradict each other."""
         # 20 and 20.0 are one run
         if self.tile is not None:
             side = checks.number("--tile", self.tile, 0, LARGEST_TILE, above=True)
@@ -93,12 +99,12 @@ class TilingOptions:
 
     @property
     def local_workers(self) -> int:
-        """Worker processes on this machine."""
+        """Return the number of worker processes on this machine."""
         return max(1, available_threads() // 2) if self.workers is None else self.workers
 
     @property
     def threads(self) -> int:
-        """Threads of each local worker: workers times threads never exceed the cores."""
+        """Return the threads of each local worker, together not more than there are cores."""
         return max(1, available_threads() // max(1, self.local_workers))
 
 
@@ -121,10 +127,9 @@ class Density:
     box: Box  #: of all inputs
 
     @classmethod
-    def of(cls, extents: Iterable[Extent]) -> Density:
-        """From the extents of inputs."""
-        boxes = [(*one.box, one.count) for one in extents if one.count]
-        around = union([box[:4] for box in boxes])
+    def measure(cls, extents: Iterable[Extent]) -> Density:
+        """Return the density of inputs with these extents."""
+        boxes = [(*extent.box, extent.count) for extent in extents if extent.count]
         x0, y0, x1, y1, count = np.array(boxes, np.float64).reshape(-1, 5).T
         with np.errstate(over="ignore"):  # of odd headers
             area = (x1 - x0) * (y1 - y0)
@@ -137,7 +142,7 @@ class Density:
             int(count.max(initial=0)),
             float(area.sum()),
             float(dense[0]) if len(dense) else 0.0,
-            around,
+            union([box[:4] for box in boxes]),
         )
 
     def grid_around(self) -> TileGrid | None:
@@ -154,33 +159,35 @@ class Density:
         return None
 
     def read_by(self, side: float, halo_units: float) -> int:
-        """Points of a tile of this side with its surroundings."""
+        """Return the points of a tile of this side with its halo."""
         return min(self.points, math.ceil(self.each * (side + 2 * halo_units) ** 2))
 
 
 def block_bytes(blocks: Blocks, area_m2: float) -> float:
-    """Memory of a block of the first round, with at most `area_m2` of points."""
+    """Return the bytes of a block of the first round, with at most `area_m2` of points."""
     return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / blocks.cell**2 * _CELL
 
 
 def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:
-    """Memory of a worker, from the points of a tile and of an output file; `block`: see
-    :func:`block_bytes`.
+    """Return the bytes of a worker that reads so many points of a tile and of an output file.
+
+    `block`: see :func:`block_bytes`.
     """
-    of_file = min(largest_file, MOST_AT_ONCE) * FILE_POINT
-    return BASE + max(points_read * TILE_POINT + STAGES, of_file, block)
+    assembled = min(largest_file, MOST_AT_ONCE) * FILE_POINT
+    return BASE + max(points_read * TILE_POINT + STAGES, assembled, block)
 
 
 def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool:
-    """Whether a cloud fits into memory in one piece, at `point` bytes for each point."""
+    """Return whether a cloud fits into memory in one piece, at `point` bytes for each point."""
     return BASE + STAGES + points * point <= (memory or free_memory() // 2)
 
 
-def settled(
+def choose_tiles(
     options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
 ) -> tuple[TilingOptions, TileGrid]:
-    """Choose tiles and the number of workers so that they fit into memory; OptionError where no
-    tile fits.
+    """Choose tiles and the number of workers that fit into memory.
+
+    OptionError where no tile fits.
     """
     whole = options.memory or free_memory() // 2
     local = 0 if options.scheduler else options.local_workers

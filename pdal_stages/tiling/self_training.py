@@ -1,4 +1,4 @@
-"""A model for a survey without labels, trained on the points that another model is sure of.
+"""Train a model for a survey without labels on the points that another model is sure of.
 
 Self-training: on a new survey, a model is nearly always right where it is sure. These points show
 what roofs, crowns and ground look like with this sensor and point density and in this region, and a
@@ -7,10 +7,9 @@ model trained on them alone is better there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -44,13 +43,12 @@ def adapt(
     sure: float = SURE,
     options: TilingOptions | None = None,
 ) -> list[str]:
-    """Write a model adapted to a survey; returns messages.
+    """Write a model adapted to a survey; return messages.
 
     Parameters
     ----------
     inputs : sequence of str
-        Files, folders, patterns, tile indexes of one survey; of their classes only noise and
-        overlap matter.
+        One survey: files, folders, patterns. Of their classes only noise and overlap matter.
     model : str
         The file to write.
     teacher : str
@@ -65,62 +63,63 @@ def adapt(
         Where the teacher is sure of fewer than two classes.
     """
     sure, options = checks.number("'--sure'", sure, 0.0, 1.0), options or TilingOptions()
-    known, files = load_model(teacher), input_files(inputs)
+    teacher_model, files = load_model(teacher), input_files(inputs)
     check_outputs([Output(model, "model", MODEL)], [*files, *inputs, find(teacher)])
-    chosen, told = spread(files)
+    chosen, messages = spread(files)
     with work_folder(model) as folder:
         request = ClassifyRequest(teacher, dimensions=("Reliability",))
-        classified = _classified(
-            ClassifyTask(tuple(chosen), f"{folder}/classified/", request, options)
-        )
-        found = sure_points(classified, sure, known.codes.tolist())
-        codes = [code for code, count in found.items() if count >= FEWEST]
+        task = ClassifyTask(tuple(chosen), f"{folder}/classified/", request, options)
+        classified = _classified(task)
+        counts = sure_points(classified, sure, teacher_model.codes.tolist())
+        codes = [code for code, count in counts.items() if count >= FEWEST]
         if len(codes) < 2:
-            counts = ", ".join(f"{count:,} of class {code}" for code, count in found.items())
             raise StageError(
-                f"'{teacher}' is sure of {FEWEST:,} points or more in fewer than two of its classes",
-                found=counts,
+                f"'{teacher}' is sure of {FEWEST:,} points in fewer than two of its classes",
+                found=_listed(counts, counts),
                 cure="Adapt to more of the survey, or use that model itself",
             )
-        given: dict[str, Any] = {
+        stage = {
             "classes": ",".join(map(str, codes)),
             "where": f"Reliability >= {sure:g}",
-            "voxel": known.voxel,
+            "voxel": teacher_model.voxel,
             "count": COUNT,
             "folds": 0,  # scoring against the teacher's own answers means nothing
         }
-        made = str(folder / "adapted.model")
-        TrainTask(classified, made, (), given, options).run()
-        new, of = (
-            load_model(made),
-            {"name": Path(teacher).stem, "sha256": digest_of(teacher), "sure": sure},
-        )
-        replace(new, info={**new.info, "teacher": of}).save(model)
-    missing = [f"{found[code]:,} points of class {code}" for code in found if code not in codes]
+        unnamed = str(folder / "adapted.model")
+        TrainTask(classified, unnamed, (), stage, options).run()
+        known = load_model(unnamed)
+        source = {"name": Path(teacher).stem, "sha256": digest_of(teacher), "sure": sure}
+        replace(known, info={**known.info, "teacher": source}).save(model)
+    missing = [code for code in counts if code not in codes]
     if missing:
-        told.append(
-            f"'{teacher}' is sure of too few points of a class ({', '.join(missing)}): the new "
-            "model leaves it out"
+        messages.append(
+            f"'{teacher}' is sure of too few points of a class ({_listed(counts, missing)}): the "
+            "new model leaves it out"
         )
-    return told
+    return messages
+
+
+def _listed(counts: Mapping[int, int], codes: Iterable[int]) -> str:
+    """Return the numbers of points of some classes as text."""
+    return ", ".join(f"{counts[code]:,} points of class {code}" for code in codes)
 
 
 def _classified(task: ClassifyTask) -> list[str]:
-    """The files that a task classifies."""
+    """Classify the files of a task; return the outputs."""
     if task.in_one_piece:
         return list(task.run_whole().outputs[0].outputs or ())
     run = task.run_tiles()
     if run.failures:
         raise StageError(
             f"{len(run.failures):,} parts of the survey cannot be classified",
-            found="; ".join(str(one) for one in run.failures[:3]),
+            found="; ".join(f"{what}: {why}" for what, why in run.failures[:3]),
             cure="Repair these files, or leave them out",
         )
-    return sorted(str(one) for one in Path(task.output).rglob("*.la[sz]"))
+    return sorted(str(path) for path in Path(task.output).rglob("*.la[sz]"))
 
 
 def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:
-    """Files at regular steps, so that they have about `most` points; and messages."""
+    """Return files at regular steps that have about `most` points together; and messages."""
     headers = [las.header_there(name) for name in files] if all(map(is_las, files)) else []
     points = sum(header.count for header in headers if header)
     step = min(max(1, round(points / most)), len(files))
@@ -133,7 +132,7 @@ def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]
 
 
 def sure_points(files: Sequence[str], sure: float, codes: Sequence[int]) -> dict[int, int]:
-    """Of each class, the points of classified files whose ``Reliability`` is at least `sure`."""
+    """Return the points of each class code in files whose ``Reliability`` is at least `sure`."""
     total = np.zeros(256, np.int64)
     for name in files:
         for points in read_chunks(name):

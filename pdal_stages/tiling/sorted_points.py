@@ -1,5 +1,4 @@
-"""Points of inputs: read once and sorted by location into an uncompressed copy, from which each
-tile cuts its points.
+"""Sort points of inputs by location into an uncompressed copy, and cut tiles from it.
 
 A LAZ file can only be read in chunks of 50,000 points, often along a flight line. Tiles read most
 points several times (for the first round, as halo of their neighbors), so they read the copy. It is
@@ -27,9 +26,7 @@ from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, IndexedSource, InputSource, digest_of, fetch_ept
 from .tile_grid import Box, TileGrid, check_number
 
-if (
-    TYPE_CHECKING
-):  # its import takes 0.15 CPU seconds, which a single file in one piece need not wait for
+if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, for which one piece need not wait
     import laspy
 
 #: Points of a block, as many as in a LAZ chunk.
@@ -45,9 +42,6 @@ _CELLS = 4
 _PLACE = 250.0
 
 
-# ---- LAS and LAZ files by laspy ------------------------------------------------------------------------------
-
-
 def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]) -> None:
     """Write points uncompressed, with the header and all records of the file that they are from."""
     import laspy
@@ -59,22 +53,23 @@ def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]
             writer.write_evlrs(header.evlrs)
 
 
-# ---- the copy, sorted by location -------------------------------------------------------------------------------
+# ---- the copy, sorted by location ----------------------------------------------------------------
 
 
 def _copy_type(header: laspy.LasHeader) -> np.dtype:
-    """The type of a point in the copy: its number in the file, and its record."""
+    """Return the type of a point in the copy: its number in the file, and its record."""
     return np.dtype([("number", "<i8"), ("record", header.point_format.dtype())])
 
 
 def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
-    """Read a file once, write its points into a sorted copy, and return their index
-    (:class:`CloudIndex`).
+    """Read a file once, write its points into a sorted copy, and return their index as a record.
+
+    :class:`CloudIndex` parses it.
     """
     header = laspy_header(path)
     dtype, cells = _copy_type(header), grid.scaled(1 / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    found = [np.empty((0, 4), np.int64)]
+    parts = [np.empty((0, 4), np.int64)]
     total = checksum = 0
     changed_ns, digest = os.stat(path).st_ctime_ns, digest_of(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
@@ -94,11 +89,11 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
             out.write(data)
             checksum = zlib.crc32(data, checksum)
             counts = np.diff([*starts, len(order)])
-            found.append(np.column_stack([column[starts], line[starts], total + starts, counts]))
+            parts.append(np.column_stack([column[starts], line[starts], total + starts, counts]))
             total += len(records)
         out.flush()
         os.fsync(out.fileno())  # before the record that calls the copy complete
-        held = np.concatenate(found)
+        held = np.concatenate(parts)
         tiles = _squares(held, _CELLS)  # which cells divide exactly: powers of two do in floats
         check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
     refuse_scattered(_squares(held, math.ceil(_PLACE / cells.size))[:, 2].tolist())
@@ -123,24 +118,22 @@ def is_intact(index: CloudIndex) -> bool:
 
 
 def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
-    """(m, 3) squares of `side` cells that hold points, in ascending order: column, row, number of
-    points.
-    """
-    squares, of = np.unique(cells[:, :2] // side, axis=0, return_inverse=True)
-    points = np.bincount(of.reshape(-1), cells[:, 3], len(squares))
+    """Return (m, 3) squares of `side` cells that hold points, ascending: column, row, points."""
+    squares, square_of_cell = np.unique(cells[:, :2] // side, axis=0, return_inverse=True)
+    points = np.bincount(square_of_cell.reshape(-1), cells[:, 3], len(squares))
     return np.column_stack([squares, points.astype(np.int64)])
 
 
 def coordinates(
     records: NDArray, header: laspy.LasHeader
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """X and y of records."""
+    """Return x and y (n,) of records (n,)."""
     x, y = (records[name] * header.scales[k] + header.offsets[k] for k, name in enumerate("XY"))
     return x, y
 
 
 def points_near(path: str, index: CloudIndex, box: Box) -> tuple[NDArray[np.int64], NDArray]:
-    """Numbers, ascending, and records of the points of a file that lie in a box, edges included."""
+    """Return numbers (n,), ascending, and records (n,) of the points in a box, with its edges."""
     header = laspy_header(path)
     (i0, j0), (i1, j1) = (
         index.grid.index(np.array(corner)).tolist() for corner in (box[:2], box[2:])
@@ -160,7 +153,7 @@ def points_near(path: str, index: CloudIndex, box: Box) -> tuple[NDArray[np.int6
     return np.ascontiguousarray(rows["number"]), np.ascontiguousarray(rows["record"])
 
 
-# ---- a tile and its surroundings -----------------------------------------------------------------------------
+# ---- a tile and its halo -------------------------------------------------------------------------
 
 
 @dataclass
@@ -176,12 +169,12 @@ class Piece:
 
     @cached_property
     def own_rows(self) -> NDArray[np.int64]:
-        """Rows of the tile's own points."""
+        """Return the rows of the tile's own points."""
         return np.flatnonzero(self.away < 0)
 
     @property
     def reader(self) -> dict[str, Any]:
-        """The reader of its input, without a file name."""
+        """Return the reader of its input, without a file name."""
         return {**self.source.reader, "type": "readers.las"}
 
 
@@ -192,11 +185,11 @@ def cut_all(
     halo_units: float,
     folder: str,
 ) -> list[Piece]:
-    """The points of a tile and its halo, from every input that has any there.
+    """Return the points of a tile and its halo, from every input that has any there.
 
     `halo_units` is in the unit of the coordinates.
     """
-    box, own = grid.box(tile, halo_units), grid.box(tile)
+    box, inner = grid.box(tile, halo_units), grid.box(tile)
     pieces = []
     for number, (source, index) in enumerate(sources):
         path = source.path
@@ -215,7 +208,8 @@ def cut_all(
         header = laspy_header(path)
         x, y = coordinates(records, header)
         places = np.column_stack([grid.index(x), grid.index(y)])
-        away = np.maximum(np.maximum(own[0] - x, x - own[2]), np.maximum(own[1] - y, y - own[3]))
+        away = np.maximum(inner[0] - x, x - inner[2])
+        away = np.maximum(away, np.maximum(inner[1] - y, y - inner[3]))
         away = np.where((places == tile).all(axis=1), -1.0, np.maximum(away, 0.0))
         target = os.path.join(folder, f"piece{number}.las")
         write_records(target, header, [records])

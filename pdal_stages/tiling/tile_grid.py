@@ -1,4 +1,4 @@
-"""The grid of tiles: anchored at zero, half-open, the same for every run; and boxes."""
+"""Cut the plane into tiles: anchored at zero, half-open, the same for every run; and boxes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Square tiles of one size; tile (i, j) holds ``i*size <= x - origin < (i+1)*size``, likewise
-    y.
+    """Square tiles of one size.
+
+    Tile (i, j) holds ``i*size <= x - origin < (i+1)*size``, and likewise y.
     """
 
     size: float  #: side of a tile, in the unit of the coordinates
@@ -30,7 +31,7 @@ class TileGrid:
     origin: float = 0.0
 
     def index(self, coordinate: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Column or row of every coordinate.
+        """Return the column or row of every coordinate, as int64 of the same shape.
 
         The edges decide, not the quotient: a point on an edge belongs to the tile it begins,
         whatever the division rounds to, so each point has exactly one tile.
@@ -48,7 +49,7 @@ class TileGrid:
         return where.astype(np.int64)
 
     def box(self, tile: tuple[int, int], halo_units: float = 0.0) -> Box:
-        """(min x, min y, max x, max y) of a tile, grown by as much on each side."""
+        """Return (min x, min y, max x, max y) of a tile, grown on each side by a halo."""
         x0, y0, x1, y1 = (n * self.size + self.origin for n in (*tile, tile[0] + 1, tile[1] + 1))
         return x0 - halo_units, y0 - halo_units, x1 + halo_units, y1 + halo_units
 
@@ -57,13 +58,11 @@ class TileGrid:
         return TileGrid(self.size * by, self.origin)
 
     def name(self, tile: tuple[int, int]) -> str:
-        """South-west corner, e.g. ``500000_5400500``."""
+        """Return the south-west corner as text, e.g. ``500000_5400500``."""
         return "_".join(f"{n * self.size + self.origin:.10g}" for n in tile)
 
     def covering(self, box: Box) -> list[tuple[int, int]]:
-        """Every tile that a box touches, row by row; StageError for more than
-        :data:`MOST_TILES`.
-        """
+        """Return the tiles that a box touches, row by row; StageError for too many."""
         x0, y0, x1, y1 = (int(self.index(np.array([v]))[0]) for v in box)
         check_number((x1 - x0 + 1) * (y1 - y0 + 1), f"bounds {box}, tiles of {self.size:g}")
         return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]
@@ -80,18 +79,18 @@ def check_number(tiles: int, found: str) -> None:
 
 
 def touching(boxes: list[Box] | NDArray[np.float64], box: Box) -> list[int]:
-    """Numbers of the boxes that share a point with a box, edges included."""
+    """Return the numbers of the boxes that share a point with a box, edges included."""
     b = np.asarray(boxes, np.float64).reshape(-1, 4)
     return np.flatnonzero(((b[:, :2] <= box[2:]) & (b[:, 2:] >= box[:2])).all(axis=1)).tolist()
 
 
 def inside(a: Box, b: Box) -> bool:
-    """Whether box a lies in box b."""
+    """Return whether box a lies in box b."""
     return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
 
 
 def union(boxes: list[Box] | NDArray[np.float64]) -> Box:
-    """The box around boxes."""
+    """Return the box around boxes."""
     if not len(boxes):
         return (math.inf, math.inf, -math.inf, -math.inf)
     low = np.asarray(boxes)[:, :2].min(axis=0)

@@ -257,11 +257,11 @@ class _Run:
         for source in survey.sources:
             if source.kind != "las" or source.path in survey.unreadable:
                 continue
-            name = fingerprint(source.path, survey.stamps[source.path], vars(survey.grid))
+            name = fingerprint(source.path, vars(survey.grid))
             copy = store.path(name, ".points")
             # Without a valid record it is read again.
             with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
-                index = CloudIndex.of(store.note(name), copy)
+                index = CloudIndex.parse(store.note(name), copy)
                 wanted = source.path in (needed or ())
                 known = source.path in survey.indexes or index.is_of(source.path)
                 if known and (not wanted or is_intact(index)):
@@ -281,7 +281,7 @@ class _Run:
             if job.reason:
                 survey.unreadable[path] = job.reason
                 continue
-            index = survey.indexes[path] = CloudIndex.of(job.record, job.mark)
+            index = survey.indexes[path] = CloudIndex.parse(job.record, job.mark)
             if index.count and (odd := las_check.beyond_box(path, index.box)):
                 survey.messages.append(odd)
         survey.place()

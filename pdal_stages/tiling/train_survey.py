@@ -1,6 +1,4 @@
-"""Training on a survey: in one piece where it fits into memory, otherwise in tiles, with the same
-model.
-"""
+"""Train on a survey: in one piece where it fits into memory, else in tiles, with equal results."""
 
 from __future__ import annotations
 
@@ -44,51 +42,51 @@ from .write_outputs import NewValues, PieceResults, of_own_points, read_with
 
 #: Memory of a point in training in one piece, with voxels and neighborhoods of samples.
 TRAIN_POINT = 400
-#: Arrays of points that a person checked, and of others that the base model is sure of: see
-#: :mod:`..stages.checked_points`.
-_WANTED, _SURE = "PdalStagesWanted", "PdalStagesSure"
+#: Array of points that a person checked: see :mod:`..stages.checked_points`.
+_WANTED = "PdalStagesWanted"
+#: Array of other points that the base model is sure of.
+_SURE = "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
 
 
-def _training_stage(given: Mapping[str, Any]) -> TrainModel:
-    """The stage that trains."""
-    return cast(TrainModel, stage_from(given))
+def _training_stage(options: Mapping[str, Any]) -> TrainModel:
+    """Make the stage that trains."""
+    return cast(TrainModel, stage_from(options))
 
 
 def surveys_of(files: Sequence[str], grouped: Sequence[str] = ()) -> dict[str, list[str]]:
-    """Name -> files of each survey; `grouped` are ``NAME=PATTERN``, and any other file is a survey
-    by itself.
+    """Return name -> files of each survey.
 
-    OptionError where a group is malformed or empty, or a file is in two.
+    `grouped` are ``NAME=PATTERN``; any other file is a survey by itself. OptionError where a group
+    is malformed or empty, or a file is in two.
     """
-    out: dict[str, list[str]] = {}
-    of: dict[str, str] = {}
-    for one in grouped:
-        name, mark, pattern = one.partition("=")
-        if not (mark and name.strip() and pattern.strip()):
+    surveys: dict[str, list[str]] = {}
+    survey_of: dict[str, str] = {}
+    for group in grouped:
+        name, _, pattern = group.partition("=")
+        if not (name.strip() and pattern.strip()):
             raise OptionError(
                 "surveys are written NAME=PATTERN",
-                found=one,
+                found=group,
                 cure="For example north='north/*.laz'",
             )
         parts = [part.strip() for part in pattern.split(",") if part.strip()]
-        mine = [f for f in files if any(_like(f, part) for part in parts)]
-        if not mine:
+        surveys[name] = [f for f in files if any(_like(f, part) for part in parts)]
+        if not surveys[name]:
             raise OptionError(
-                "a survey has no files", found=one, cure=f"There are {', '.join(files[:5])}"
+                "a survey has no files", found=group, cure=f"There are {', '.join(files[:5])}"
             )
-        for file in mine:
-            if of.setdefault(file, name) != name:
+        for file in surveys[name]:
+            if survey_of.setdefault(file, name) != name:
                 raise OptionError(
-                    "a file is in two surveys", found=f"{file}: {of[file]} and {name}"
+                    "a file is in two surveys", found=f"{file}: {survey_of[file]} and {name}"
                 )
-        out[name] = mine
     for file in files:
-        if file not in of:
+        if file not in survey_of:
             name = Path(file).stem
-            out.setdefault(name if name not in out else file, []).append(file)
-    return out
+            surveys.setdefault(name if name not in surveys else file, []).append(file)
+    return surveys
 
 
 def _like(file: str, pattern: str) -> bool:
@@ -103,9 +101,8 @@ class TrainTask:
     files: Sequence[str]  #: labeled inputs
     model: str  #: the file to write
     overrides: Sequence[Override] = ()
-    given: Mapping[str, Any] = field(
-        default_factory=dict
-    )  #: options of ``writers.classifiermodel``
+    #: of ``writers.classifiermodel``
+    stage_options: Mapping[str, Any] = field(default_factory=dict)
     options: TilingOptions = field(default_factory=TilingOptions)
     #: the files of each survey, whose points are not neighbors of each other's
     surveys: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -114,49 +111,46 @@ class TrainTask:
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
-        """The training stage as in a pipeline; several files are scored by file, unless specified
-        otherwise.
-        """
+        """Return the training stage as in a pipeline, which scores several files by file."""
         files = list(self.files)
         writer = {
             "type": TrainModel.type,
             "filename": self.model,
             "files": files,
-            **self.given,
+            **self.stage_options,
         }
         writer = overridden(writer, self.overrides)
-        told = {name: value for name in ("survey", "groups") if (value := writer.get(name))}
-        if told and (self.surveys or self.survey):
+        grouping = {name: value for name in ("survey", "groups") if (value := writer.get(name))}
+        if grouping and (self.surveys or self.survey):
             raise OptionError(
                 "surveys are given by files or by a dimension, not by both",
-                found=", ".join(f"{name}={value}" for name, value in told.items()),
+                found=", ".join(f"{name}={value}" for name, value in grouping.items()),
             )
         forest = writer.get("algorithm", TrainingOptions.algorithm) == "random_forest"
-        if len(files) > 1 and forest and not (told or self.surveys or self.survey):
+        if len(files) > 1 and forest and not (grouping or self.surveys or self.survey):
             writer["groups"] = FILE_NUMBER
         return writer
 
     def _each(self) -> list[TrainTask]:
-        """A task for each survey; this one where there are none."""
-        named = self.surveys.items()
-        return [replace(self, files=files, surveys={}, survey=name) for name, files in named] or [
-            self
-        ]
+        """Return a task for each survey; this one where there are none."""
+        return [
+            replace(self, files=files, surveys={}, survey=name)
+            for name, files in self.surveys.items()
+        ] or [self]
 
     def _points(self) -> int:
-        """The number of points of the files, from their headers."""
+        """Return the number of points of the files, from their headers."""
         return sum(read_extent(source).count for source in find_sources(readers_of(self.files)))
 
     @cached_property
     def stage(self) -> TrainModel:
-        """The stage that trains."""
+        """Return the stage that trains."""
         return _training_stage(self._writer)
 
     def in_one_piece(self) -> bool:
-        """Whether all points fit into the memory, those of each survey by themselves, or cannot be
-        cut into tiles.
+        """Return whether the points of each survey fit into memory, or cannot be cut into tiles.
 
-        Not where tiles are asked for.
+        False where the user wants tiles.
         """
         can_be_cut = all(is_las(name) or is_ept(name) for name in self.files)
         if not can_be_cut or self.stage.algorithm != "random_forest":
@@ -165,53 +159,51 @@ class TrainTask:
             return False
         try:
             return all(
-                fits_whole(one._points(), self.options.memory, TRAIN_POINT) for one in self._each()
+                fits_whole(task._points(), self.options.memory, TRAIN_POINT)
+                for task in self._each()
             )
         except StageError:
-            return True  # said when it is read
+            return True  # reading it reports the error
 
     def run(self) -> list[str]:
-        """Train and write the model; returns messages."""
+        """Train and write the model; return messages."""
         base = self.stage.training.base
-        made_by = (
-            preparation_of(self.stage.wished)
-            if base is None
-            else base.info.get("preparation") or []
-        )
-        heights = [overridden(one, self.overrides) for one in made_by]
+        if base is None:
+            preparation = preparation_of(self.stage.wished)
+        else:
+            preparation = base.info.get("preparation") or []
+        heights = [overridden(options, self.overrides) for options in preparation]
         stage = self.stage.after(heights)
-        told = [warning] if (warning := stage.check_upstream()) is not None else []
-        pdal_env.bindings()  # says what is wrong with PDAL before any work
+        warning = stage.check_upstream()
+        pdal_env.bindings()  # reports what is wrong with PDAL before any work
         check_outputs(stage.outputs(), [*self.files, *self.named, *stage_files(stage)])
         report = Report()
-        made = (self._whole if self.in_one_piece() else self._tiled)(heights, report)
-        stage.finish(made, report)
-        said = [*told, *report.messages]  # once what the preparation says as well
-        return [one for one in said if not any(one.endswith(f": {other}") for other in said)]
+        model = (self._whole if self.in_one_piece() else self._tiled)(heights, report)
+        stage.finish(model, report)
+        messages = [*filter(None, [warning]), *report.messages]
+        # A message that the preparation has as well comes once.
+        return [text for text in messages if not any(text.endswith(f": {m}") for m in messages)]
 
     def _read(self, heights: Sequence[Mapping[str, Any]], stage: TrainModel) -> Points:
-        """The points with heights, and with file numbers where these are the groups of the
-        score.
-        """
+        """Read the points with heights, and with file numbers where the score groups by file."""
         readers = [reader_of(file, f"input{i}") for i, file in enumerate(self.files, 1)]
-        told = check_readers(readers)
-        own = [one for one in self.overrides if one.selector != stage.type]
+        messages = check_readers(readers)
         numbers = count(1)
 
         def number(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-            """PDAL calls it for the points of one reader after the other."""
+            """Set the number of a file; PDAL calls it for one reader after the other."""
             outs[FILE_NUMBER] = np.full(len(ins["X"]), next(numbers), np.uint32)
 
         callbacks = Callbacks()
         grouped = stage.groups == FILE_NUMBER
         numbered = [callbacks.filter(number, {FILE_NUMBER: "uint32_t"})] if grouped else []
-        pipeline = Pipeline([*readers, *numbered, *map(dict, heights)], own)
+        pipeline = Pipeline([*readers, *numbered, *map(dict, heights)], self._other_overrides)
         pipeline.execute()
         if not any(map(len, pipeline.arrays)):
             raise StageError("there are no points to train on", where=", ".join(self.files[:3]))
         points = points_of_views(pipeline.arrays, pipeline.metadata, stage.points)
         points.report.warnings += [
-            *told,
+            *messages,
             *(f"PDAL says: {line}" for line in pipeline.log_lines[:10]),
         ]
         points.report.warnings += pipeline.messages
@@ -226,33 +218,39 @@ class TrainTask:
             nonlocal training
             for task in each:
                 points = task._read(heights, self.stage)
-                found = self.stage.training_on(points)
-                training = training or found
-                _check_same(found.dimensions, training.dimensions)
-                cloud = self.stage.cloud_of(points, found)
+                options = self.stage.training_on(points)
+                training = training or options
+                _check_same(options.dimensions, training.dimensions)
+                cloud = self.stage.cloud_of(points, options)
                 report.merge(points.report)
                 if task.survey:
                     yield replace(cloud, name=task.survey, survey=task.survey)
                 else:
-                    yield from (one for _, one in self.stage.surveys(cloud))
+                    yield from (part for _, part in self.stage.surveys(cloud))
 
-        made = clouds()
-        first = next(made)  # what is trained on follows from its dimensions
-        return train([first, *made] if len(each) == 1 else chain([first], made), training)
+        every = clouds()
+        first = next(every)  # what is trained on follows from its dimensions
+        return train([first, *every] if len(each) == 1 else chain([first], every), training)
 
-    # ---- in tiles ----------------------------------------------------------------------------------------
+    @property
+    def _other_overrides(self) -> list[Override]:
+        """Return the overrides of other stages than the one that trains."""
+        return [override for override in self.overrides if override.selector != TrainModel.type]
+
+    # ---- in tiles --------------------------------------------------------------------------------
 
     def _tiled(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
+        """Train on the points of one survey after the other, read in tiles."""
         clouds: list[TiledCloud] = []
         dimensions: list[str] | None = None
         with work_folder(self.model) as folder:
             for number, task in enumerate(self._each()):
-                made = folder / f"survey{number}"
-                made.mkdir()
-                found, parts, names = task._in_tiles(made, heights)
+                subfolder = folder / f"survey{number}"
+                subfolder.mkdir()
+                survey_report, parts, names = task._in_tiles(subfolder, heights)
                 _check_same(names, dimensions or names)
                 dimensions = names
-                report.merge(found)
+                report.merge(survey_report)
                 clouds += parts
             training = self.stage.training
             if self.stage.automatic:
@@ -263,12 +261,12 @@ class TrainTask:
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
     ) -> tuple[Report, list[TiledCloud], list[str]]:
-        """A report; the points with heights, as tiled clouds; and the dimensions to train on."""
+        """Return a report, the points with heights as tiled clouds, and dimensions to train on."""
         tiles = folder / "tiles"
         tiles.mkdir()
         tail = {"type": "writers.null", "filename": str(tiles / "#.npz")}
-        own = [one for one in self.overrides if one.selector != self.stage.type]
-        plan, _ = plan_of_files(self.files, [*map(dict, heights), tail], own)
+        stages = [*map(dict, heights), tail]
+        plan, _ = plan_of_files(self.files, stages, self._other_overrides)
         numbers: dict[str, int] = {}
         if self.stage.groups == FILE_NUMBER:
             for number, name in enumerate(self.files, 1):
@@ -314,17 +312,17 @@ class TrainTask:
         return report, [clouds[value] for value in sorted(clouds)], dimensions
 
 
-def _check_same(found: Sequence[str], before: Sequence[str]) -> None:
-    if list(found) != list(before):
+def _check_same(names: Sequence[str], before: Sequence[str]) -> None:
+    if list(names) != list(before):
         raise StageError(
             "the files do not have the same dimensions",
-            found=f"{', '.join(found)}; before: {', '.join(before)}",
+            found=f"{', '.join(names)}; before: {', '.join(before)}",
             cure="Name those that all have: --writers.classifiermodel.dimensions=HeightAboveGround",
         )
 
 
 def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCloud:
-    """The points of a tile, as :func:`take_points` wrote them."""
+    """Return the points of a tile, as :func:`take_points` wrote them."""
     arrays = load_arrays(path)
     wanted, sure = (arrays.pop(f"d/{mark}", np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
     if choice is not None:
@@ -339,21 +337,20 @@ def take_points(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Save a tile's own points for training, in place of a pipeline's writers
-    (:attr:`TilePlan.takes`).
+    """Save a tile's own points for training, in place of writers (:attr:`TilePlan.takes`).
 
     `writer` is the stage that trains; `numbers` are those of inputs by path, where points are to
-    have the number of theirs.
+    have the number of their input.
     """
     stage = _training_stage(writer)
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
     new = []
     for result in results:
-        found, number = of_own_points(result), numbers.get(result.piece.source.path)
+        values, number = of_own_points(result), numbers.get(result.piece.source.path)
         if number is not None:
             numbered = (None, np.full(len(result.piece.index), number, np.uint32))
-            found = NewValues(found.kept, {**found.values, FILE_NUMBER: numbered})
-        new.append(found)
+            values = NewValues(values.kept, {**values.values, FILE_NUMBER: numbered})
+        new.append(values)
     callbacks = Callbacks()
     flags = las_output.files_with_flags_to_split(readers)
     stages, _ = read_with(callbacks, readers, new, flags)

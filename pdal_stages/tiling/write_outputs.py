@@ -1,6 +1,4 @@
-"""Outputs: points are read again, get the results of tiles, and go through the pipeline's tail with
-its writers.
-"""
+"""Write outputs: read points again, set the results of tiles, run the tail with its writers."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ from .sorted_points import BLOCK, Piece, write_records
 _FLOATS = {"float64": "double", "float32": "float"}
 
 
-# ---- results of tiles ----------------------------------------------------------------------------------------
+# ---- results of tiles ----------------------------------------------------------------------------
 
 
 @dataclass
@@ -60,16 +58,14 @@ class NewValues:
 
 
 def of_own_points(result: PieceResults) -> NewValues:
-    """The results as new values for the piece's file, of which only the tile's own points
-    remain.
-    """
+    """Return results as new values for the file of a piece; only the tile's own points remain."""
     kept = np.zeros(len(result.piece.index), bool)
     kept[result.rows] = True
     return NewValues(kept, {name: (result.rows, values) for name, values in result.values.items()})
 
 
 def flags_in_classes(path: str) -> bool:
-    """Whether this PDAL reads the flags of a file (LAS 1.0 to 1.3) as bits of the class."""
+    """Return whether this PDAL reads the flags of a file (LAS 1.0-1.3) as bits of the class."""
     return not pdal_env.splits_class_flags() and las.holds_flags(path)
 
 
@@ -80,8 +76,7 @@ def changed_in(
     values: NDArray,
     holds_flags: NDArray[np.bool_] | bool,
 ) -> NDArray:
-    """Return a dimension (n,) with new values in some or all rows; flags that are bits of the class
-    are kept.
+    """Return a dimension (n,) with new values in some or all rows; keep flags in the class.
 
     `holds_flags` (n,) tells of which points the class holds flags.
     """
@@ -100,7 +95,7 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
     the tile, dropped ones included.
     """
     content: dict[str, NDArray] = {}
-    own: list[tuple[str, int]] = []
+    counts: list[tuple[str, int]] = []
     for result in results:
         piece = result.piece
         if not len(piece.own_rows):
@@ -111,15 +106,14 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
         for name, column in columns.items():
             records[name] = column
         content[piece.source.key] = records
-        own.append((piece.source.key, len(piece.own_rows)))
-    return {**content, "own": np.array(own, [("key", "<U12"), ("count", "<i8")])}
+        counts.append((piece.source.key, len(piece.own_rows)))
+    return {**content, "own": np.array(counts, [("key", "<U12"), ("count", "<i8")])}
 
 
 def read_results(
     tiles: Iterable[str], source: InputSource, count: int, start: int, end: int
 ) -> NewValues:
-    """The results of points `start` to `end` of a file with `count` points, from the files of its
-    tiles.
+    """Return the results of points `start` to `end` of a file, from the files of its tiles.
 
     StageError where these do not contain each of the file's points once.
     """
@@ -133,15 +127,15 @@ def read_results(
         points, index = arrays[source.key], arrays[source.key]["index"]
         seen += dict(arrays["own"].tolist())[source.key]
         first, last = np.searchsorted(index, (start, end))
-        mine = index[first:last] - start
-        if (index.size and index[-1] >= count) or kept[mine].any():
+        rows = index[first:last] - start
+        if (index.size and index[-1] >= count) or kept[rows].any():
             raise StageError(
                 "internal: two tiles hold the same point", where=source.path, found=name
             )
-        kept[mine] = True
+        kept[rows] = True
         for field in list(points.dtype.fields or ())[1:]:
             column = points[field][first:last].copy()
-            columns.setdefault(field.removeprefix("dim/"), []).append((mine, column))
+            columns.setdefault(field.removeprefix("dim/"), []).append((rows, column))
     if seen != count:
         raise StageError(
             "the tiles do not hold all points of the file: the file changed during the run",
@@ -161,7 +155,7 @@ def read_results(
     return NewValues(kept, values)
 
 
-# ---- the tail ------------------------------------------------------------------------------------------------
+# ---- the tail ------------------------------------------------------------------------------------
 
 
 def run_tail(
@@ -172,23 +166,20 @@ def run_tail(
     scratch: str,
     sources: Sequence[str],
 ) -> dict[str, Any]:
-    """Run readers, their new values, and the tail with its writers; returns a record of what was
-    written.
+    """Run readers, their new values, and the tail with its writers; return a record.
 
-    The readers read `sources`, or parts of them.
-
-    The `outputs` get their names once all are complete, and only while the run with the temporary
-    folder `scratch` exists.
+    The readers read `sources`, or parts of them. The `outputs` get their names once all are
+    complete, and only while the run with the temporary folder `scratch` exists.
     """
     writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
-    def finish(made: Path, final: Path, number: int) -> None:
+    def finish(partial: Path, final: Path, number: int) -> None:
         if not Path(scratch).is_dir():  # the run was killed, and another one may be writing here
             raise StageError("the run that this belonged to has ended", found=scratch)
         check_complete(
-            made, final, writers[number], None if "where" in writers[number] else run.count
+            partial, final, writers[number], None if "where" in writers[number] else run.count
         )
-        las_output.finish(made, sources, plane_unit(stages, run.metadata))
+        las_output.finish(partial, sources, plane_unit(stages, run.metadata))
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
     callbacks = Callbacks()
@@ -211,8 +202,7 @@ def run_tail(
 def read_with(
     callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: Sequence[bool]
 ) -> tuple[list[dict[str, Any]], str]:
-    """Return stages that read points, merge them in the order of the readers, and set new values;
-    and the last one's tag.
+    """Return stages that read and merge points and set new values, and the tag of the last one.
 
     One filter sets the values of all readers: the time PDAL needs grows with the third power of the
     number of filters that add dimensions. `flags`: of each reader, whether flags must be split from
@@ -258,9 +248,7 @@ def joined(new: Sequence[NewValues]) -> NewValues:
 def _put(
     callbacks: Callbacks, new: NewValues, inputs: list[str], holds_flags: NDArray[np.bool_]
 ) -> Iterator[dict[str, Any]]:
-    """Yield filters that set new values of points, and drop some; PDAL needs two filters for
-    this.
-    """
+    """Yield filters that set new values of points, and drop some: PDAL needs two filters."""
 
     def put(module, ins, outs) -> None:
         if len(ins["X"]) != len(new.kept):
@@ -281,9 +269,7 @@ def _put(
 def with_dimensions(
     tail: list[dict[str, Any]], extra_dims: Mapping[str, str] | None, paths: list[str]
 ) -> list[dict[str, Any]]:
-    """A tail whose LAS writers list the extra dimensions to write: the inputs' own, and
-    `extra_dims`.
-    """
+    """Return a tail whose LAS writers list extra dimensions: the inputs' and `extra_dims`."""
     listed = "" if extra_dims is None else las_output.extra_dims_option(paths, extra_dims)
     return [
         {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
@@ -291,7 +277,7 @@ def with_dimensions(
     ]
 
 
-# ---- an output for each input file -----------------------------------------------------------------------------
+# ---- an output for each input file ---------------------------------------------------------------
 
 
 def write_file(
@@ -302,8 +288,9 @@ def write_file(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Write the outputs of an input file of `count` points from the results of its tiles; the
-    record, with class counts.
+    """Write the outputs of a file of `count` points from the results of its tiles.
+
+    Return the record, with class counts.
     """
     tail = with_dimensions(plan.tail, plan.extra_dims, [source.path])
     writer, names = plan.writers[0], [Path(path).suffix.lower() for path in outputs]
@@ -332,9 +319,7 @@ def _in_parts(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Run the tail on each part into an uncompressed file, and join these under the first one's
-    header.
-    """
+    """Run the tail on each part of a file, and join the results under the first one's header."""
     import laspy
 
     classes: Counter[str] = Counter()
@@ -342,8 +327,8 @@ def _in_parts(
     count = 0
     tail = [{k: v for k, v in stage.items() if k != "compression"} for stage in tail]
 
-    def check(made: Path, final: Path, number: int) -> None:
-        check_complete(made, final, {"type": "writers.las", "filename": final}, count)
+    def check(partial: Path, final: Path, number: int) -> None:
+        check_complete(partial, final, {"type": "writers.las", "filename": final}, count)
 
     with whole_files(*outputs, check=check) as (partial,), contextlib.ExitStack() as stack:
         folder = stack.enter_context(TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True))
@@ -356,17 +341,20 @@ def _in_parts(
             reader = {**source.reader, "filename": piece}
             run_tail([reader], [new], tail, [part], scratch, [source.path])
             classes.update(_classes(new))
-            with laspy.open(part) as made:
+            with laspy.open(part) as points_of_part:
                 if out is None:
-                    how = {"header": made.header, "do_compress": partial.suffix.lower() == ".laz"}
+                    how = {
+                        "header": points_of_part.header,
+                        "do_compress": partial.suffix.lower() == ".laz",
+                    }
                     out = stack.enter_context(laspy.open(partial, mode="w", **how))
-                elif [*made.header.offsets] != [*out.header.offsets]:
+                elif [*points_of_part.header.offsets] != [*out.header.offsets]:
                     raise StageError(
                         "internal: parts of a file have different offsets", found=str(partial)
                     )
-                for chunk in made.chunk_iterator(BLOCK):
+                for chunk in points_of_part.chunk_iterator(BLOCK):
                     out.write_points(chunk)
-                count += int(made.header.point_count)
+                count += int(points_of_part.header.point_count)
         if out.header.evlrs:
             out.write_evlrs(out.header.evlrs)
     return {"outputs": written(outputs), "written": count, "classes": dict(classes)}
@@ -377,20 +365,17 @@ def _classes(new: NewValues) -> dict[str, int]:
     return class_counts(codes)
 
 
-# ---- an output for each tile ---------------------------------------------------------------------------------
-
-
 def write_tile(
     results: list[PieceResults], plan: TilePlan, outputs: list[str], scratch: str
 ) -> dict[str, Any]:
-    """Write one tile's own points, from the files that were cut for it; the record."""
-    mine = [result for result in results if result.piece.own_rows.size]
-    if not mine:
+    """Write the points of a tile, from the files that were cut for it; return the record."""
+    results = [result for result in results if result.piece.own_rows.size]
+    if not results:
         return {"outputs": []}
     if plan.takes is not None:
-        return plan.takes(mine, outputs, scratch)
-    sources = [result.piece.source.path for result in mine]
+        return plan.takes(results, outputs, scratch)
+    sources = [result.piece.source.path for result in results]
     tail = with_dimensions(plan.tail, plan.extra_dims, sources)
-    readers = [{**result.piece.reader, "filename": result.piece.path} for result in mine]
-    new = [of_own_points(result) for result in mine]
+    readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
+    new = [of_own_points(result) for result in results]
     return run_tail(readers, new, tail, outputs, scratch, sources)
