@@ -76,6 +76,10 @@ def model_of(net, codes=(2, 5, 6)):
             "samples": 27,
         },
         "accuracy": {"cross_validation": None},
+        "preparation": [],
+        "algorithms": {},
+        "voxel": 0.0,
+        "densities": {"low": 1.0, "high": 9.0},
         "passes": [{"importances": None}],
         "created_by": {"pdal_stages": "0.1.0"},
     }

@@ -185,7 +185,7 @@ def test_saved_and_loaded_gives_the_same_labels(tmp_path):
     assert np.array_equal(one.probabilities, other.probabilities)
     assert (
         "alsnet" in str(again)
-        and again.describe()["passes"][0]["parameters"]["configuration"]["name"] == "test"
+        and again.manifest()["passes"][0]["parameters"]["configuration"]["name"] == "test"
     )
 
 

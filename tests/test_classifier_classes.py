@@ -14,23 +14,12 @@ def test_default_takes_every_label_that_names_a_kind_of_object():
     assert classes.names[:3] == ("Ground", "High vegetation", "Building")
 
 
-@pytest.mark.parametrize(
-    "spec", [[2, 1, 6], "2,1,6", "[2, 1, 6]", ["2", "1", "6"], (1, 2, 6), "1-2,6"]
-)
+@pytest.mark.parametrize("spec", [[2, 1, 6], "2,1,6", ["2", "1", "6"], (1, 2, 6), "1-2,6"])
 def test_lists(spec):
     assert ClassMap.parse(spec).codes == (1, 2, 6)
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        "Vegetation",
-        "5 Vegetation",
-        "5: Vegetation",
-        {"code": 5, "name": "Vegetation"},
-        "5=Vegetation",
-    ],
-)
+@pytest.mark.parametrize("value", ["5 Vegetation", "5: Vegetation", "5=Vegetation"])
 def test_mapping_merges_renames_and_drops(value):
     classes = ClassMap.parse({"2": "Ground", "3-4,5": value, 6: 6, "9": "drop", "17": None})
     assert classes.codes == (2, 5, 6)
@@ -69,10 +58,10 @@ def test_a_single_label_with_a_name_of_its_own_keeps_its_code():
         ({"x": 5}, "not a list of labels"),
         ({"5-3": 5}, "range"),
         ({"2": 256}, "0 to 255"),
-        ({"2": {"nr": 3}}, "'code' and 'name'"),
+        ({"2": {"nr": 3}}, "whole number"),
         ([True, 2], "whole number"),
         ([2.5], "whole number"),
-        ("{", "JSON"),
+        ("{", "list of labels"),
         (7, "list or a mapping"),
     ],
 )
@@ -82,7 +71,7 @@ def test_mistakes(spec, text):
 
 
 def test_labels_above_a_byte_need_a_mapping():
-    with pytest.raises(OptionError, match="above 255"):
+    with pytest.raises(OptionError, match="0 to 255"):
         ClassMap.parse(None, [2, 1004])
 
 

@@ -170,7 +170,7 @@ def test_counts_scores_and_importances(trained):
     assert [entry["samples"] + entry["duplicates"] for entry in classes.values()] == [150] * 3
     found = trained.info["accuracy"]["cross_validation"]["chosen"]
     assert 0.8 < found["overall_accuracy"] <= 1 and set(found["f1"]) == {"2", "5", "6"}
-    for by in ("column", "feature", "group", "neighborhood", "dimension"):
+    for by in ("column", "feature", "group", "neighborhood"):
         assert sum(trained.importances(by).values()) == pytest.approx(1)
     assert set(trained.importances("neighborhood")) == {"c1", "s2", "kopt(5,20)", "(dimension)"}
     assert set(trained.importances("group")) == {"covariance", "geometric", "shapes", "dimension"}
@@ -180,10 +180,8 @@ def test_counts_scores_and_importances(trained):
     for word in (
         "Ground",
         "Building",
-        "c1, vertical cylinder of 1 m radius",
-        "s2, sphere of 2 m radius",
-        "kopt(5,20), the best of 5 to 20 nearest points",
-        "D2 (10 bins)",
+        "kopt(5,20)",
+        "D2",
         "HeightAboveGround",
         "a.laz",
         "held out",

@@ -72,8 +72,8 @@ def _plain(value):
 
 
 def test_a_binary_recipe_asks_for_its_class():
-    with pytest.raises(OptionError, match="needs the option 'target'"):
-        with_recipe({"recipe": "weinmann2018-binary"})
+    with pytest.raises(OptionError, match="needs 'target'"):
+        TrainingOptions.from_recipe("weinmann2018-binary")
     with pytest.raises(OptionError, match="'recipe' must be one of"):
         with_recipe({"recipe": "weinman2018"})
 

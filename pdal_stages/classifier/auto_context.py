@@ -78,8 +78,7 @@ class FoldForests:
 class WeightedPass(NamedTuple):
     """A pass, and the factors of its probabilities."""
 
-    #: a FeatureClassifier, or as the first a CloudClassifier
-    classifier: Any
+    classifier: Any  #: see ``PassClassifier``
     codes: Sequence[int]  #: its classes
     #: (classes,) what the probabilities are multiplied by before they are handed on
     factors: npt.NDArray[np.float64] | None = None

@@ -36,9 +36,6 @@ class ClassLimit(NamedTuple):
     accuracy: (
         float  #: share of these that are right; where none keeps it, the largest share there is
     )
-    #: where none keeps it: a lower accuracy, and the share of points that would keep the class with
-    #: it
-    instead: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,16 +62,15 @@ class ReliabilityLimits:
         ]
         for code, limit in self.classes.items():
             name = f"{code} {names.get(code, '')}".strip()
-            if limit.instead is None:
+            if limit.kept:
                 lines.append(
                     f"  {name}: {100 * limit.kept:.1f} % keep it, from reliability "
                     f"{limit.reliability:.2f} on"
                 )
             else:
-                accuracy, share = limit.instead
                 lines.append(
                     f"  {name}: no point keeps it, as at most {100 * limit.accuracy:.1f} % of the "
-                    f"most reliable were right; with {accuracy:g}, {100 * share:.1f} % would"
+                    "most reliable were right"
                 )
         return lines
 
@@ -119,9 +115,7 @@ class Calibration:
             kept, share_right = points[first] / points[0], right[first] / points[first]
             return ClassLimit(first / BINS, float(kept), float(share_right))
         most = float(np.max(right / np.maximum(points, 1e-12)))
-        instead = float(np.floor(100 * most) / 100)
-        share = self._limit(code, instead).kept if instead < accuracy else 0.0
-        return ClassLimit(UNREACHABLE, 0.0, most, (instead, share))
+        return ClassLimit(UNREACHABLE, 0.0, most)
 
     def points(self, codes: Iterable[int]) -> float:
         """Return the weight of the points that were given these classes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -18,20 +17,8 @@ from ..base.errors import OptionError, suggest
 #: The largest code a point can carry.
 MAX_CODE = 255
 
-# Words people use where ASPRS has another.
-_WORDS = {
-    **{name.lower(): code for code, name in NAMES.items()},
-    **{
-        "other": 1,
-        "low vegetation": 3,
-        "medium vegetation": 4,
-        "vegetation": 5,
-        "tree": 5,
-        "trees": 5,
-    },
-    **{"buildings": 6, "roof": 6, "facade": 6, "noise": 7, "road": 11, "wire": 14, "wires": 14},
-    **{"power line": 14, "pole": 15, "tower": 15, "bridge": 17},
-}
+#: ASPRS name, in small letters -> code.
+_CODES = {name.lower(): code for code, name in NAMES.items()}
 _CURE = (
     "Write classes as a list of codes, [2, 5, 6], or as labels and what they become: "
     '{"2": "Ground", "3,4,5": "5 Vegetation", "6": 6, "9": "drop"}'
@@ -57,28 +44,17 @@ class ClassMap:
         spec : None, str, list of codes or mapping
             None: every label as it is, except those `left_out`. A list: those labels as they
             are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
-            name (``"5 Trees"``), ``{"code": 5, "name": "Trees"}``, or ``"drop"``. Labels not
-            mentioned are dropped. Text is a comma-separated list, or JSON.
+            name (``"5 Trees"``), or ``"drop"``. Labels not mentioned are dropped. Text is a
+            comma-separated list.
         labels_found : iterable of int
             Labels in the training clouds, for None.
         left_out : collection of int
             Labels that are no classes of themselves.
         """
-        if isinstance(spec, str):
-            try:
-                spec = json.loads(spec) if spec.strip()[:1] in ("{", "[") else _labels(spec)
-            except ValueError as error:
-                raise OptionError(
-                    "'classes' is not valid JSON", found=str(error), cure=_CURE
-                ) from None
         if spec is None:
             spec = [label for label in sorted(set(map(int, labels_found))) if label not in left_out]
-            if any(label > MAX_CODE for label in spec):
-                raise OptionError(
-                    f"labels above {MAX_CODE} cannot be class codes",
-                    found=max(spec),
-                    cure=f"Map them. {_CURE}",
-                )
+        elif isinstance(spec, str):
+            spec = _labels(spec)
         if isinstance(spec, Mapping):
             pairs = [(_labels(key), value) for key, value in spec.items()]
         elif isinstance(spec, Iterable):
@@ -161,12 +137,6 @@ def _code(value: Any, what: str) -> int:
 
 def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | None:
     """Return the code and name that a mapping's value stands for; None for dropped."""
-    if isinstance(value, Mapping):
-        if "code" not in value or set(value) - {"code", "name"}:
-            raise OptionError(
-                "a class is written with 'code' and 'name'", found=dict(value), cure=_CURE
-            )
-        return _code(value["code"], "code"), str(value["name"]) if value.get("name") else None
     if value is not None and not isinstance(value, str):
         return _code(value, "code"), None
     word = " ".join((value or "drop").split())
@@ -174,12 +144,12 @@ def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | Non
         return None
     if match := re.fullmatch(r"(\d{1,5})\s*[:=]?\s*(.*)", word):
         return _code(match[1], "code"), match[2] or None
-    if word.lower() in _WORDS:
-        return _WORDS[word.lower()], word
+    if word.lower() in _CODES:
+        return _CODES[word.lower()], word
     if len(labels) == 1 and labels[0] <= MAX_CODE:
         return labels[0], word
     raise OptionError(
         f"'{word}' is not an ASPRS class, and several labels become it",
         found=f"labels {list(labels)}",
-        cure=suggest(word.lower(), _WORDS) + f"Say its code too: '5 {word}'",
+        cure=suggest(word.lower(), _CODES) + f"Say its code too: '5 {word}'",
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -65,7 +65,13 @@ class PredictRequest:
 
 
 class PassClassifier(Protocol):
-    """Classifier that is one pass of a model: each kind is one of the two below."""
+    """Classifier that is one pass of a model.
+
+    A kind that reads features and the context of the pass before has ``probabilities(values,
+    rows)``: (b, classes) from features and context (b, inputs) at `rows`. One that reads the points
+    themselves can only be the first pass, and has ``predict(request)``, which yields a
+    :class:`Block` after the other, with each row wanted once.
+    """
 
     #: arrays that the kind stores in a model file; a name that ends in ``*`` stands for many
     rules: ClassVar[Mapping[str, ArrayRule]]
@@ -103,22 +109,6 @@ class PassClassifier(Protocol):
 
     def columns(self, codes: Sequence[int]) -> list[Column]:
         """Return its inputs, in order."""
-
-
-class FeatureClassifier(PassClassifier, Protocol):
-    """Classifier of points by their features, and the context of the pass before."""
-
-    def probabilities(
-        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
-    ) -> npt.NDArray[np.float64]:
-        """Return probabilities (b, classes) from features and context (b, inputs) at `rows`."""
-
-
-class CloudClassifier(PassClassifier, Protocol):
-    """Classifier that reads points themselves; it can only be the first pass."""
-
-    def predict(self, request: PredictRequest) -> Iterator[Block]:
-        """Yield the probabilities of all rows wanted, block by block, each row once."""
 
 
 class Block(NamedTuple):

@@ -22,7 +22,7 @@ from ..features.voxels import Representatives, check_side, represent
 from . import model_description, model_file
 from .auto_context import WeightedPass, classify, plan_of
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
-from .interface import InputPlan, PredictRequest
+from .interface import Column, InputPlan, PredictRequest
 from .prediction import (
     PointRoles,
     Prediction,
@@ -38,6 +38,8 @@ from .registry import classifier_of, preprocessing
 
 #: How many times sparser or denser than those trained on a cloud may be without a warning.
 DENSITY_TOLERANCE = 2.0
+#: What importances are summed by.
+GROUPINGS = ("column", "feature", "group", "neighborhood")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,13 +98,13 @@ class Model:
 
     @property
     def preparation(self) -> list[dict[str, Any]]:
-        """Stages that computed the training's dimensions; empty where the model does not say."""
-        return self.info.get("preparation") or []
+        """Stages that computed the training's dimensions; empty where the file cannot carry them."""
+        return self.info["preparation"]
 
     @property
     def voxel(self) -> float:
         """Side in meters of the voxels that one point each stands for; 0 for none."""
-        return float(self.info.get("voxel") or 0.0)
+        return float(self.info["voxel"])
 
     @property
     def halo_m(self) -> float:
@@ -129,7 +131,7 @@ class Model:
     @property
     def outdated(self) -> list[str]:
         """Warnings about algorithms that have changed since the model was trained."""
-        stored, warnings = self.info.get("algorithms", {}), []
+        stored, warnings = self.info["algorithms"], []
         release = self.info["created_by"].get("pdal_stages", "unknown")
         for kind, version in self.algorithm_versions.items():
             if stored.get(kind) == version:
@@ -149,27 +151,27 @@ class Model:
         ----------
         by : str
             column, feature (over all neighborhoods, a histogram's bins together), group
-            (covariance, geometry, shape features and context), neighborhood, or dimension (of the
-            points, against all others).
+            (covariance, geometry, shape features and context), or neighborhood.
         number : int
             Which of the `passes`.
         """
         values = self.info["passes"][number]["importances"]
-        columns = self.passes[number].columns(self.codes_of[number])
-        return model_description.importances(values, columns, by)
+        if by not in GROUPINGS:
+            raise OptionError(
+                "importances are grouped by something unknown", found=by, cure=f"One of {GROUPINGS}"
+            )
+        if values is None:
+            raise ModelError("the model file holds no importances")
+        total: dict[str, float] = {}
+        for column, value in zip(self.columns[number], values, strict=True):
+            key = getattr(column, "name" if by == "column" else by)
+            total[key] = total.get(key, 0.0) + value
+        return dict(sorted(total.items(), key=lambda item: -item[1]))
 
-    def describe(self) -> dict[str, Any]:
-        """Return everything about the model as plain data; ``str(model)`` is the same as text."""
-        more = {
-            "required_dimensions": list(self.required_dimensions),
-            "optional_dimensions": list(self.optional_dimensions),
-            "halo_m": self.halo_m,
-            "outdated": self.outdated,
-        }
-        columns = [
-            each.columns(codes) for each, codes in zip(self.passes, self.codes_of, strict=True)
-        ]
-        return model_description.describe({**self.manifest(), **more}, columns)
+    @property
+    def columns(self) -> list[list[Column]]:
+        """The inputs of each pass, in order."""
+        return [each.columns(codes) for each, codes in zip(self.passes, self.codes_of, strict=True)]
 
     def __repr__(self) -> str:
         """Return the kind and the codes in a line."""
@@ -177,10 +179,10 @@ class Model:
 
     def __str__(self) -> str:
         """Return a page of text about the model."""
-        return model_description.text(self.describe())
+        return model_description.text(self)
 
     def manifest(self) -> dict[str, Any]:
-        """Return what the model file holds beside arrays."""
+        """Return what the model file holds beside arrays, as plain data."""
         entries = zip(self.passes, self.codes_of, self.info["passes"], strict=True)
         passes = [
             {"algorithm": each.name, **each.to_file(codes), **scores}
@@ -300,10 +302,10 @@ class Model:
         return represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
 
     @property
-    def _cell(self) -> float | None:
-        """Side in meters of the grid that features are computed by; None without features."""
+    def _cell(self) -> float:
+        """Side in meters of the cells that points are sorted by: those of the features."""
         features = (each.features for each in self.passes if each.features is not None)
-        return next((each.plan.cell for each in features), None)
+        return next((each.plan.cell for each in features), 1.0)
 
     def _request(
         self,
@@ -325,7 +327,7 @@ class Model:
             options.variance,
             options.device,
         )
-        if self.info.get("densities") is not None and request.count:
+        if request.count:
             request.report.figures["density"] = density(work.xyz)
         return request
 
@@ -348,20 +350,17 @@ class Model:
 
     def _check_density(self, request: PredictRequest) -> None:
         """Warn where the cloud is not as dense as those that the model was trained on."""
-        figures, trained = request.report.figures, self.info.get("densities")
-        if trained is None or "density" not in figures:
+        figures, trained = request.report.figures, self.info["densities"]
+        if "density" not in figures:
             return
         points_per_m2 = figures["density"]
         figures["density"] = round(points_per_m2, 3)
         low, high = trained["low"] / DENSITY_TOLERANCE, trained["high"] * DENSITY_TOLERANCE
         if low <= points_per_m2 <= high:
             return
-        few = max(figures.get("fewer_than_three", {}).values(), default=0)
-        lonely = f"; {100 * few / request.count:.3g} % have fewer than three neighbors"
         request.report.warnings.append(
             f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
-            f"{model_description.range_text(trained)}{lonely if few else ''}. Expect lower "
-            "accuracy, or train with 'thin'"
+            f"{model_description.range_text(trained)}. Expect lower accuracy, or train with 'thin'"
         )
 
 
@@ -416,7 +415,7 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
     codes = [code for code, _ in classes]
     if sorted(set(codes)) != codes:
         raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
-    check_side(manifest.get("voxel") or 0.0)
+    check_side(manifest["voxel"])
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(classes):
         raise ModelError(

@@ -175,18 +175,16 @@ class WorkingCloud:
     wanted: (
         npt.NDArray[np.int64] | None
     )  #: rows in work that stand for points to classify, ascending; None: all
-    grid: CellGrid | None  #: the index of `xyz`
-    rows_in_cloud: (
-        npt.NDArray[Any] | None
-    )  #: (k,) of the points themselves; None: each is its own row
-    _order: npt.NDArray[Any] | None  #: (k,) place of each among the representatives
+    grid: CellGrid  #: the index of `xyz`
+    rows_in_cloud: npt.NDArray[Any]  #: (k,) of the points themselves
+    _order: npt.NDArray[Any]  #: (k,) place of each among the representatives
     _representatives: Representatives | None
 
     @classmethod
     def sort(
         cls,
         xyz: npt.NDArray[np.float64],
-        cell: float | None,
+        cell: float,
         representatives: Representatives | None,
         wanted_rows: npt.NDArray[np.int64] | None,
     ) -> WorkingCloud:
@@ -196,26 +194,22 @@ class WorkingCloud:
         ----------
         xyz : (k, 3) float64
             Of the representatives, where there are any.
-        cell : float or None
-            Side of the grid's cells, meters; None leaves the points in their order.
+        cell : float
+            Side of the grid's cells, meters.
         representatives : Representatives or None
             Which points of the cloud stand for which; None: each for itself.
         wanted_rows : (m,) int64 or None
             Rows in the cloud of the points to classify. Representatives know those that stand for
             any of them.
         """
-        rows_in_cloud = None
-        wanted = wanted_rows
-        if representatives is not None:
-            wanted, rows_in_cloud = representatives.wanted, representatives.rows
-            representatives = replace(representatives, rows=rows_in_cloud[:0])
-        if cell is None or not len(xyz):
-            return cls(xyz, wanted, None, rows_in_cloud, None, representatives)
         grid = build_grid(xyz, cell)
         order = grid.order
+        wanted, rows_in_cloud = wanted_rows, order
+        if representatives is not None:
+            wanted, rows_in_cloud = representatives.wanted, representatives.rows[order]
+            representatives = replace(representatives, rows=order[:0])
         if wanted is not None:
             wanted = np.flatnonzero(np.isin(order, wanted))
-        rows_in_cloud = order if rows_in_cloud is None else rows_in_cloud[order]
         sorted_grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
         return cls(grid.coordinates, wanted, sorted_grid, rows_in_cloud, order, representatives)
 
@@ -228,8 +222,6 @@ class WorkingCloud:
         self, names: Iterable[str], dimensions: Mapping[str, npt.ArrayLike]
     ) -> dict[str, npt.ArrayLike]:
         """Return the values (k,) of those of the dimensions (n,) that are there."""
-        if self.rows_in_cloud is None:
-            return dict(dimensions)
         return {
             name: np.asarray(dimensions[name])[self.rows_in_cloud]
             for name in names
@@ -243,7 +235,7 @@ class WorkingCloud:
 
         And for each of them the row in the block that stands for it.
         """
-        rows = rows_in_work if self._order is None else self._order[rows_in_work]
+        rows = self._order[rows_in_work]
         if self._representatives is None:
             return rows, slice(None)
         return self._representatives.members(rows)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..base import checks
-from ..base.errors import OptionError
 
 #: Where a paper leaves an option open.
 NOT_STATED = "not stated"
@@ -26,7 +25,6 @@ class Recipe:
     source: str  #: the paper, as docs/papers.md cites it, or the kind of scan
     #: option of ``writers.classifiermodel`` -> (value, section of the paper)
     options: Mapping[str, tuple[Any, str]]
-    needs: tuple[str, ...] = ()  #: options that only the user can give
 
     def values(self) -> dict[str, Any]:
         """Return each option's value."""
@@ -75,7 +73,6 @@ RECIPES: dict[str, Recipe] = {
     "weinmann2018-binary": Recipe(
         "[W18]",
         {**_WEINMANN, "strategy": ("binary", "3.3, 4.3 one class against all others")},
-        needs=("target",),
     ),
     "he2017": Recipe(
         "[H17]",
@@ -156,13 +153,6 @@ def with_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
         return dict(options)
     checks.one_of("option 'recipe'", name, tuple(RECIPES))
     recipe = RECIPES[name]
-    for option in recipe.needs:
-        if options.get(option) is None:
-            raise OptionError(
-                f"the recipe '{name}' needs the option '{option}'",
-                cure=f"Give {option}, the code of the class to find; with the command train as "
-                f"--writers.classifiermodel.{option}=6",
-            )
     values = recipe.values() | dict(options)
     if isinstance(network := options.get("alsnet"), Mapping) and "alsnet" in recipe.options:
         values["alsnet"] = {**recipe.options["alsnet"][0], **network}

@@ -112,10 +112,8 @@ def describe_refinement(
     ]
     if base.factors is not None:
         scores[-1]["factors"] = base.factors.tolist()
-    densities, before = info["densities"], base.info.get("densities")
-    if densities and before:
-        low, high = min(densities["low"], before["low"]), max(densities["high"], before["high"])
-        densities = {**densities, "low": low, "high": high}
+    both = info["densities"], base.info["densities"]
+    low, high = min(each["low"] for each in both), max(each["high"] for each in both)
     return {
         **info,
         "strategy": "multiclass",
@@ -123,8 +121,8 @@ def describe_refinement(
         "background": None,
         "classes": classes,
         "priors": None,
-        "densities": densities,
+        "densities": {"low": low, "high": high},
         "preparation": base.preparation,
-        "algorithms": base.info.get("algorithms", {}),
+        "algorithms": base.info["algorithms"],
         "passes": [*scores, *info["passes"]],
     }

@@ -192,6 +192,6 @@ def _model(options: argparse.Namespace) -> None:
     with contextlib.suppress(OptionError):  # it was never scored
         model.info["sureness"] = read_calibration(model.info, find(options.file)).to_dict()
     if options.showjson:
-        print(json.dumps(model.describe(), indent=2, default=str))
+        print(json.dumps(model.manifest(), indent=2))
     else:
         print(model)

@@ -311,7 +311,7 @@ def model(data: bytes) -> str:
         put("fuzz.model", _model_file(data)), lambda name: classifier_of(name).rules
     )
     made = assemble(manifest, arrays)
-    assert str(made) and made.describe() and made.halo_m >= 0
+    assert str(made) and made.halo_m >= 0
     made.importances()
     codes = [code for code, _ in made.classes]
     for one in made.passes:
