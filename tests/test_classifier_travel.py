@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_classifier_training import SMALL, scene
 
-from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.sampling import draw_samples, share_out
 from pdal_stages.classifier.training_clouds import prepared
