@@ -27,7 +27,7 @@ from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.inputs_outputs import input_files
-from pdal_stages.pipeline.overrides import parse_overrides
+from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.reports.pictures import triptych, write_png
 from pdal_stages.tiling.train_survey import TrainTask
 

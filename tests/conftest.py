@@ -374,7 +374,7 @@ def ready_halves(ready_town, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def ready_models(ready_town, quick, tmp_path_factory) -> Path:
     """A folder with the models that ready pipelines apply, trained by those that train."""
-    from pdal_stages.pipeline.overrides import parse_overrides
+    from pdal_stages.pipeline.json_source import parse_overrides
     from pdal_stages.pipeline.run import Pipeline
 
     folder = tmp_path_factory.mktemp("models")

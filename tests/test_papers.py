@@ -60,7 +60,7 @@ def folder(town, tmp_path_factory):
 @pytest.mark.pdal
 def test_pts_through_pdal(folder, tmp_path, monkeypatch):
     """The commands of docs/papers.md for clouds that cannot be had, on a stand-in with the same format."""
-    from pdal_stages.pipeline.overrides import parse_overrides
+    from pdal_stages.pipeline.json_source import parse_overrides
     from pdal_stages.pipeline.run import Pipeline
 
     monkeypatch.chdir(tmp_path)

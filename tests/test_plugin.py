@@ -23,7 +23,7 @@ from processes import ended
 
 import pdal_stages as ps
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
+from pdal_stages.pipeline.json_source import apply_overrides, parse_overrides
 from pdal_stages.plugin import calls, declarations, install
 from pdal_stages.stages.registry import stage_type, stage_types
 
@@ -67,7 +67,7 @@ def pipeline(stock, tmp_path_factory):
 
     def run(stages, *words, **how):
         path = folder / f"{next(count)}.json"
-        path.write_text(json.dumps(pdal_env.adapted(pdal_env.typed(stages))))
+        path.write_text(json.dumps(pdal_env.for_this_version(pdal_env.with_types(stages))))
         return stock("pipeline", path, *words, **how)
 
     return run

@@ -13,7 +13,7 @@ import pytest
 from pdal_stages import run_tiled
 from pdal_stages.classifier.recipes import RECIPES
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.overrides import parse_overrides
+from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
 
 pytestmark = pytest.mark.pdal

@@ -27,7 +27,7 @@ from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.threads import available_threads
 from pdal_stages.pipeline import workers
-from pdal_stages.pipeline.workers import perform
+from pdal_stages.pipeline.workers import perform_task
 from pdal_stages.tiling import dask_workers as dask_cluster
 from pdal_stages.tiling import tiled_run
 from pdal_stages.tiling.checkpoint import Store
@@ -319,7 +319,7 @@ def test_a_straggler_of_an_ended_run_changes_nothing(tmp_path, folder, monkeypat
     stages = pipeline(folder, tmp_path / "o_#.laz")
     late = []
     monkeypatch.setattr(
-        workers, "perform", lambda task: late.append(pickle.dumps(task)) or perform(task)
+        workers, "perform_task", lambda task: late.append(pickle.dumps(task)) or perform_task(task)
     )
     assert not run_tiled(stages, 40, workers=0).failures
     late = [task for task in map(pickle.loads, late) if not isinstance(task, partial)]
@@ -327,7 +327,7 @@ def test_a_straggler_of_an_ended_run_changes_nothing(tmp_path, folder, monkeypat
     assert not run_tiled(stages, 40, workers=0).failures  # the run after
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
     for task in late:
-        assert perform(task).reason
+        assert perform_task(task).reason
     assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()} == before
 
 

@@ -41,7 +41,7 @@ def parse(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
         Where usage is wrong, or only help was requested.
     """
     # Imported here, so that a missing package is reported in one sentence.
-    from ..pipeline.overrides import parse_overrides
+    from ..pipeline.json_source import parse_overrides
 
     overrides, words = parse_overrides(arguments)
     parser = Parser(

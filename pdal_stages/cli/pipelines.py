@@ -109,8 +109,8 @@ def _pipeline(options: argparse.Namespace) -> int:
 
 def _run_tiles(options: argparse.Namespace) -> int:
     """Run a pipeline in tiles; return the exit code."""
+    from ..pipeline.inputs_outputs import writers_outputs
     from ..pipeline.run import Pipeline
-    from ..pipeline.stage_files import writers_outputs
     from ..tiling.plan import make_plan
     from ..tiling.tiled_run import run_tiled
 

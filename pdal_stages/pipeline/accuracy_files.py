@@ -18,8 +18,10 @@ from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from ..stages.registry import stage_from
 from .classify_request import ClassifyRequest
-from .inputs_outputs import in_folders, input_files, reader_of, stage_files
-from .overrides import Override, apply_overrides
+from .expansion import stage_files
+from .inputs_outputs import in_folders, input_files
+from .json_source import Override, apply_overrides
+from .pdal import reader_of
 from .run import Pipeline
 from .runtime import points_of_views
 

@@ -16,20 +16,17 @@ from ..classifier.model_file import STANDARD
 from ..stages import preprocessing
 from ..stages.points import SELECTED
 from ..stages.registry import stage_from, stage_types
-from .inputs_outputs import is_las, overridden, reader_of, writer_of
+from .inputs_outputs import is_las, writes_las
+from .json_source import Override, overridden
 from .las_output import extra_dims_option
-from .overrides import Override
+from .pdal import reader_of, writer_of
 from .run import Pipeline
-from .stage_files import LAS_WRITERS
 
 #: The stage whose ground bridge decks lead on to.
 _GROUND = preprocessing.GROUND_FILTER
-
 #: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
-
-#: How the names begin of dimensions that hold what the input has, while stages make others of the
-#: same names.
+#: Prefix of dimensions that hold what the input has, while stages create others of the same names.
 _KEPT = "PdalStagesKept"
 
 
@@ -39,7 +36,7 @@ def _ferry(pairs: list[str]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class ClassifyRequest:
-    """How points are to be classified, independent of the inputs."""
+    """Settings of a classification, independent of the inputs."""
 
     model: str = STANDARD  #: a model file, or the name of a shipped one
     overrides: tuple[Override, ...] = ()  #: options of stages, which may name another model
@@ -50,50 +47,48 @@ class ClassifyRequest:
     #: options of ``filters.modelclassifier``, such as ``keep_sure`` and ``vegetation_heights``
     classifier_options: Mapping[str, Any] = field(default_factory=dict)
     noise: bool = True  #: mark low and high noise first
-    bridges: bool = (
-        False  #: find bridge decks, where heights come from ``filters.hag_morphological``
-    )
+    bridges: bool = False  #: find bridge decks, where heights are those of `_GROUND`
     wires: bool = False  #: find wires, where heights are computed
     towers: bool = False  #: find wires, and their towers
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     given_ground: bool = False  #: points of class 2 are the ground, and stay so
 
-    @property
-    def _inside(self) -> dict[str, str]:
-        return {"where": self.where} if self.where else {}
-
     @cached_property
     def _classifier(self) -> dict[str, Any]:
+        """The classifier as an object of a pipeline, before overrides."""
         stage: dict[str, Any] = {
             "type": "filters.modelclassifier",
             "model": self.model,
             "compact": True,
-            **self._inside,
-            **({"mark": SELECTED} if self.where else {}),
+            **({"where": self.where, "mark": SELECTED} if self.where else {}),
             **self.classifier_options,
         }
-        for option, name in (("margin", "Margin"), ("probabilities", "Probability_")):
-            if any(one.startswith(name) for one in self.dimensions):
+        for option, prefix in (("margin", "Margin"), ("probabilities", "Probability_")):
+            if any(name.startswith(prefix) for name in self.dimensions):
                 stage[option] = True
         return stage
 
+    @cached_property
+    def _settled(self) -> dict[str, Any]:
+        """The classifier with overrides."""
+        return overridden(self._classifier, self.overrides)
+
     @property
     def cost(self) -> list[str]:
-        """The expected cost of `keep_sure`, as lines of text; none without it."""
-        given = overridden(self._classifier, self.overrides)
-        if given.get("keep_sure") is None:
+        """The expected cost of `keep_sure`, as lines of text; empty without it."""
+        if self._settled.get("keep_sure") is None:
             return []
-        stage: Any = stage_from(given)
+        stage: Any = stage_from(self._settled)
         return stage.limits.describe_cost(dict(stage.model.classes))
 
     @cached_property
     def loaded(self) -> Any:
         """The model that will be applied, after overrides."""
-        return loaded_model(overridden(self._classifier, self.overrides)["model"])
+        return loaded_model(self._settled["model"])
 
     @cached_property
     def stages(self) -> list[dict[str, Any]]:
-        """The stages: noise, preparation of what the model reads, the classifier, corrections."""
+        """The stages: noise, preprocessing of what the model reads, the classifier, corrections."""
         if by_hand := self.loaded.info.get("by_hand"):
             raise ModelError(
                 "the model reads dimensions of stages that a model file does not hold",
@@ -102,99 +97,91 @@ class ClassifyRequest:
                 cure="Write a pipeline: the reader, these stages with the options of the training, "
                 "filters.modelclassifier, and the writer",
             )
-        prepared = self._prepared
-        if self.bridges:
-            prepared = [
-                {**stage, "ground": True} if stage["type"] == _GROUND else stage
-                for stage in prepared
-            ]
-        noise, classifier = {"type": "filters.detachednoise", **self._inside}, self._classifier
-        if self._ground_is_given:
-            ground = f"Classification != {GROUND}"
-            noise["where"] = f"({self.where}) && {ground}" if self.where else ground
-            classifier = {**classifier, "given_ground": True}
-        return [*([noise] if self.noise else []), *prepared, classifier, *self._corrections]
+        prepared, keep_ground = self._prepared()
+        noise: dict[str, Any] = {"type": "filters.detachednoise"}
+        wheres = [f"({self.where})"] * bool(self.where)
+        wheres += [f"Classification != {GROUND}"] * keep_ground
+        if wheres:
+            noise["where"] = " && ".join(wheres)
+        classifier = {**self._classifier, **({"given_ground": True} if keep_ground else {})}
+        first = [noise] if self.noise else []
+        return [*first, *prepared, classifier, *self._corrections(keep_ground)]
 
-    @property
-    def _prepared(self) -> list[dict[str, Any]]:
-        """The stages before the classifier, as the model says or its dimensions need."""
+    def _prepared(self) -> tuple[list[dict[str, Any]], bool]:
+        """Return the stages before the classifier, and whether they take ground that is given.
+
+        The model holds them, or they follow from its dimensions.
+        """
         needed = self.loaded.required_dimensions
         stages = self.loaded.info.get("preparation") or preprocessing.preparation_of(needed)
-        if not self.given_ground:
-            return stages
-        if not any(stage["type"] == _GROUND for stage in stages):
-            raise OptionError(
-                f"--ground given needs a model whose heights come from {_GROUND}",
-                found=f"{self.model}: "
-                f"{', '.join(stage['type'] for stage in stages) or 'no heights'}",
-                cure="Leave it out, or take another model",
-            )
-        return preprocessing.with_given_ground(stages)
+        if self.given_ground:
+            if not any(stage["type"] == _GROUND for stage in stages):
+                types = ", ".join(stage["type"] for stage in stages) or "no heights"
+                raise OptionError(
+                    f"--ground given needs a model whose heights come from {_GROUND}",
+                    found=f"{self.model}: {types}",
+                    cure="Leave it out, or take another model",
+                )
+            stages = preprocessing.with_given_ground(stages)
+        if self.bridges:
+            stages = [{**s, "ground": True} if s["type"] == _GROUND else s for s in stages]
+        return stages, any(stage.get("given_ground") for stage in stages)
 
-    @property
-    def _ground_is_given(self) -> bool:
-        return any(stage.get("given_ground") for stage in self._prepared)
-
-    @property
-    def _corrections(self) -> list[dict[str, Any]]:
-        """Return the corrections after the classifier, for models with the classes they need, and
-        polygons last.
+    def _corrections(self, keep_ground: bool) -> list[dict[str, Any]]:
+        """Return the stages after the classifier that were requested, polygons last.
 
         They take the points that the classifier marked: `where` would see its new classes by then.
         """
-        settled = overridden(self._classifier, self.overrides)
-        taken: dict[str, Any] = {
+        settled = self._settled
+        shared: dict[str, Any] = {
             name: settled[name] for name in ("ignore", "keep") if name in settled
         }
-        wanted = {
-            "filters.bridges": self.bridges,
-            "filters.wires": self.wires,
-            "filters.polygons": bool(self.polygons),
-        }
-        inside = {"where": f"{SELECTED} == 1"} if self.where else {}
-        stages = [{"type": kind, **taken, **inside} for kind, chosen in wanted.items() if chosen]
-        for stage in stages:
-            if stage["type"] == "filters.wires" and self.towers:
-                stage["towers"] = True
-            if self._ground_is_given and stage["type"] != "filters.polygons":
-                kept = stage.get("keep", OVERLAP)
-                stage["keep"] = [*(kept if isinstance(kept, list) else [kept]), GROUND]
+        kept = shared.get("keep", OVERLAP)
+        finders = {**shared}
+        if keep_ground:
+            finders["keep"] = [*(kept if isinstance(kept, list) else [kept]), GROUND]
+        stages: list[dict[str, Any]] = []
+        if self.bridges:
+            stages.append({"type": "filters.bridges", **finders})
+        if self.wires:
+            towers = {"towers": True} if self.towers else {}
+            stages.append({"type": "filters.wires", **finders, **towers})
         if self.polygons:
-            stages[-1]["polygons"] = list(self.polygons)
-        return stages
+            polygons = {"type": "filters.polygons", "polygons": list(self.polygons)}
+            stages.append({**polygons, **shared})
+        inside = {"where": f"{SELECTED} == 1"} if self.where else {}
+        return [{**stage, **inside} for stage in stages]
 
     @cached_property
     def _creates(self) -> dict[str, str]:
-        """The dimensions that the stages make, except classes: name -> PDAL type."""
-        made: dict[str, str] = {}
+        """The dimensions that the stages create, except classes: name -> PDAL type."""
+        created: dict[str, str] = {}
         for stage in self.stages:
             if stage["type"] in preprocessing.OF_PDAL:
-                made["HeightAboveGround"] = "double"
+                created["HeightAboveGround"] = "double"
             elif stage["type"] in stage_types():
-                made |= stage_from(overridden(stage, self.overrides)).creates()
+                created |= stage_from(overridden(stage, self.overrides)).creates()
         for name in ("Classification", SELECTED):
-            made.pop(name, None)
-        return made
+            created.pop(name, None)
+        return created
 
     @cached_property
     def extra_dims(self) -> dict[str, str]:
         """The dimensions that are written besides the input's own: name -> PDAL type."""
-        made = self._creates
+        created = self._creates
         for name in self.dimensions:
-            if name not in ("all", "none", *made) and self.dimensions != WRITTEN:
+            if name not in ("all", "none", *created) and self.dimensions != WRITTEN:
                 raise OptionError(
                     "--dimensions names a dimension no stage creates",
                     found=name,
-                    cure=f"{suggest(name, list(made))}There are {', '.join(made)}; or all, or none",
+                    cure=f"{suggest(name, list(created))}There are {', '.join(created)}; or all, "
+                    "or none",
                 )
-        if "all" in self.dimensions:
-            return made
-        return {name: kind for name, kind in made.items() if name in self.dimensions}
+        every = "all" in self.dimensions
+        return {name: kind for name, kind in created.items() if every or name in self.dimensions}
 
     def pipeline(self, source: str, target: str) -> Pipeline:
-        """Read a file, compute heights where the model needs them, classify, and write with
-        everything else kept.
-        """
+        """Return the pipeline that classifies one file; everything else in it is kept."""
         if Path(target).suffix.lower() in (".tif", ".tiff", ".gpkg", ".shp", ".geojson"):
             raise OptionError(
                 "classify writes points",
@@ -203,7 +190,8 @@ class ClassifyRequest:
                 "rasters: docs/large-areas.md",
             )
         writer = writer_of(target)
-        if writer.get("type") in LAS_WRITERS:
+        to_las = "type" in writer and writes_las(writer)  # other formats get all dimensions
+        if to_las:
             listed = extra_dims_option([source], self.extra_dims)
             writer |= {"extra_dims": listed} if listed else {}
         elif self.dimensions != WRITTEN and "all" not in self.dimensions:
@@ -212,11 +200,10 @@ class ClassifyRequest:
                 found=target,
                 cure="Leave it out, or write a pipeline",
             )
-        # What stages make on the way must not replace what the input has under the same name.
-        to_las = writer.get("type") in LAS_WRITERS  # others get all dimensions
-        own = extra_dimensions(source) if to_las and is_las(source) else {}
-        kept = [name for name in own if name in self._creates and name not in self.extra_dims]
+        # What stages create on the way must not replace what the input has under the same name.
+        existing = extra_dimensions(source) if to_las and is_las(source) else {}
+        kept = [name for name in existing if name in self._creates and name not in self.extra_dims]
         keep = _ferry([f"{name}=>{_KEPT}{name}" for name in kept])
-        put_back = _ferry([f"{_KEPT}{name}=>{name}" for name in kept])
-        stages = [reader_of(source, "input"), *keep, *self.stages, *put_back, writer]
+        restore = _ferry([f"{_KEPT}{name}=>{name}" for name in kept])
+        stages = [reader_of(source, "input"), *keep, *self.stages, *restore, writer]
         return Pipeline(stages, self.overrides)

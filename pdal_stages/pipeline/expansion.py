@@ -1,5 +1,4 @@
-"""From our pipeline JSON to plain PDAL JSON: each stage of ours becomes a ``filters.python`` in
-place.
+"""Expand our pipeline JSON to plain PDAL JSON: stages of ours become ``filters.python`` in place.
 
 The pipeline is never split, so the LAS header, metadata, spatial reference, tags and
 inputs work as in PDAL.
@@ -18,15 +17,16 @@ from typing import Any
 from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.las import read_header
 from ..base.las_repair import extra_dimensions
+from ..classifier.model_file import find
 from ..stages import preprocessing
 from ..stages.base import Stage
 from ..stages.points import MAKERS
 from ..stages.registry import PDAL_OWN, stage_from, stage_type, stage_types
 from . import pdal as pdal_env
+from .inputs_outputs import is_reader, readers_files
 from .json_source import PipelineSource
 from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
-from .runtime import TRAMPOLINE, ExpandedStage, made, python_filter
-from .stage_files import is_reader, reader_files
+from .runtime import BY_LABEL, TRAMPOLINE, ExpandedStage, python_filter
 
 #: Stages after which several views are what the user asked for.
 SPLITS = {
@@ -45,8 +45,9 @@ class Expanded:
 
 
 def expand(source: PipelineSource, whole: bool = True) -> Expanded:
-    """Expand a pipeline. Not `whole`: it will be run in tiles, which separate flags from classes
-    themselves.
+    """Expand a pipeline.
+
+    Not `whole`: it will be run in tiles, which separate flags from classes themselves.
     """
     stages = copy.deepcopy(source.stages)
     places = [source.where(number) for number in range(len(stages))]
@@ -54,14 +55,13 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
     check_copc_outputs(stages)
     out = Expanded([], warnings=unread_extra_dimensions(stages))
     flags = _flags_to_split(stages) if whole else []
-    last_reader = max((n for n, stage in enumerate(stages) if is_reader(stage)), default=None)
-    readers = [str(stage.get("filename", "")) for stage in stages if is_reader(stage)]
-    several = len(readers) > 1 or any(c in name for name in readers for c in "*?[")
+    readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
+    names = [str(stages[number].get("filename", "")) for number in readers]
+    several = len(readers) > 1 or any(c in name for name in names for c in "*?[")
     for index, stage in enumerate(stages):
-        type_name = stage["type"]
-        if type_name not in stage_types():
-            out.stages += _each_file(stage) if flags and is_reader(stage) else [stage]
-            if flags and index == last_reader:
+        if stage["type"] not in stage_types():
+            out.stages += _reader_per_file(stage) if flags and is_reader(stage) else [stage]
+            if flags and index == readers[-1]:
                 out.stages.append(flag_splitter(flags))
             continue
         try:
@@ -71,36 +71,33 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
                     merge |= {"inputs": stage["inputs"], "tag": f"pdal_stages_merge_{index}"}
                     stage["inputs"] = [merge["tag"]]
                 out.stages.append(merge)
-            taken = stage_type(type_name).from_pipeline(stage, stages[:index])
-            expanded = expand_stage({**taken, **stage}, index, len(out.stages))
+            derived = stage_type(stage["type"]).from_pipeline(stage, stages[:index])
+            expanded = expand_stage({**derived, **stage}, index, len(out.stages))
         except StageError as error:
             raise error.prefixed(places[index]) from None
         out.ours.append(expanded)
         out.stages.append(expanded.plain)
-    _follow_preparations(out)
+    _place_upstream(out)
     check_writers(out.stages, out.ours)
     return out
 
 
-def _each_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
-    """A reader for each file of a pattern, sorted by name: PDAL reads them in the order of the
-    folder's listing.
-    """
-    names = reader_files(reader)
-    named = {name: value for name, value in reader.items() if name != "tag"}
-    return [{**named, "filename": name} for name in names] if len(names) > 1 else [reader]
+def _reader_per_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a reader for each file of a pattern, by name: PDAL reads in the folder's order."""
+    names = readers_files([reader])
+    untagged = {name: value for name, value in reader.items() if name != "tag"}
+    return [{**untagged, "filename": name} for name in names] if len(names) > 1 else [reader]
 
 
 def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
-    flags = files_with_flags_to_split(
-        stages, any(stage["type"] in stage_types() for stage in stages)
-    )
+    """Return for each input file whether flags must be split from the class; empty for none."""
+    with_ours = any(stage["type"] in stage_types() for stage in stages)
+    flags = files_with_flags_to_split(stages, with_ours)
     readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
     if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
         raise PipelineError(
             "this PDAL carries the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into "
-            "other files only where all "
-            "readers come first and no stage has 'inputs'",
+            "other files only where all readers come first and no stage has 'inputs'",
             found=f"PDAL {pdal_env.dotted_version()}",
             cure="Leave 'inputs' out, write one file at a time, or use PDAL 2.6",
         )
@@ -110,32 +107,11 @@ def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
 # ---- how PDAL wires stages -----------------------------------------------------------------------
 
 
-def _wiring(stages: Sequence[dict[str, Any]]) -> list[list[int]] | None:
-    """The numbers of the stages from which each takes points; None where a tag is unknown, which
-    PDAL refuses.
-    """
-    tagged: dict[str, int] = {}
-    waiting: list[int] = []
-    inputs: list[list[int]] = []
-    for number, stage in enumerate(stages):
-        named = stage.get("inputs") or []
-        chosen = [str(tag) for tag in ([named] if isinstance(named, str) else named)]
-        if any(tag not in tagged for tag in chosen):
-            return None
-        reads = is_reader(stage)
-        inputs.append([] if reads else [tagged[tag] for tag in chosen] or waiting)
-        waiting = [*(waiting if reads else []), number]
-        if "tag" in stage:
-            tagged[str(stage["tag"])] = number
-    return inputs
-
-
 def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) -> bool:
-    """Whether points may reach a stage in several views, of several readers, and nobody wants them
-    apart.
+    """Return whether points may reach a stage in several views, and nobody wants them apart.
 
-    A stage that makes one thing of all points never wants them apart; filters.crop splits, too,
-    where it has several areas.
+    `several`: there are several input files. A stage that makes one thing of all points never wants
+    them apart; filters.crop splits, too, where it has several areas.
     """
     kinds = [stage["type"] for stage in stages[:number]]
     split = not SPLITS.isdisjoint(kinds)
@@ -146,51 +122,60 @@ def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) 
 
 
 def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str]) -> None:
-    """PDAL runs only what leads to the first end of a pipeline, and says nothing of the others."""
-    taken = set(itertools.chain(*(_wiring(stages) or [list(range(len(stages)))])))
-    ends = [number for number in range(len(stages)) if number not in taken]
+    """Refuse several ends: PDAL runs only what leads to the first, and says nothing of others."""
+    tagged: dict[str, int] = {}
+    waiting: list[int] = []  # stages that the next one takes points from
+    used: set[int] = set()
+    for number, stage in enumerate(stages):
+        named = stage.get("inputs") or []
+        tags = [str(tag) for tag in ([named] if isinstance(named, str) else named)]
+        if any(tag not in tagged for tag in tags):  # which PDAL refuses
+            return
+        reads = is_reader(stage)
+        used.update([] if reads else [tagged[tag] for tag in tags] or waiting)
+        waiting = [*(waiting if reads else []), number]
+        if "tag" in stage:
+            tagged[str(stage["tag"])] = number
+    ends = [number for number in range(len(stages)) if number not in used]
     if len(ends) > 1:
-        named = [
-            " ".join(str(stages[n][key]) for key in ("type", "filename") if key in stages[n])
+        named_ends = (
+            f"{stages[n]['type']} {stages[n].get('filename', '')}".strip() + f" ({where[n]})"
             for n in ends
-        ]
+        )
         raise PipelineError(
             "the pipeline has several ends, and PDAL runs only what leads to the first of them",
-            found=", ".join(
-                f"{name} ({where[n]})" for n, name in list(zip(ends, named, strict=True))[:5]
-            ),
+            found=", ".join(itertools.islice(named_ends, 5)),
             cure="Write one file after the other (a writer passes its points on, so leave its "
-            "'inputs' out), or add a last "
-            'stage that takes all ends as inputs, e.g. {"type": "filters.merge", "inputs": [...]}',
+            "'inputs' out), or add a last stage that takes all ends as inputs, e.g. "
+            '{"type": "filters.merge", "inputs": [...]}',
         )
 
 
-# ---- the dimensions that stages read, and whether they will exist ----------------------------------------------
+# ---- the dimensions that stages read, and whether they will exist --------------------------------
 
 
 def settle_upstream(
     stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]
 ) -> tuple[Stage, bool]:
-    """Return a stage placed after those that created what it reads, and whether any created what it
-    creates.
+    """Return a stage placed after those that created what it reads.
 
-    `before` are the earlier stages in order, as written, each with the dimensions it creates:
+    The second value tells whether any of them created what it creates, too. `before` are the
+    earlier stages in order, as written, each with the dimensions it creates:
     :meth:`Stage.creates`, or :func:`heights_of` for PDAL's own.
     """
-    wanted = set(stage.reads()) - {
-        "Classification"
-    }  # which noise is marked in, too: it is no preparation
-    makers = [preprocessing.entry(given) for given, creates in before if wanted & set(creates)]
+    # Noise is marked in `Classification`, too: it is no preprocessing.
+    wanted = set(stage.reads()) - {"Classification"}
+    makers = [preprocessing.entry(plain) for plain, creates in before if wanted & set(creates)]
     created_before = any(set(creates) & set(stage.creates()) for _, creates in before)
     return stage.after(makers), created_before
 
 
 def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
-    """The dimensions of a PDAL stage that ours may read."""
+    """Return the dimensions of a PDAL stage that ours may read."""
     return {"HeightAboveGround": "double"} if stage.get("type") in preprocessing.OF_PDAL else {}
 
 
-def _follow_preparations(expanded: Expanded) -> None:
+def _place_upstream(expanded: Expanded) -> None:
     """Place each of our stages after the earlier ones that created what it reads."""
     numbered = {ours.index: ours for ours in expanded.ours}
     before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
@@ -206,13 +191,13 @@ def _follow_preparations(expanded: Expanded) -> None:
             plain["pdalargs"]["preparation"] = list(ours.stage.upstream)
         if (warning := ours.stage.check_upstream()) is not None:
             expanded.warnings.append(warning)
-        before.append((ours.given, ours.stage.creates()))
+        before.append((ours.as_written, ours.stage.creates()))
 
 
 #: Prefixes of dimensions that come only from a stage or from extra bytes.
-_MADE = ("HeightAbove", "Ground", "Slope", "Reference")
+_CREATED = ("HeightAbove", "Ground", "Slope", "Reference")
 #: Stages of PDAL that may create dimensions of any name.
-_MAKES_ANY = {
+_CREATES_ANY = {
     f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")
 }
 _DEGREES = re.compile(
@@ -222,9 +207,7 @@ _DEGREES = re.compile(
 
 
 def check_dimensions(expanded: Expanded) -> None:
-    """Refuse a stage that reads heights or labels that nothing provides, and one that would get
-    degrees.
-    """
+    """Refuse stages that read heights or labels that nothing provides, or would get degrees."""
     of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
     for ours in expanded.ours:
         before = list(enumerate(expanded.stages[: ours.index]))
@@ -239,8 +222,8 @@ def check_dimensions(expanded: Expanded) -> None:
                 "projected reference",
             )
         for name in ours.stage.reads():
-            if name.startswith(_MADE) and not any(
-                name in of_ours[index] if index in of_ours else _may_make(name, stage)
+            if name.startswith(_CREATED) and not any(
+                name in of_ours[index] if index in of_ours else _may_create(name, stage)
                 for index, stage in before
             ):
                 raise DimensionError(
@@ -251,36 +234,31 @@ def check_dimensions(expanded: Expanded) -> None:
                 )
 
 
-def _may_make(name: str, stage: Mapping[str, Any]) -> bool:
-    """Whether a stage of PDAL may create a dimension; readers of other formats than LAS may create
-    any.
-    """
-    kind = stage["type"]
+def _may_create(name: str, stage: Mapping[str, Any]) -> bool:
+    """Return whether a stage of PDAL may create a dimension; readers but those of LAS may."""
     if is_reader(stage):
-        files = reader_files(dict(stage), las=True)
+        files = readers_files([stage], las=True)
         named = name in str(stage.get("extra_dims", ""))
         return not files or named or any(name in extra_dimensions(path) for path in files)
-    if kind in _MAKES_ANY or name in heights_of(stage):
+    if stage["type"] in _CREATES_ANY or name in heights_of(stage):
         return True
     return any(name in str(value) for key, value in stage.items() if key not in ("type", "tag"))
 
 
 def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
-    """A warning for each file of LAS 1.0-1.3 with extra dimensions, which PDAL reads only on
-    request.
-    """
+    """Return a warning for each file of LAS 1.0-1.3 whose extra dimensions PDAL does not read."""
     warnings = []
     for stage in stages:
         if str(stage.get("use_eb_vlr", "")).lower() == "true" or "extra_dims" in stage:
             continue
-        for path in reader_files(stage, las=True):
+        for path in readers_files([stage], las=True):
             header, names = read_header(path), list(extra_dimensions(path))
             if header is not None and header.minor < 4 and names:
                 listed = ", ".join(names[:5]) + ", ..." * (len(names) > 5)
                 warnings.append(
                     f"{path}: its extra dimensions are not read: {listed}. In LAS "
-                    f"1.{header.minor}, PDAL reads them "
-                    'only if the reader has "use_eb_vlr": true'
+                    f"1.{header.minor}, PDAL reads them only if the reader has "
+                    '"use_eb_vlr": true'
                 )
     return warnings
 
@@ -288,23 +266,37 @@ def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
 # ---- one stage -----------------------------------------------------------------------------------
 
 
-def expand_stage(given: dict[str, Any], number: int = 0, index: int = 0) -> ExpandedStage:
-    """One stage of ours, checked, and the ``filters.python`` that stands for it."""
-    stage = stage_from(given)
-    options = {k: v for k, v in given.items() if k not in ("type", *PDAL_OWN)}
+def stage_files(stage: Stage) -> list[str]:
+    """Return the files that a stage of ours reads, also a model that is both read and written."""
+    written = {output.path for output in stage.outputs()}
+    if stage.type.startswith("writers."):  # whose outputs may be named after it
+        written.add(stage.options["filename"])
+    files: list[str] = []
+    for option in stage.all_options():
+        name = stage.options[option.name]
+        if name and option.kind == "model":
+            files.append(find(name))
+        elif name and option.kind == "filename" and name not in written:
+            files.append(name)
+    return [*files, *stage.inputs()]
+
+
+def expand_stage(as_written: dict[str, Any], number: int = 0, index: int = 0) -> ExpandedStage:
+    """Check one stage of ours, and return it with the ``filters.python`` that stands for it."""
+    stage = stage_from(as_written)
+    options = {k: v for k, v in as_written.items() if k not in ("type", *PDAL_OWN)}
     label = f"pdal_stages_{stage.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"
     arguments = {"stage": stage.type, "label": label, "options": options}
-    if given.get("tag"):
-        arguments["tag"] = given["tag"]
+    if as_written.get("tag"):
+        arguments["tag"] = as_written["tag"]
     plain = python_filter(label, TRAMPOLINE, arguments, stage.creates())
-    plain |= {key: given[key] for key in PDAL_OWN if key in given}
-    made[label] = expanded = ExpandedStage(stage, number, index, given, plain)
+    plain |= {key: as_written[key] for key in PDAL_OWN if key in as_written}
+    BY_LABEL[label] = expanded = ExpandedStage(stage, number, index, as_written, plain)
     return expanded
 
 
 def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """An expanded pipeline with one filter for stages of ours, and functions, that follow one
-    another.
+    """Return an expanded pipeline with one filter for stages of ours that follow one another.
 
     For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. What
     tags and inputs wire stays as it is; a stage that forgets dimensions is the last of its filter.
@@ -313,16 +305,13 @@ def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     for stage in stages:
         before = out[-1] if out else {}
         wired = (before.keys() - {"inputs"} | stage.keys()).intersection(PDAL_OWN)
-        if not wired and all(str(one.get("module")) in made for one in (before, stage)):
+        if not wired and all(str(each.get("module")) in BY_LABEL for each in (before, stage)):
             several = before["pdalargs"].get("stages", [before["pdalargs"]])
-            last = made.get(several[-1]["label"])
+            last = BY_LABEL.get(several[-1]["label"])
             if not (isinstance(last, ExpandedStage) and last.stage.forgets):
                 adds = [*dict.fromkeys(before["add_dimension"] + stage["add_dimension"])]
-                joined = {
-                    "pdalargs": {"stages": [*several, stage["pdalargs"]]},
-                    "add_dimension": adds,
-                }
-                out[-1] = {**before, **joined}
+                arguments = {"stages": [*several, stage["pdalargs"]]}
+                out[-1] = {**before, "pdalargs": arguments, "add_dimension": adds}
                 continue
         out.append(stage)
     return out

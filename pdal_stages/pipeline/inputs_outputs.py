@@ -1,56 +1,66 @@
-"""Inputs and outputs: files by name, folder or pattern, and their readers and writers."""
+"""Files of a job: inputs by name, folder or pattern, names of outputs, and the files of stages.
+
+Each stage has a type (:func:`.pdal.with_types`).
+"""
 
 from __future__ import annotations
 
 import glob
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
+from ..base.files import LAS, Output
 from ..base.las import named_copc, named_las, refuse_pipe
-from ..base.octree_check import check_copc, check_ept
-from ..classifier.model_file import find
-from ..stages.base import Stage
-from . import pdal as pdal_env
-from .overrides import Override, apply_overrides
-from .stage_files import reader_files
 
 #: File name of the description of an EPT source.
 EPT = "ept.json"
-
 #: Tile indexes, by suffix.
 _INDEXES = (".gpkg", ".sqlite", ".shp", ".geojson")
+#: Writers of LAS and COPC.
+LAS_WRITERS = ("writers.las", "writers.copc")
+#: Readers of LAS files.
+LAS_READERS = ("readers.las", "readers.copc")
+#: Options of PDAL's stages that never name a file.
+_NO_FILES = ("type", "tag", "inputs", "user_data", "pdalargs")
+
+
+# ---- inputs --------------------------------------------------------------------------------------
 
 
 def input_files(names: Sequence[str]) -> list[str]:
-    """The inputs behind files, folders, patterns, tile indexes and EPT sources: each once, sorted
-    by name within each.
+    """Return the inputs behind files, folders, patterns, tile indexes and EPT sources.
+
+    Each comes once, in the order of the names; those behind one name are sorted.
     """
-    found: list[str] = []
+    by_place: dict[str, str] = {}
     for name in names:
         try:
-            found += _meant(name)
+            for path in _expand_name(name):
+                by_place.setdefault(path if "://" in path else os.path.realpath(path), path)
         except OSError as error:
-            raise StageError("the input cannot be read", where=name, found=error.strerror) from None
-    by_place: dict[str, str] = {}
-    for name in found:
-        by_place.setdefault(name if "://" in name else os.path.realpath(name), name)
+            raise StageError("the input cannot be read", where=name, found=error) from None
     return list(by_place.values())
 
 
-def _meant(name: str) -> list[str]:
-    """The inputs behind one name."""
-    if not name:  # which for a path is the current folder
+def _expand_name(name: str) -> list[str]:
+    """Return the inputs behind one name."""
+    path = Path(name)
+    if not name:  # which as a path is the current folder
         cure = "Name a file, or '.' for the current folder; is a shell variable unset?"
         raise StageError("the name of an input is empty", cure=cure)
-    path = Path(name)
     if "://" in name:
         return [name]
     if path.is_dir():
-        return _inside(path)
+        if (path / EPT).is_file():
+            return [str(path / EPT)]
+        if inside := sorted(str(file) for file in path.iterdir() if is_las(str(file))):
+            return inside
+        cure = f"For files in subfolders name a pattern: '{name}/**/*.laz'"
+        raise StageError("the folder holds no LAS or LAZ files", found=name, cure=cure)
     if path.suffix.lower() in _INDEXES:
         return locations(name)
     if path.exists() or name.startswith("/vsi"):
@@ -62,21 +72,10 @@ def _meant(name: str) -> list[str]:
     raise StageError("there is no such file or folder", where=name, cure=cure)
 
 
-def _inside(folder: Path) -> list[str]:
-    """The LAS and LAZ files of a folder, or the EPT source that it is."""
-    if (folder / EPT).is_file():
-        return [str(folder / EPT)]
-    inside = sorted(str(path) for path in folder.iterdir() if is_las(str(path)))
-    if not inside:
-        deeper = next(folder.rglob("*.la[sz]"), None)
-        cure = f"There are some in subfolders: '{folder}/**/*{deeper.suffix}'" if deeper else None
-        raise StageError("the folder holds no LAS or LAZ files", found=str(folder), cure=cure)
-    return inside
-
-
 def locations(path: str, column: str = "location") -> list[str]:
-    """The files a tile index names, made by ``pdal tindex create``; relative ones from its folder,
-    then from here.
+    """Return the files that a tile index of ``pdal tindex create`` names.
+
+    Relative names are looked for in the index's folder, then in the current one.
     """
     from ..base.vector import reading
 
@@ -97,66 +96,63 @@ def locations(path: str, column: str = "location") -> list[str]:
 
 
 def is_ept(name: str) -> bool:
-    """Whether an input is an EPT source."""
+    """Return whether an input is an EPT source."""
     return name.startswith("ept://") or Path(name).name == EPT
 
 
 def ept_address(name: str) -> str:
-    """The path or address of the description of an EPT source."""
+    """Return the path or address of the description of an EPT source."""
     name = name.removeprefix("ept://")
     name = name if name.endswith(EPT) else f"{name.rstrip('/')}/{EPT}"
     return name if "://" in name else os.path.abspath(name)
 
 
 def is_las(name: str) -> bool:
-    """Whether an input is a LAS, LAZ or COPC file, as its name says."""
+    """Return whether an input is a local LAS, LAZ or COPC file, as its name says."""
     return named_las(name) and "://" not in name
 
 
+# ---- outputs -------------------------------------------------------------------------------------
+
+
 def is_folder(target: str) -> bool:
-    """Whether an output is a folder: one that is there, or a name that ends with a slash, or has
-    neither suffix nor '#'.
+    """Return whether an output is a folder: an existing one, or a name that looks like one.
+
+    Such a name ends with a slash, or has neither a suffix nor '#'.
     """
     path = Path(target)
     named = "#" not in path.name and not path.suffix and not path.exists()
     return path.is_dir() or target.endswith(("/", os.sep)) or named
 
 
-def _output_name(source: str, copc: bool) -> str:
-    """The input's name; COPC becomes plain LAZ unless it is written as COPC."""
-    name = Path(source).name
-    return name[: -len(".copc.laz")] + ".laz" if named_copc(name) and not copc else name
-
-
 def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
-    """The names of outputs in a folder; where two are equal, with the inputs' folders below their
-    common one.
+    """Return the names of outputs in a folder.
+
+    Where two are equal, each begins with its input's folder below the inputs' common one.
     """
     if len(set(names)) == len(names) or any("://" in source for source in sources):
         return list(names)
     folders = [os.path.dirname(os.path.abspath(source)) for source in sources]
     shared = os.path.commonpath(folders)
-    inside = (os.path.relpath(folder, shared) for folder in folders)
-    return [
-        os.path.normpath(os.path.join(folder, name))
-        for folder, name in zip(inside, names, strict=True)
-    ]
+    pairs = zip(folders, names, strict=True)
+    return [os.path.normpath(f"{os.path.relpath(folder, shared)}/{name}") for folder, name in pairs]
 
 
 def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[str]:
-    """An output for each input, with its name in place of ``#``; for ``#`` alone, with its suffix
-    (see :func:`in_folders`).
+    """Return an output for each input, with its name in place of ``#``.
 
-    `copc`: COPC inputs may be written as COPC, where this PDAL can.
+    The file name ``#`` alone takes the input's suffix, too (see :func:`in_folders`). With `copc`,
+    COPC inputs become COPC outputs, else plain LAZ.
     """
     path = Path(target)
+    names = [Path(source).name for source in sources]
+    stems = [n[: -len(".copc.laz")] if named_copc(n) else Path(n).stem for n in names]
     if path.name == "#":
-        names = [_output_name(source, copc and pdal_env.knows_copc()) for source in sources]
+        pairs = zip(names, stems, strict=True)
+        names = [f"{stem}.laz" if named_copc(n) and not copc else n for n, stem in pairs]
         outputs = [str(path.parent / name) for name in in_folders(sources, names)]
     else:
-        outputs = named_outputs(
-            target, [Path(_output_name(source, False)).stem for source in sources]
-        )
+        outputs = named_outputs(target, stems)
     first: dict[str, str] = {}
     for source, output in zip(sources, outputs, strict=True):
         if (other := first.setdefault(output, source)) is not source:
@@ -170,67 +166,83 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
 
 
 def named_outputs(target: str, names: Sequence[str]) -> list[str]:
-    """A file's name with each name in place of ``#``; PipelineError where several would be written
-    to one file.
-    """
+    """Return a file's name with each name in place of ``#``; PipelineError without ``#``."""
     path = Path(target)
     if "#" not in path.name and len(names) > 1:
         raise PipelineError(
             "several inputs or tiles would be written to one file",
             found=f"{len(names)} to {target}",
             cure="Name a folder (with a slash at its end), or put '#' where the name of the input "
-            "or tile should be, e.g. "
-            "classified_#.laz. To merge inputs into one file, use a pipeline",
+            "or tile should be, e.g. classified_#.laz. To merge inputs into one file, use a "
+            "pipeline",
         )
     return [str(path.with_name(path.name.replace("#", name))) for name in names]
 
 
-def reader_of(source: str, tag: str) -> dict[str, Any]:
-    """A reader; it also reads the extra dimensions of LAS 1.0-1.3, which PDAL leaves out by
-    default.
+# ---- files of PDAL's stages ----------------------------------------------------------------------
+
+
+def readers_files(stages: Sequence[Mapping[str, Any]], *, las: bool = False) -> list[str]:
+    """Return the local files that PDAL's readers read; only LAS and LAZ files with `las`.
+
+    Patterns are replaced by the files that match.
     """
-    stage: dict[str, Any] = {"filename": str(source), "tag": tag}
-    if named_las(source) and not named_copc(source):
-        stage |= {"type": "readers.las", "use_eb_vlr": True}
-    return pdal_env.typed([stage])[0]
-
-
-def writer_of(target: str) -> dict[str, Any]:
-    """A writer that keeps the input's header, where it is a LAS file."""
-    stage: dict[str, Any] = {"filename": target, "tag": "output"}
-    if named_las(target):
-        kind = "writers.copc" if named_copc(target) and pdal_env.knows_copc() else "writers.las"
-        stage |= {"type": kind, "forward": "all"}
-    return stage
-
-
-def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:
-    """A stage with the overrides of its type."""
-    return apply_overrides(
-        [stage], [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
-    )[0]
-
-
-def check_octrees(stages: list[dict[str, Any]]) -> None:
-    """Refuse damaged octrees of COPC and EPT inputs; StageError."""
+    files: list[str] = []
     for stage in stages:
-        if stage["type"] == "readers.ept":
-            check_ept(ept_address(str(stage.get("filename", ""))))
-        elif stage["type"] == "readers.copc" and pdal_env.knows_copc():
-            for path in reader_files(stage, las=True):
-                check_copc(path)
+        name, is_las = stage.get("filename"), stage["type"] in LAS_READERS
+        if not is_reader(stage) or not isinstance(name, str) or "://" in name:
+            continue
+        if is_las or not las:
+            names = sorted(glob.glob(name)) if not os.path.exists(name) else [name]
+            there = os.path.exists if is_las else os.path.isfile  # other readers may read a pipe
+            files += [path for path in names if there(path) and not os.path.isdir(path)]
+    return files
 
 
-def stage_files(stage: Stage) -> list[str]:
-    """Files that a stage of ours reads; a model that is both read and written is among them."""
-    written = {output.path for output in stage.outputs()}
-    if stage.type.startswith("writers."):  # whose outputs may be named after it
-        written.add(stage.options["filename"])
-    given = [
-        (o.kind, stage.options[o.name])
-        for o in stage.all_options()
-        if o.kind in ("filename", "model")
-    ]
-    models = [find(name) for kind, name in given if name and kind == "model"]
-    files = [name for kind, name in given if kind != "model" and name and name not in written]
-    return [*models, *files, *stage.inputs()]
+def named_files(stages: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return existing files named in any option of PDAL's stages: polygons, rasters, scripts."""
+    files: list[str] = []
+    for stage in stages:
+        aside = (*_NO_FILES, *(("filename",) if is_writer(stage) else ()))
+        texts = _texts({name: value for name, value in stage.items() if name not in aside})
+        files += [text for text in texts if "\0" not in text and os.path.isfile(text)]
+    return files
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield all texts in an option's value."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _texts(inner)
+
+
+def is_reader(stage: Mapping[str, Any]) -> bool:
+    """Return whether a stage is a reader."""
+    return stage["type"].startswith("readers.")
+
+
+def is_writer(stage: Mapping[str, Any]) -> bool:
+    """Return whether a stage writes a local file."""
+    name, kind = stage.get("filename"), stage["type"]
+    if not kind.startswith("writers.") or not isinstance(name, str) or "://" in name:
+        return False
+    return kind != "writers.text" or name.upper() != "STDOUT"  # which PDAL prints
+
+
+def writes_las(stage: Mapping[str, Any]) -> bool:
+    """Return whether a stage writes LAS."""
+    return stage["type"] in LAS_WRITERS
+
+
+def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:
+    """Return the files that PDAL's writers write."""
+    writers = filter(is_writer, stages)
+    return [Output(s["filename"], "output", LAS if writes_las(s) else "") for s in writers]
+
+
+def with_outputs(stages: list[dict[str, Any]], names: list[Any]) -> list[dict[str, Any]]:
+    """Return the stages with other names for the files that writers write."""
+    waiting = iter(names)
+    return [{**s, "filename": str(next(waiting))} if is_writer(s) else s for s in stages]

@@ -1,20 +1,20 @@
-"""Read a pipeline as a user wrote it: JSON with comments, as PDAL reads it, and errors that name
-the line.
+"""Read a pipeline as a user wrote it: JSON with comments, options set from outside, line numbers.
+
+Comments are allowed, as PDAL allows them. On the command line, options of stages are set as in
+PDAL: ``--stage.TAG.option=value`` and ``--filters.name.option=value``.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..base.checks import refuse_constant
-from ..base.errors import PipelineError
-
-#: More bytes than any pipeline file has.
-_LARGEST = 1 << 26
+from ..base.errors import OptionError, PipelineError, suggest
 
 
 @dataclass
@@ -26,73 +26,50 @@ class PipelineSource:
     name: str = ""  #: the file, for messages; empty for text
 
     def __post_init__(self) -> None:
-        self.stages = [_with_plain_name(stage) for stage in self.stages]
+        """Write file names as text that are objects with only a path (PDAL 2.9)."""
+        for number, stage in enumerate(self.stages):
+            name = stage.get("filename") if isinstance(stage, dict) else None
+            if isinstance(name, dict) and set(name) == {"path"} and isinstance(name["path"], str):
+                self.stages[number] = {**stage, "filename": name["path"]}
 
     def where(self, index: int) -> str:
-        """``job.json, line 12`` or ``stage 3``."""
+        """Return ``job.json, line 12`` or ``stage 3``."""
         if self.lines[index]:
             return f"{self.name or 'pipeline'}, line {self.lines[index]}"
         return f"stage {index + 1}"
 
 
-def _with_plain_name(stage: Any) -> Any:
-    """A file name given as an object with only a path (PDAL 2.9), as text, which every PDAL
-    takes.
-    """
-    name = stage.get("filename") if isinstance(stage, dict) else None
-    if isinstance(name, dict) and set(name) == {"path"} and isinstance(name["path"], str):
-        return {**stage, "filename": name["path"]}
-    return stage
-
-
 def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
-    """A pipeline from a file name, JSON text, or Python lists and dicts."""
+    """Read a pipeline from a file name, JSON text, or Python lists and dicts."""
     if isinstance(source, list | dict):
-        stages = source.get("pipeline") if isinstance(source, dict) else source
-        if not isinstance(stages, list):
-            raise PipelineError(
-                "a pipeline is a list of stages, or an object with a list named 'pipeline'"
-            )
-        return _checked(PipelineSource(stages, [0] * len(stages)))
-    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n")[:2].startswith(
-        ("[", "{", "//", "/*")
-    ):
-        return parse_pipeline(source)
+        stages = _list_of_stages(source, "")
+        return _checked(PipelineSource(list(stages), [0] * len(stages)))
+    text = str(source)
+    if text.lstrip("\ufeff \t\r\n")[:2].startswith(("[", "{", "//", "/*")):
+        return parse_pipeline(text)
     try:
-        data = _content(Path(source))
+        data = Path(source).read_bytes()
     except (OSError, ValueError) as error:
-        where = ascii(str(source)[:200])[1:-1]
+        where = ascii(text[:200])[1:-1]
         raise PipelineError("the pipeline file cannot be read", where=where, found=error) from None
-    return parse_pipeline(decode(data, str(source)), str(source))
-
-
-def _content(path: Path) -> bytes:
-    """What a file or pipe holds; devices have no end."""
-    with open(path, "rb") as file:
-        if len(data := file.read(_LARGEST)) == _LARGEST:
-            raise OSError(f"{_LARGEST >> 20} MB or more, too much for a pipeline")
-    return data
+    return parse_pipeline(decode(data, text), text)
 
 
 def decode(data: bytes, name: str) -> str:
-    """The text of a pipeline file, which is UTF-8, with or without a byte order mark."""
+    """Return the text of a pipeline file: UTF-8, with or without a byte order mark."""
     if data.startswith(b"LASF"):
-        cure = (
-            "Give the JSON file of a pipeline; or classify the points: pdal-stages classify IN OUT"
-        )
+        cure = "Give a pipeline's JSON file; or classify the points: pdal-stages classify IN OUT"
         raise PipelineError("this is a point cloud, not a pipeline", where=name, cure=cure)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        what, found = (
-            "the pipeline file is not UTF-8 text",
-            f"byte {error.start} is 0x{data[error.start]:02x}",
-        )
-        raise PipelineError(what, where=name, found=found, cure="Save it as UTF-8") from None
+        what = "the pipeline file is not UTF-8 text"
+        byte = f"byte {error.start} is 0x{data[error.start]:02x}"
+        raise PipelineError(what, where=name, found=byte, cure="Save it as UTF-8") from None
 
 
 def parse_pipeline(text: str, name: str = "") -> PipelineSource:
-    """Parse pipeline JSON text; comments are allowed, as PDAL allows them."""
+    """Parse pipeline JSON text; errors name the line."""
     clean = _without_comments(text.removeprefix("\ufeff"), name)
     if not clean.strip():
         raise PipelineError("the pipeline is empty", where=name or None)
@@ -107,67 +84,66 @@ def parse_pipeline(text: str, name: str = "") -> PipelineSource:
             "before a closing bracket",
         ) from None
     except (ValueError, RecursionError) as error:
-        found = str(error)[:200]
-        raise PipelineError(
-            "the pipeline is not valid JSON", where=name or None, found=found
-        ) from None
-    stages = value.get("pipeline") if isinstance(value, dict) else value
-    if not isinstance(stages, list):
-        what, found = "must be a list or an object", type(value).__name__
-        if isinstance(value, dict):
-            what = "has no list named 'pipeline'"
-            found = f"an object with {', '.join(map(repr, value)) or 'nothing in it'}"[:200]
-        cure = 'Write {"pipeline": [...]}, or the list alone'
-        raise PipelineError(f"the pipeline {what}", where=name or None, found=found, cure=cure)
+        what, reason = "the pipeline is not valid JSON", str(error)[:200]
+        raise PipelineError(what, where=name or None, found=reason) from None
+    stages = _list_of_stages(value, name)
     start = len(clean) - len(clean.lstrip())
     if isinstance(value, dict):
-        inside = _places(clean, start)
+        inside = _item_positions(clean, start)
         keys = [_decoder.raw_decode(clean, at)[0] for at in inside[::2]]
         start = dict(zip(keys, inside[1::2], strict=True))["pipeline"]
-    lines = [clean.count("\n", 0, at) + 1 for at in _places(clean, start)]
+    lines = [clean.count("\n", 0, at) + 1 for at in _item_positions(clean, start)]
     return _checked(PipelineSource(stages, lines, name))
 
 
-def _places(text: str, at: int) -> list[int]:
-    """Where the items of a list begin, or the keys and values of an object, whose bracket is there;
-    it is valid JSON.
+def _list_of_stages(value: Any, name: str) -> list[Any]:
+    """Return the stages of a pipeline: the list itself, or that named 'pipeline' in an object."""
+    stages = value.get("pipeline") if isinstance(value, dict) else value
+    if isinstance(stages, list):
+        return stages
+    what, kind = "must be a list or an object", type(value).__name__
+    if isinstance(value, dict):
+        what = "has no list named 'pipeline'"
+        kind = f"an object with {', '.join(map(repr, value)) or 'nothing in it'}"[:200]
+    cure = 'Write {"pipeline": [...]}, or the list alone'
+    raise PipelineError(f"the pipeline {what}", where=name or None, found=kind, cure=cure)
+
+
+def _item_positions(text: str, at: int) -> list[int]:
+    """Return where the items of a list begin, or the keys and values of an object, in valid JSON.
+
+    The opening bracket is at `at`.
     """
-    places: list[int] = []
+    positions: list[int] = []
     while True:
         while text[(at := at + 1)] in " \t\r\n,:":
             pass
         if text[at] in "]}":
-            return places
-        places.append(at)
+            return positions
+        positions.append(at)
         at = _decoder.raw_decode(text, at)[1] - 1
 
 
 _decoder = json.JSONDecoder()
 
 
-#: Types of the options that connect stages.
-_SHAPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
-    ("type", (str,), "text"),
-    ("tag", (str,), "text"),
-    ("inputs", (str, list), "a tag, or a list of tags"),
-)
-
-
 def _checked(source: PipelineSource) -> PipelineSource:
+    """Refuse stages that are no objects or file names, or hold what PDAL cannot take."""
     if not source.stages:
         raise PipelineError("the pipeline has no stages", where=source.name or None)
     for index, stage in enumerate(source.stages):
         where = source.where(index)
         if not isinstance(stage, str | dict):
-            found = json.dumps(stage, default=str)[:80]
-            raise PipelineError("a stage is an object, or a file name", where=where, found=found)
+            value = json.dumps(stage, default=str)[:80]
+            raise PipelineError("a stage is an object, or a file name", where=where, found=value)
         _check_values(stage, where)
-        for key, kinds, what in _SHAPES if isinstance(stage, dict) else ():
+        for key in ("type", "tag", "inputs") if isinstance(stage, dict) else ():
             value = stage.get(key, "")  # type: ignore[union-attr]
-            tags = value if isinstance(value, list) else []
-            if not isinstance(value, kinds) or not all(isinstance(tag, str) for tag in tags):
-                found = json.dumps(value, default=str)[:80]
-                raise PipelineError(f"a stage's '{key}' is {what}", where=where, found=found)
+            texts = value if key == "inputs" and isinstance(value, list) else [value]
+            if not all(isinstance(text, str) for text in texts):
+                kind = "a tag, or a list of tags" if key == "inputs" else "text"
+                value = json.dumps(value, default=str)[:80]
+                raise PipelineError(f"a stage's '{key}' is {kind}", where=where, found=value)
     return source
 
 
@@ -179,15 +155,12 @@ def _check_values(stage: Any, where: str) -> None:
         if "\\u0000" in text.replace("\\\\", ""):  # a backslash before it makes it a text
             raise ValueError("a text holds a NUL character")
     except UnicodeEncodeError as error:
-        found = ascii(error.object[max(0, error.start - 40) : error.end])
+        what, text = "a text is not valid UTF-8", error.object[max(0, error.start - 40) : error.end]
         cure = "If it is a file's name, rename the file"
-        raise PipelineError(
-            "a text is not valid UTF-8", where=where, found=found, cure=cure
-        ) from None
+        raise PipelineError(what, where=where, found=ascii(text), cure=cure) from None
     except (TypeError, ValueError, RecursionError) as error:
-        raise PipelineError(
-            "a stage holds a value that PDAL cannot take", where=where, found=error
-        ) from None
+        what = "a stage holds a value that PDAL cannot take"
+        raise PipelineError(what, where=where, found=error) from None
 
 
 # The closing quote is optional, so that a match never fails: searching stays linear whatever the
@@ -208,3 +181,73 @@ def _without_comments(text: str, name: str) -> str:
         return re.sub(r"[^\n]", " ", match[0])
 
     return _STRING_OR_COMMENT.sub(blank, text)
+
+
+# ---- options set from outside --------------------------------------------------------------------
+
+_FLAG = re.compile(
+    r"--(?:stage\.(?P<tag>[^.=]+)|(?P<type>(?:readers|filters|writers)\.\w+))\.(?P<option>\w+)"
+    r"(?:=(?P<value>.*))?",
+    re.DOTALL,
+)
+
+
+@dataclass(frozen=True)
+class Override:
+    """An option set from outside: for stages with a tag, or of a type."""
+
+    selector: str
+    by_tag: bool
+    option: str
+    value: str
+
+    @property
+    def flag(self) -> str:
+        """The option as it is written on the command line."""
+        return f"--{'stage.' if self.by_tag else ''}{self.selector}.{self.option}={self.value}"
+
+
+def parse_overrides(arguments: Iterable[str]) -> tuple[list[Override], list[str]]:
+    """Return the overrides among command-line arguments, and the other arguments.
+
+    The value follows after ``=`` or as the next argument.
+    """
+    overrides: list[Override] = []
+    others: list[str] = []
+    words = iter(arguments)
+    for word in words:
+        match = _FLAG.fullmatch(word)
+        if match is None:
+            others.append(word)
+            continue
+        value = next(words, "--") if match["value"] is None else match["value"]
+        if match["value"] is None and value.startswith("--"):
+            raise OptionError(f"'{word}' has no value", cure=f"Write {word}=VALUE")
+        by_tag = match["tag"] is not None
+        overrides.append(Override(match["tag"] or match["type"], by_tag, match["option"], value))
+    return overrides, others
+
+
+def apply_overrides(stages: list[Any], overrides: Iterable[Override]) -> list[Any]:
+    """Return the stages with overrides applied; an override that fits no stage is an error."""
+    out = [dict(s) if isinstance(s, dict) else s for s in stages]
+    for override in overrides:
+        key = "tag" if override.by_tag else "type"
+        hits = [s for s in out if isinstance(s, dict) and str(s.get(key, "")) == override.selector]
+        if not hits:
+            known = sorted({str(s[key]) for s in out if isinstance(s, dict) and key in s})
+            raise OptionError(
+                f"no stage of the pipeline has the {key} '{override.selector}'",
+                found=override.flag,
+                cure=f"{suggest(override.selector, known)}The pipeline's {key}s: "
+                f"{', '.join(known) or 'none'}",
+            )
+        for stage in hits:
+            stage[override.option] = override.value
+    return out
+
+
+def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:
+    """Return a stage with the overrides of its type."""
+    of_type = [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
+    return apply_overrides([stage], of_type)[0]

@@ -24,17 +24,18 @@ from ..base.las import (
 from ..base.las_repair import MOST_ENTRIES, extra_dimensions, restore_texts, restore_titles
 from ..stages.registry import stage_types
 from . import pdal as pdal_env
+from .inputs_outputs import is_reader, is_writer, readers_files, writes_las
 from .runtime import ExpandedStage, python_filter
-from .stage_files import is_reader, is_writer, reader_files, writes_las
 
 _AS_LAS_14 = '"minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)'
 
 
-def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) -> tuple[int, int]:
-    """(minor_version, dataformat_id) the writer will use: its options, the forwarded header, PDAL's
-    defaults.
+def las_version(writer: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+    """Return (minor_version, dataformat_id) that a writer will use.
+
+    They come from its options, the forwarded header, or PDAL's defaults.
     """
-    found: list[int | None] = []
+    values: list[int | None] = []
     forward, headers = str(writer.get("forward", "")), las_headers(before)
     forwards = any(word in forward for word in ("all", "header", "minor_version"))
     for option, of_headers in (
@@ -42,86 +43,80 @@ def las_version(writer: Mapping[str, Any], before: Iterable[Mapping[str, Any]]) 
         ("dataformat_id", {header.point_format for header in headers}),
     ):
         try:
-            found.append(int(writer[option]))
+            values.append(int(writer[option]))
         except (KeyError, TypeError, ValueError, OverflowError):  # PDAL reports wrong ones
-            found.append(of_headers.pop() if forwards and len(of_headers) == 1 else None)
+            values.append(of_headers.pop() if forwards and len(of_headers) == 1 else None)
     # PDAL is asked only then: it is another process
-    defaults: Sequence[int] = pdal_env.las_writer_defaults() if None in found else (0, 0)
-    minor, format_id = (d if one is None else one for one, d in zip(found, defaults, strict=True))
+    defaults = pdal_env.las_writer_defaults() if None in values else (0, 0)
+    minor, format_id = (d if v is None else v for v, d in zip(values, defaults, strict=True))
     return minor, format_id
 
 
-def las_headers(readers: Iterable[Mapping[str, Any]]) -> list[LasHeader]:
-    """Headers of the LAS files that stages read, where they can be read."""
-    paths = [name for stage in readers for name in reader_files(dict(stage), las=True)]
-    return [header for header in map(header_there, paths) if header is not None]
+def las_headers(readers: Sequence[Mapping[str, Any]]) -> list[LasHeader]:
+    """Return the headers of the LAS files that stages read, where they can be read."""
+    return [h for h in map(header_there, readers_files(readers, las=True)) if h is not None]
 
 
-def extra_dims_option(sources: Sequence[str], made: Mapping[str, str]) -> str:
-    """The inputs' own extra dimensions and those `made` (name -> PDAL type); ``all`` where the
-    inputs' own are not known.
+def extra_dims_option(sources: Sequence[str], created: Mapping[str, str]) -> str:
+    """Return the writers' option: the inputs' extra dimensions and those `created`.
+
+    `created` maps names to PDAL types. The option is ``all`` where an input is no LAS file.
     """
-    own: dict[str, str] = {}
+    if not all(map(named_las, sources)):
+        return "all"
+    dimensions: dict[str, str] = {}
     for source in sources:
-        if not named_las(source):
-            return "all"
-        own |= extra_dimensions(source)
-    return ",".join(f"{name}={kind}" for name, kind in {**own, **made}.items())
+        dimensions |= extra_dimensions(source)
+    return ",".join(f"{name}={kind}" for name, kind in {**dimensions, **created}.items())
 
 
 #: How the message begins that a run replaces dimensions of its inputs.
 REPLACED = "dimensions of the input get new values:"
 
 
-def replaced(sources: Iterable[str], made: Iterable[str]) -> list[str]:
-    """Return a message on extra dimensions of LAS files that stages make anew, such as those of an
-    earlier run.
-    """
-    own = dict.fromkeys(name for source in sources for name in extra_dimensions(source))
-    names = [name for name in own if name in set(made)]
+def replaced(sources: Iterable[str], created: Iterable[str]) -> list[str]:
+    """Return a message on extra dimensions of LAS files that stages create anew, if any."""
+    existing = dict.fromkeys(name for source in sources for name in extra_dimensions(source))
+    names = [name for name in existing if name in set(created)]
     if not names:
         return []
     return [f"{REPLACED} {', '.join(names)}. To keep the old ones, rename them first"]
 
 
-def finish(made: Path, sources: Iterable[str], unit: float | None = None) -> None:
+def finish(output: Path, sources: Iterable[str], unit: float | None = None) -> None:
     """Correct in a LAS output what PDAL forwards wrongly; other outputs stay as they are.
 
     Parameters
     ----------
-    made : Path
-        The output.
+    output : Path
     sources : iterable of str
         The files it was made from.
     unit : float, optional
         The unit of its x and y in meters, where it is that of the sources.
     """
-    supersede_copc(made)
-    if named_las(made):
+    supersede_copc(output)
+    if named_las(output):
         sources = list(sources)
-        restore_titles(made, sources)
-        restore_texts(made, sources)
+        restore_titles(output, sources)
+        restore_texts(output, sources)
         if unit is not None:
-            set_geotiff_unit(made, unit)
+            set_geotiff_unit(output, unit)
 
 
 # ---- limits, checked before any work -------------------------------------------------------------
 
 
 def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage]) -> None:
-    """Class codes must fit the LAS files written later, and extra dimensions must fit one LAS
-    record.
-    """
-    last = [one.stage for one in ours if "Classification" in one.stage.creates()][-1:]
-    for one in ours:
-        stage, extra = one.stage, len(one.stage.creates())
-        for writer in filter(writes_las, stages[one.index + 1 :]):
-            if (limit := _code_limit(writer, stages[: one.index])) is not None:
-                one.update_context(code_limit=limit if stage in last else None)
+    """Refuse class codes and numbers of extra dimensions that a later LAS writer cannot hold."""
+    last = [each for each in ours if "Classification" in each.stage.creates()][-1:]
+    for each in ours:
+        stage, extra = each.stage, len(each.stage.creates())
+        for writer in filter(writes_las, stages[each.index + 1 :]):
+            if (limit := _code_limit(writer, stages[: each.index])) is not None:
+                each.update_context(code_limit=limit if each in last else None)
                 if (largest := max(stage.written_classes(), default=0)) > LEGACY_LIMIT:
-                    raise OptionError(
-                        limit[0], where=stage.place, found=f"code {largest}", cure=limit[1]
-                    )
+                    code = f"code {largest}"
+                    raise OptionError(limit[0], where=stage.place, found=code, cure=limit[1])
             if extra > MOST_ENTRIES and str(writer.get("extra_dims", "")).strip() == "all":
                 raise DimensionError(
                     "LAS cannot hold so many extra dimensions: one record describes "
@@ -129,15 +124,13 @@ def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage])
                     where=stage.place,
                     found=f"{extra} features",
                     cure="Take fewer neighborhoods or features, write to a format without the "
-                    "limit (writers.text, "
-                    "writers.tiledb), or use writers.classifiermodel and filters.modelclassifier, "
-                    "which need no "
-                    "dimensions",
+                    "limit (writers.text, writers.tiledb), or use writers.classifiermodel and "
+                    "filters.modelclassifier, which need no dimensions",
                 )
 
 
 def _code_limit(writer: dict[str, Any], before: list[dict[str, Any]]) -> tuple[str, str] | None:
-    """The message for codes above 31, and the cure; None for point formats that hold all codes."""
+    """Return the message for codes above 31, and the cure; None where all codes fit."""
     if writer["type"] == "writers.copc":
         return None
     minor, format_id = las_version(writer, before)
@@ -154,15 +147,11 @@ def check_copc_outputs(stages: list[dict[str, Any]]) -> None:
     """Refuse a plain LAZ file under the name of a COPC file."""
     for stage in stages:
         name = str(stage.get("filename", ""))
-        if stage["type"] != "writers.las" or not named_copc(name):
-            continue
-        if not pdal_env.knows_copc():
-            what = f"PDAL {pdal_env.dotted_version()} cannot write COPC"
-            raise PipelineError(
-                what, found=name, cure="Name the output .laz, or use PDAL 2.4 or later"
-            )
-        what = "writers.las writes plain LAZ, not COPC"
-        raise PipelineError(what, found=name, cure='Use "type": "writers.copc"')
+        if stage["type"] == "writers.las" and named_copc(name):
+            cure = 'Use "type": "writers.copc"'
+            if not pdal_env.knows_copc():
+                cure = "Name the output .laz, or use writers.copc of PDAL 2.4 or later"
+            raise PipelineError("writers.las writes plain LAZ, not COPC", found=name, cure=cure)
 
 
 # ---- flags of LAS 1.0-1.3, before PDAL 2.6 -------------------------------------------------------
@@ -187,26 +176,22 @@ def stage(ins, outs):
 def files_with_flags_to_split(
     stages: Sequence[dict[str, Any]], with_ours: bool = True
 ) -> list[bool]:
-    """For each input file, whether flags must be split from the class; empty where nothing is to be
-    done.
+    """Return for each input file whether flags must be split from the class; empty for none.
 
     A writer of LAS 1.0-1.3 writes both into one byte, as they were read. `with_ours`: our stages
     are involved; without them, text and rasters come out as PDAL makes them.
     """
     if pdal_env.splits_class_flags():
         return []
-    read = [
-        [header.point_format for header in las_headers([stage])]
-        for stage in stages
-        if is_reader(stage)
-    ]
-    old = [one <= 5 for formats in read for one in formats or [6]]
+    readers = filter(is_reader, stages)
+    formats = [[header.point_format for header in las_headers([reader])] for reader in readers]
+    old = [number <= 5 for numbers in formats for number in numbers or [6]]
     if True not in old:
         return []
-    mixed = any(one > 5 for formats in read for one in formats)
+    mixed = any(number > 5 for numbers in formats for number in numbers)
     writers = [s for s in stages if is_writer(s) and s["type"] not in stage_types()]
-    written = [las_version(one, stages)[1] for one in writers if writes_las(one)]
-    together, apart = any(one <= 5 for one in written), any(one > 5 for one in written)
+    written = [las_version(writer, stages)[1] > 5 for writer in filter(writes_las, writers)]
+    together, apart = False in written, True in written
     if together and (apart or mixed):
         raise PipelineError(
             "this PDAL cannot carry the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into "
@@ -219,8 +204,9 @@ def files_with_flags_to_split(
 
 
 def flag_splitter(old: Sequence[bool], **wiring: Any) -> dict[str, Any]:
-    """A filter that moves flags to the dimension that they have in LAS 1.4; `old`: see
-    :func:`files_with_flags_to_split`.
+    """Return a filter that moves flags to the dimension that they have in LAS 1.4.
+
+    `old`: see :func:`files_with_flags_to_split`; `wiring`: the filter's tag and inputs.
     """
     adds = {"ClassFlags": "uint8_t"}
     return {**python_filter("pdal_stages_class_flags", _SPLIT, {"old": list(old)}, adds), **wiring}
@@ -229,37 +215,35 @@ def flag_splitter(old: Sequence[bool], **wiring: Any) -> dict[str, Any]:
 # ---- LAZ with class codes above 31, before PDAL 2.3 ----------------------------------------------
 
 UNCOMPRESSED = ".uncompressed.las"
-_BLOCK = 1_000_000
+_BLOCK = 1_000_000  #: points that are compressed at a time
 
 
-def uncompressed_writer(writer: dict[str, Any], before: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """The writer, or an uncompressed one followed by :func:`compress` where PDAL would fail to
-    compress.
+def uncompressed_writer(writer: dict[str, Any], before: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the writer, or where PDAL would fail to compress an uncompressed one.
+
+    :func:`compress` follows it.
     """
+    if pdal_env.compresses_las_14() or writer["type"] != "writers.las":
+        return writer
     named = str(writer.get("filename", "")).lower().endswith(".laz")
     compresses = named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
-    if (
-        pdal_env.version() >= (2, 3, 0)
-        or writer["type"] != "writers.las"
-        or not compresses
-        or las_version(writer, before)[1] <= 5
-    ):
+    if not compresses or las_version(writer, before)[1] <= 5:
         return writer
     plain = {key: value for key, value in writer.items() if key != "compression"}
     return {**plain, "filename": f"{writer['filename']}{UNCOMPRESSED}"}
 
 
 def compress(partials: Iterable[Path]) -> dict[str, str]:
-    """Compress files that were left uncompressed; returns their old names -> their new names."""
+    """Compress files that were left uncompressed; return their old names -> their new names."""
     names: dict[str, str] = {}
     folders = {partial.parent for partial in partials}
-    for made in [one for folder in folders for one in sorted(folder.glob(f"*{UNCOMPRESSED}"))]:
-        target = made.with_name(made.name.removesuffix(UNCOMPRESSED))
+    for path in [path for folder in folders for path in sorted(folder.glob(f"*{UNCOMPRESSED}"))]:
+        target = path.with_name(path.name.removesuffix(UNCOMPRESSED))
         import laspy  # which takes a moment
 
-        supersede_copc(made)  # of a COPC file that was read, whose record laspy does not write
+        supersede_copc(path)  # of a COPC file that was read, whose record laspy does not write
         try:
-            with laspy.open(made) as source:
+            with laspy.open(path) as source:
                 header = source.header
                 with laspy.open(target, "w", header=header, do_compress=True) as out:
                     for points in source.chunk_iterator(_BLOCK):
@@ -267,8 +251,8 @@ def compress(partials: Iterable[Path]) -> dict[str, str]:
                     if header.evlrs:
                         out.write_evlrs(header.evlrs)
         except Exception as error:  # laspy and lazrs raise many types
-            found = f"{target}: {error}"
-            raise StageError("the output file could not be compressed", found=found) from error
-        made.unlink()
-        names[str(made)] = str(target)
+            what = "the output file could not be compressed"
+            raise StageError(what, found=f"{target}: {error}") from error
+        path.unlink()
+        names[str(path)] = str(target)
     return names

@@ -1,5 +1,6 @@
-"""The only module that calls PDAL: running pipelines, versions, drivers, and differences between
-versions.
+"""Call PDAL: run pipelines, ask for versions and drivers, and hide differences between versions.
+
+No other module of the package calls PDAL.
 """
 
 from __future__ import annotations
@@ -20,23 +21,22 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from types import CodeType, FrameType
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
-from ..base.las import geotiff_code, read_header, source_id
+from ..base.las import geotiff_code, header_there, named_copc, named_las, source_id
 from ..base.las_check import DAMAGED, check_readable
 from ..base.las_repair import LARGEST_HEAD, corrected, overwritten
-from .stage_files import reader_files, readers_files, writers_outputs
+from .inputs_outputs import readers_files, writers_outputs
 
 INSTALL = (
-    "Install PDAL with its Python bindings: conda install -c conda-forge python-pdal pdal-plugins; "
-    "on Debian or "
-    "Ubuntu see docs/install.md"
+    "Install PDAL with its Python bindings and its program 'pdal' on PATH: conda install -c "
+    "conda-forge python-pdal pdal-plugins; on Debian or Ubuntu see docs/install.md"
 )
 _DRIVER_CURE = (
     "filters.python comes with the package pdal-plugins. Install it for this Python (pip install "
-    "pdal-plugins), and "
-    "set PDAL_DRIVER_PATH to the folder that holds libpdal_plugin_filter_python"
+    "pdal-plugins), and set PDAL_DRIVER_PATH to the folder that holds "
+    "libpdal_plugin_filter_python"
 )
 
 
@@ -50,60 +50,119 @@ class Execution:
     log: str = ""
 
 
-def bindings():
-    """The module `pdal`; :class:`DependencyError` with the cure where it is absent or broken."""
+def bindings() -> Any:
+    """Return the module `pdal`; DependencyError with the cure where it is absent or broken."""
     try:
         import pdal
-    except ImportError as error:
-        found = f"{sys.executable}: {error}"
-        raise DependencyError(
-            "python-pdal cannot be imported", found=found, cure=INSTALL
-        ) from error
-    except (
-        OSError,
-        subprocess.SubprocessError,
-    ) as error:  # it asks the program `pdal` for its drivers
-        what, cure = (
-            "python-pdal could not start the program 'pdal'",
-            f"Put pdal on PATH. {INSTALL}",
-        )
-        raise DependencyError(what, found=str(error), cure=cure) from error
+    except (ImportError, OSError, subprocess.SubprocessError) as error:  # it runs program `pdal`
+        reason = f"{sys.executable}: {error}"
+        what = "python-pdal cannot be imported"
+        raise DependencyError(what, found=reason, cure=INSTALL) from error
     return pdal
 
 
 @cache
 def version() -> tuple[int, int, int]:
-    """PDAL's version, e.g. (2, 2, 0)."""
+    """Return PDAL's version, e.g. (2, 2, 0)."""
     major, minor, patch, *_ = [*map(int, re.findall(r"\d+", str(bindings().info.version))), 0, 0, 0]
     return major, minor, patch
 
 
 def dotted_version() -> str:
-    """PDAL's version as text, e.g. 2.2.0."""
+    """Return PDAL's version as text, e.g. 2.2.0."""
     return ".".join(map(str, version()))
 
 
 def program() -> str:
-    """Path of the program `pdal`, the one beside this Python first."""
+    """Return the path of the program `pdal`, the one beside this Python first."""
     beside = os.path.join(os.path.dirname(sys.executable), "pdal")
-    if found := beside if os.access(beside, os.X_OK) else shutil.which("pdal"):
-        return found
+    if path := beside if os.access(beside, os.X_OK) else shutil.which("pdal"):
+        return path
     raise DependencyError("the program 'pdal' is not on PATH", cure=INSTALL)
 
 
-def _run_program(*arguments: str, **how: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [program(), *arguments], capture_output=True, text=True, check=False, **how
-    )
+def _run_program(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    command = [program(), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 
 def ask_program(*arguments: str) -> str:
-    """What `pdal` prints for some arguments."""
+    """Return what `pdal` prints for some arguments."""
     done = _run_program(*arguments, timeout=120)
     if not done.returncode:
         return done.stdout
-    said = (done.stderr or done.stdout).strip()[-500:]
-    raise PipelineError(f"pdal {' '.join(arguments)} failed", found=said)
+    output = (done.stderr or done.stdout).strip()[-500:]
+    raise PipelineError(f"pdal {' '.join(arguments)} failed", found=output)
+
+
+def drivers() -> list[dict[str, Any]]:
+    """Return PDAL's stages: name, description, link, extensions."""
+    return json.loads(ask_program("--drivers", "--showjson"))
+
+
+# ---- stages --------------------------------------------------------------------------------------
+
+
+def reader_of(source: str, tag: str) -> dict[str, Any]:
+    """Return a reader that reads extra dimensions of LAS 1.0-1.3 too, which PDAL leaves out."""
+    stage: dict[str, Any] = {"filename": str(source), "tag": tag}
+    if named_las(source) and not named_copc(source):
+        stage |= {"type": "readers.las", "use_eb_vlr": True}
+    return with_types([stage])[0]
+
+
+def writer_of(target: str) -> dict[str, Any]:
+    """Return a writer that keeps the input's header, where it is a LAS file."""
+    stage: dict[str, Any] = {"filename": target, "tag": "output"}
+    if named_las(target):
+        kind = "writers.copc" if named_copc(target) and knows_copc() else "writers.las"
+        stage |= {"type": kind, "forward": "all"}
+    return stage
+
+
+def stages_of(thing: Any) -> list[dict[str, Any]] | None:
+    """Return the stages of an object of python-pdal; None where it is not one."""
+    pdal = bindings()
+    stages = thing.stages if isinstance(thing, pdal.Pipeline) else [thing]
+    if not all(isinstance(stage, pdal.pipeline.Stage) for stage in stages):
+        return None
+    return [{"type": stage.type, **stage.options} for stage in stages]
+
+
+def with_types(
+    stages: Sequence[Any], where: Callable[[int], str] | None = None
+) -> list[dict[str, Any]]:
+    """Return stages as objects with the types that PDAL infers from file names.
+
+    The name of a file alone is a reader, or as the last of several stages a writer. PipelineError
+    where PDAL infers no type; `where` tells where a stage stands.
+    """
+    out = []
+    for number, as_written in enumerate(stages):
+        stage = dict(as_written) if isinstance(as_written, dict) else {"filename": as_written}
+        if not stage.get("type"):
+            bindings()
+            from pdal import libpdalpython
+
+            name = str(stage.get("filename", ""))
+            kind = "writer" if 0 < number == len(stages) - 1 else "reader"
+            plain = "".join(c if c.isascii() else "_" for c in name)  # that no locale refuses
+            stage["type"] = str(getattr(libpdalpython, f"infer_{kind}_driver")(plain))
+            if not name or not stage["type"]:
+                raise PipelineError(
+                    f"PDAL has no {kind} for a file of this name"
+                    if name
+                    else "a stage has neither a type nor the name of a file",
+                    where=where(number) if where else None,
+                    found=name,
+                    cure="Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "
+                    f'"{kind}s.las"',
+                )
+        out.append(stage)
+    return out
+
+
+# ---- running -------------------------------------------------------------------------------------
 
 
 def execute(
@@ -128,66 +187,60 @@ def execute(
 
 @contextlib.contextmanager
 def readable(stages: list[dict[str, Any]], points: bool = True) -> Iterator[list[dict[str, Any]]]:
-    """Give the stages with readers of copies in place of LAS files that PDAL cannot read as they
-    are.
+    """Yield the stages with corrected copies in place of LAS files that PDAL cannot read.
 
     See :mod:`..base.las_repair`. The copies lie beside what is written, and are removed on leaving.
     Without `points` they hold what stands before the points.
     """
     beside = [os.path.dirname(output.path) for output in writers_outputs(stages)][:1]
+    folder = next(filter(os.path.isdir, beside), None)
     with contextlib.ExitStack() as stack:
-        made: list[dict[str, Any]] = []
+        out: list[dict[str, Any]] = []
         for stage in stages:
-            paths = reader_files(stage, las=True)
-            extra = not stage.keys() & {"extra_dims", "ignore_vlr"}
-            asked = str(stage.get("use_eb_vlr", "")).lower() == "true"
-            streams = [corrected(path, extra and (asked or _is_las_14(path))) for path in paths]
+            paths = readers_files([stage], las=True)
+            reads_extra = not stage.keys() & {"extra_dims", "ignore_vlr"}
+            by_request = str(stage.get("use_eb_vlr", "")).lower() == "true"
+            streams = []
+            for path in paths:
+                header = header_there(path)
+                described = by_request or (header is not None and header.minor >= 4)
+                streams.append(corrected(path, reads_extra and described))
             if any(streams):
-                folder = tempfile.TemporaryDirectory(
-                    prefix=".pdal-stages-input-", dir=next(filter(os.path.isdir, beside), None)
-                )
-                most = None if points else LARGEST_HEAD
-                name = _copied(stack.enter_context(folder), paths, streams, most)
+                copies = tempfile.TemporaryDirectory(prefix=".pdal-stages-input-", dir=folder)
+                name = _copy_corrected(stack.enter_context(copies), paths, streams, points)
                 stage = {**stage, "filename": name}
-            made.append(stage)
-        yield made
+            out.append(stage)
+        yield out
 
 
-def _is_las_14(path: str) -> bool:
-    header = read_header(path)
-    return header is not None and header.minor >= 4
-
-
-def _copied(
-    folder: str, paths: list[str], streams: Sequence[BinaryIO | None], most: int | None
+def _copy_corrected(
+    folder: str, paths: list[str], streams: Sequence[Any], with_points: bool
 ) -> str:
-    """Copy corrected files into a folder, with links to the others; return the name or pattern of
-    all of them.
+    """Copy corrected files into a folder, with links to the others; return a pattern of them all.
 
-    Of each file, `most` bytes are copied, and the rest is a hole.
+    Without their points the rest of the files is a hole.
     """
-    names = [os.path.join(folder, f"{n:06}{_suffix(path)}") for n, path in enumerate(paths)]
-    for name, path, stream in zip(names, paths, streams, strict=True):
+    for number, (path, stream) in enumerate(zip(paths, streams, strict=True)):
+        suffix = ".laz" if path.lower().endswith("z") else ".las"
+        name = os.path.join(folder, f"{number:06}{suffix}")
         if stream is None:
             os.symlink(os.path.abspath(path), name)
             continue
         with stream, open(name, "xb") as copy:
-            if most is None:
+            if with_points:
                 shutil.copyfileobj(stream, copy, 1 << 20)
             else:
-                copy.write(stream.read(most))
+                copy.write(stream.read(LARGEST_HEAD))
                 copy.truncate(stream.seek(0, os.SEEK_END))
-    return names[0] if len(names) == 1 else os.path.join(folder, "*")
+    return name if len(paths) == 1 else os.path.join(folder, "*")
 
 
-def _suffix(path: str) -> str:
-    return ".laz" if path.lower().endswith("z") else ".las"
-
-
-#: PDAL puts its log in the place of sys.stdout while it runs and puts back what it found there,
-#: which in two threads is the other's log. It also holds Python still, so runs in threads gain
-#: nothing from each other.
+#: PDAL puts its log in the place of sys.stdout while it runs and restores what it replaced, which
+#: in two threads is the other's log. It also holds Python still, so runs in threads gain nothing
+#: from each other.
 _one_run = threading.RLock()
+_CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
+_FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure (?!\(\d+\) PROJ:).*)")
 
 
 def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execution:
@@ -195,17 +248,13 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
     stdout = sys.stdout
     pipeline = None
     try:
-        pipeline = pdal.Pipeline(json.dumps(adapted(stages)), loglevel=loglevel)
+        pipeline = pdal.Pipeline(json.dumps(for_this_version(stages)), loglevel=loglevel)
         count = pipeline.execute()
         metadata = pipeline.metadata  # text in older python-pdal, a dict in newer
-    except (
-        RuntimeError,
-        ValueError,
-        IndexError,
-        OverflowError,
-    ) as error:  # C++'s errors, as Python has them
-        keep(stdout)
-        if _CUT_POINTS.search(str(error)) and (read := readers_files(stages, las=True)):
+    except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # of C++
+        keep_alive(stdout)
+        read = readers_files(stages, las=True)
+        if read and _CUT_POINTS.search(str(error)):
             raise PipelineError(
                 "the LAS file is damaged: its points cannot be decoded",
                 where=read[0] if len(read) == 1 else "one of " + ", ".join(read),
@@ -220,172 +269,121 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout
     log = _log(pipeline)
-    if failed := _FAILED_WRITER.search(log):  # after which PDAL goes on
-        raise PipelineError("an output file could not be written", found=": ".join(failed.groups()))
+    if failure := _FAILED_WRITER.search(log):  # after which PDAL goes on
+        reason = ": ".join(failure.groups())
+        raise PipelineError("an output file could not be written", found=reason)
     if isinstance(metadata, str):
         with contextlib.suppress(ValueError):
             metadata = json.loads(metadata)
-    found = metadata if isinstance(metadata, dict) else {}
-    return Execution(int(count), found, list(pipeline.arrays) if arrays else [], log)
+    metadata = metadata if isinstance(metadata, dict) else {}
+    return Execution(int(count), metadata, list(pipeline.arrays) if arrays else [], log)
 
 
-_CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
-_FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure (?!\(\d+\) PROJ:).*)")
-BROKEN_REFERENCE = "the spatial reference in the file cannot be read"
-REFERENCE_CURE = 'Name the right one, --readers.las.override_srs=EPSG:CODE (in a pipeline "override_srs" of the reader)'
 #: How PDAL begins a line of its log; some stages say their name once more.
 _BY_PROGRAM = re.compile(
     r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE
 )
-_kept: list[Any] = []
+_kept_alive: dict[int, Any] = {}
 
 
-def keep(stdout: Any) -> None:
-    """Keep a reference to sys.stdout after a script failed: PDAL holds a borrowed one until a run
-    succeeds.
-    """
-    if not any(kept is stdout for kept in _kept):
-        _kept.append(stdout)
+def keep_alive(stdout: Any) -> None:
+    """Keep a sys.stdout after a script failed: PDAL borrows the reference until a run succeeds."""
+    _kept_alive[id(stdout)] = stdout
 
 
 def log_lines(log: str) -> list[str]:
-    """Warnings and errors of a log, once each: ``filters.smrf: ...``."""
+    """Return warnings and errors of a log, once each: ``filters.smrf: ...``."""
     lines = [_BY_PROGRAM.sub(r"\1: ", line.strip()) for line in str(log or "").splitlines()]
-    return list(dict.fromkeys(line for line in lines if line))
+    return list(dict.fromkeys(filter(None, lines)))
 
 
-def stages_of(thing: Any) -> list[dict[str, Any]] | None:
-    """The stages of an object of python-pdal; None where it is not one."""
-    pdal = bindings()
-    stages = thing.stages if isinstance(thing, pdal.Pipeline) else [thing]
-    if not all(isinstance(stage, pdal.pipeline.Stage) for stage in stages):
-        return None
-    return [{"type": stage.type, **stage.options} for stage in stages]
-
-
-def typed(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> list[dict[str, Any]]:
-    """Stages as objects with a type: the name of a file stands for the reader or writer that PDAL
-    infers from it.
-
-    A writer is meant by the last of several stages. PipelineError where PDAL infers none; `where`
-    says where a stage stands.
-    """
-    out = []
-    for number, given in enumerate(stages):
-        stage = dict(given) if isinstance(given, dict) else {"filename": given}
-        if not stage.get("type"):
-            bindings()
-            from pdal import libpdalpython
-
-            name = str(stage.get("filename", ""))
-            kind = "writer" if 0 < number == len(stages) - 1 else "reader"
-            plain = "".join(c if c.isascii() else "_" for c in name)  # that no locale refuses
-            stage["type"] = str(getattr(libpdalpython, f"infer_{kind}_driver")(plain))
-            if not name or not stage["type"]:
-                raise PipelineError(
-                    f"PDAL has no {kind} for a file of this name"
-                    if name
-                    else "a stage has neither a type nor the name of a file",
-                    where=where(number) if where else None,
-                    found=name,
-                    cure="Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "
-                    f'"{kind}s.las"',
-                )
-        out.append(stage)
-    return out
+def _log(pipeline: Any) -> str:
+    """Return the log of PDAL and GDAL, which may quote names that are not UTF-8."""
+    try:
+        return str(getattr(pipeline, "log", "") or "")
+    except UnicodeDecodeError as error:
+        return error.object.decode(errors="backslashreplace")
+    except RuntimeError:  # a pipeline that PDAL could not make has no log
+        return ""
 
 
 def validate(stages: list[dict[str, Any]]) -> None:
     """Let the program `pdal` check stages and their options, without reading points."""
     with readable(stages, points=False) as copies:
-        text = json.dumps({"pipeline": adapted(copies)})
+        text = json.dumps({"pipeline": for_this_version(copies)})
         done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
-    try:
+    output = (done.stderr or done.stdout).strip()
+    verdict = {"valid": done.returncode == 0, "error_detail": output}
+    with contextlib.suppress(ValueError):
         verdict = json.loads(done.stdout)
-    except ValueError:
-        verdict = {
-            "valid": done.returncode == 0,
-            "error_detail": (done.stderr or done.stdout).strip(),
-        }
     if not verdict.get("valid", False):
         raise translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
 
 
+BROKEN_REFERENCE = "the spatial reference in the file cannot be read"
+REFERENCE_CURE = (
+    "Name the right one, --readers.las.override_srs=EPSG:CODE "
+    '(in a pipeline "override_srs" of the reader)'
+)
+
+
 def translate(message: str, before: Sequence[str] = ()) -> PipelineError | DependencyError:
-    """PDAL's error text, and the log lines `before`, as one of our errors, with a cure where the
-    cause is known.
+    """Return PDAL's error text as one of our errors, with a cure where the cause is known.
+
+    `before` are the last lines of the log.
     """
     text = message.strip()
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    # PDAL quotes names of files, which may hold line breaks.
+    one_line = "; ".join([*lines, *before])
     if re.search(r"(create|load|find).*filters\.python", text) or (
         "filters.python" in text and "driver" in text.lower()
     ):
         return DependencyError("PDAL has no filters.python", found=text, cure=_DRIVER_CURE)
     if "ModuleNotFoundError" in text and "pdal_stages" in text:
-        return DependencyError(
-            "the Python that PDAL runs does not have pdal_stages",
-            found=text.splitlines()[-1],
-            cure="Install pdal_stages into the Python that the plugin of filters.python was built "
-            "for",
-        )
+        cure = "Install it into the Python that the plugin of filters.python was built for"
+        what = "the Python that PDAL runs does not have pdal_stages"
+        return DependencyError(what, found=lines[-1], cure=cure)
     if "convert spatial reference" in text:
-        return PipelineError(BROKEN_REFERENCE, found=_one_line(text, before), cure=REFERENCE_CURE)
-    if (
-        "Traceback (most recent call last)" in text
-    ):  # of a script, as the pieces of a list in older PDAL
+        return PipelineError(BROKEN_REFERENCE, found=one_line, cure=REFERENCE_CURE)
+    if "Traceback (most recent call last)" in text:  # of a script; a list in older PDAL
         lines = [line.strip(" '") for line in text.replace("\\n", "\n").splitlines()]
         place = [line for line in lines if line.startswith("File ")][-1:]
         last = [line for line in lines if line][-1]
         return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
-    return PipelineError("PDAL could not run the pipeline", found=_one_line(text, before))
-
-
-def _one_line(text: str, before: Sequence[str]) -> str:
-    """What PDAL says, which quotes names of files that may hold line breaks, and log lines before
-    it.
-    """
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return "; ".join([*lines, *before])
-
-
-def _log(pipeline) -> str:
-    """The log of PDAL and GDAL, which may quote names that are not UTF-8."""
-    try:
-        return str(getattr(pipeline, "log", "") or "")
-    except UnicodeDecodeError as error:
-        return error.object.decode(errors="backslashreplace")
-    except RuntimeError:  # a pipeline that PDAL could not even make has none
-        return ""
+    return PipelineError("PDAL could not run the pipeline", found=one_line)
 
 
 # ---- Ctrl-C while PDAL runs ----------------------------------------------------------------------
 
 # PDAL's plugins crash when KeyboardInterrupt comes up in Python code that PDAL called. So it is
-# raised only inside functions that `catches` marks, which hand it on as an error; otherwise it
-# waits for `check_interrupt`.
+# raised only inside functions that are marked as interruptible, which hand it on as an error;
+# otherwise it waits for `check_interrupt`.
 _Function = TypeVar("_Function", bound=Callable)
-_catching: set[CodeType] = set()
+_interruptible: set[CodeType] = set()
 _handling = False
-_asked = False
+_interrupted = False
 
 
-def catches(function: _Function) -> _Function:
+def interruptible(function: _Function) -> _Function:
     """Mark a function inside which KeyboardInterrupt may be raised, even if PDAL called it."""
-    _catching.add(function.__code__)
+    _interruptible.add(function.__code__)
     return function
 
 
 def check_interrupt() -> None:
-    """Raise KeyboardInterrupt if the user asked to stop."""
-    if _asked:
+    """Raise KeyboardInterrupt if the user pressed Ctrl-C."""
+    if _interrupted:
         raise KeyboardInterrupt
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    global _asked
-    _asked = True
+    """Raise KeyboardInterrupt, unless PDAL runs and no interruptible function does."""
+    global _interrupted
+    _interrupted = True
     inside_pdal = False
     while frame is not None:
-        if frame.f_code in _catching:
+        if frame.f_code in _interruptible:
             raise KeyboardInterrupt
         inside_pdal |= frame.f_code is _execute.__code__
         frame = frame.f_back
@@ -394,28 +392,32 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
-def gentle() -> Iterator[None]:
+def deferred_interrupts() -> Iterator[None]:
     """Handle Ctrl-C this way, and SIGTERM where Python handles it."""
-    global _asked, _handling
+    global _interrupted, _handling
     if _handling or threading.current_thread() is not threading.main_thread():
         yield
         return
     numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if callable(signal.getsignal(n))]
     before = {number: signal.signal(number, _handle) for number in numbers}
-    _handling, _asked = True, False
+    _handling, _interrupted = True, False
     try:
         yield
     finally:
-        _handling = _asked = False
+        _handling = _interrupted = False
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
 # ---- what differs between versions ---------------------------------------------------------------
 
+#: Options of readers.copc that choose points, and those that only make it faster.
+_COPC_OPTIONS = ("bounds", "polygon", "ogr", "resolution", "origin")
+_COPC_TUNING = ("requests", "keep_alive", "header", "query", "vlr", "fix_dims", "srs_vlr_order")
 
-def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Stages that this PDAL knows: before 2.4 a COPC file is read as plain LAZ.
+
+def for_this_version(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return stages that this PDAL knows: before 2.4 a COPC file is read as plain LAZ.
 
     Options that old PDAL reads from uninitialized memory are set where the user does not: the file
     source id of `writers.las` to 0, and the measure dimension of `writers.ogr`, which crashes
@@ -438,12 +440,10 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
                     found=str(stage.get("filename", "")),
                     cure="Use PDAL 2.4 or later, or filters.crop after the reader",
                 )
-            stage = {
-                **{k: v for k, v in stage.items() if k not in _COPC_TUNING},
-                "type": "readers.las",
-            }
+            stage = {k: v for k, v in stage.items() if k not in _COPC_TUNING}
+            stage["type"] = "readers.las"
         else:
-            codes = {geotiff_code(path) for path in reader_files(stage, las=True)}
+            codes = {geotiff_code(path) for path in readers_files([stage], las=True)}
             if len(codes) == 1 and "" not in codes:  # which that PDAL does not look at
                 stage = {"default_srs": codes.pop(), **stage}
         out.append(stage)
@@ -451,23 +451,16 @@ def adapted(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _file_source(writer: dict[str, Any], before: list[dict[str, Any]]) -> int:
-    """The file source id that a writer forwards, 0 where it forwards none: inputs differ, or are of
-    LAS 1.0.
-    """
+    """Return the file source id that a writer forwards; 0 where inputs differ or are LAS 1.0."""
     forward = str(writer.get("forward", ""))
     forwards = any(word in forward for word in ("all", "header", "filesource_id"))
     ids = {source_id(path) for path in readers_files(before, las=True)} if forwards else set()
     return ids.pop() if len(ids) == 1 else 0
 
 
-#: Options of readers.copc that choose points, and those that only make it faster.
-_COPC_OPTIONS = ("bounds", "polygon", "ogr", "resolution", "origin")
-_COPC_TUNING = ("requests", "keep_alive", "header", "query", "vlr", "fix_dims", "srs_vlr_order")
-
-
 @cache
 def las_writer_defaults() -> tuple[int, int]:
-    """(minor_version, dataformat_id) that this PDAL's `writers.las` uses where neither is given."""
+    """Return (minor_version, dataformat_id) that `writers.las` uses where neither is set."""
     described = ask_program("--options", "writers.las")
     minor = re.search(r"minor_version \[(\d+)\]", described)
     format_id = re.search(r"dataformat_id \[(\d+)\]", described)
@@ -475,33 +468,37 @@ def las_writer_defaults() -> tuple[int, int]:
 
 
 def knows_copc() -> bool:
-    """Whether this PDAL reads and writes COPC."""
+    """Return whether this PDAL reads and writes COPC."""
     return version() >= (2, 4, 0)
+
+
+def needs_ground_check() -> bool:
+    """Return whether this PDAL crashes in heights above ground where no point is ground."""
+    return version() < (2, 9, 0)
+
+
+def compresses_las_14() -> bool:
+    """Return whether this PDAL compresses LAS 1.4 with class codes above 31."""
+    return version() >= (2, 3, 0)
 
 
 @cache
 def splits_class_flags() -> bool:
-    """Whether readers give the flags of LAS 1.0-1.3 apart from the class (PDAL 2.2 does not)."""
-    return "Withheld" in {one["name"] for one in bindings().dimensions}
+    """Return whether readers split the flags of LAS 1.0-1.3 from the class (PDAL 2.2 does not)."""
+    return "Withheld" in {dimension["name"] for dimension in bindings().dimensions}
 
 
-def flags_inside_classification(dimensions, metadata: Any) -> bool:
-    """Whether the flag bits of LAS 1.0-1.3 sit inside `Classification`, as PDAL 2.2 reads them.
+def flags_inside_classification(dimensions: Any, metadata: Any) -> bool:
+    """Return whether the flag bits of LAS 1.0-1.3 sit inside `Classification`, as in PDAL 2.2.
 
     Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
     """
-    if any(
-        name in dimensions
-        for name in ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")
-    ):
-        return False
-    formats = _point_formats(metadata)
-    return bool(formats) and max(formats) <= 5
+    flags = ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")
+    return max(_point_formats(metadata), default=6) <= 5 and not any(f in dimensions for f in flags)
 
 
-def overlap_as_flag(dimensions, metadata: Any) -> bool:
-    """Whether class 12 (overlap) of LAS 1.0-1.3 is read as class 0 with the flag Overlap, as PDAL
-    from 2.6 on does.
+def overlap_as_flag(dimensions: Any, metadata: Any) -> bool:
+    """Return whether class 12 (overlap) of LAS 1.0-1.3 is class 0 with the flag Overlap (2.6 on).
 
     Files of LAS 1.4 have both the class and the flag: there class 0 with the flag is a point not
     yet classified.
@@ -515,31 +512,29 @@ def _point_formats(metadata: Any) -> list[int]:
 
 
 def overwritten_dimensions(metadata: Any) -> list[str]:
-    """Names of dimensions that a reader has overwritten with extra bytes, from metadata as
-    filters.python has it.
+    """Return the dimensions that a reader has overwritten with extra bytes.
+
+    `metadata` is a node, as filters.python has it.
     """
     nodes = metadata.get("children", []) if isinstance(metadata, dict) else []
-    own = {node["name"]: node["value"] for node in nodes if isinstance(node, dict)}
-    found = [name for node in nodes for name in overwritten_dimensions(node)]
-    for node in nodes if str(own.get("dataformat_id", "")).isdigit() else ():
+    values = {node["name"]: node["value"] for node in nodes if isinstance(node, dict)}
+    names = [name for node in nodes for name in overwritten_dimensions(node)]
+    for node in nodes if str(values.get("dataformat_id", "")).isdigit() else ():
         record = {child["name"]: child["value"] for child in node.get("children", [])}
         if (record.get("user_id"), str(record.get("record_id"))) == ("LASF_Spec", "4"):
             data = base64.b64decode(record.get("data", ""))
-            found += overwritten(int(own["dataformat_id"]), data)
-    return found
+            names += overwritten(int(values["dataformat_id"]), data)
+    return names
 
 
 def _values(node: Any, name: str) -> list[Any]:
-    """All values of a name in metadata, as filters.python hands them over (nodes) or a pipeline
-    gives them (a dict).
-    """
+    """Return all values of a name in metadata: nodes in filters.python, a dict in a pipeline."""
     if isinstance(node, list):
         return [value for child in node for value in _values(child, name)]
     if not isinstance(node, dict):
         return []
-    own = [node.get("value")] if node.get("name") == name else []
+    values = [node.get("value")] if node.get("name") == name else []
     for key, child in node.items():
-        own += (
-            [child] if key == name and not isinstance(child, dict | list) else _values(child, name)
-        )
-    return own
+        is_value = key == name and not isinstance(child, dict | list)
+        values += [child] if is_value else _values(child, name)
+    return values

@@ -39,14 +39,13 @@ class _Family:
                 options["merge"], merge = merge, True
             # Points of several readers must see each other; of one reader merging costs nothing.
             wired = {"inputs": options["inputs"]} if merge and "inputs" in options else {}
-            own = {name: value for name, value in options.items() if name not in wired}
-            expanded = expand_stage({"type": kind.type, **own})
+            unwired = {name: value for name, value in options.items() if name not in wired}
+            expanded = expand_stage({"type": kind.type, **unwired})
             runtime.remember_stdout()
-            stages = [*([{"type": "filters.merge", **wired}] if merge else []), expanded.plain]
-            shown = (
-                f"{kind.type}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
-            )
-            joined = _joined(stages, shown, expanded)
+            merging = [{"type": "filters.merge", **wired}] if merge else []
+            values = ", ".join(f"{key}={value!r}" for key, value in options.items())
+            shown = f"{kind.type}({values})"
+            joined = _joined([*merging, expanded.plain], shown, expanded)
             joined.type, joined.tag = kind.type, options.get("tag")
             joined.options = {"type": kind.type, **options}
             return joined
@@ -62,20 +61,18 @@ class _Family:
 
 
 def _signature(kind: type[Stage]) -> inspect.Signature:
-    """The required option first, by place or by name; the others by name, with their defaults."""
+    """Return a stage's parameters: required options by place or name, others by name."""
+    make = inspect.Parameter
     needed = [option.name for option in kind.all_options() if option.required]
     defaults = {option.name: option.default for option in kind.all_options() if not option.required}
     by_name = {"tag": None, "inputs": None, "merge": True} | defaults
-    return inspect.Signature(
-        [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in needed]
-        + [
-            inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d)
-            for n, d in by_name.items()
-        ]
-    )
+    parameters = [make(name, make.POSITIONAL_OR_KEYWORD) for name in needed]
+    parameters += [make(n, make.KEYWORD_ONLY, default=d) for n, d in by_name.items()]
+    return inspect.Signature(parameters)
 
 
 def _help(kind: type[Stage]) -> str:
+    """Return a stage's docstring in Python."""
     lines = [f"{kind.summary}.", "", "Parameters", "----------"]
     for option in kind.all_options():
         lines += [f"{option.name} : {option.kind}", f"    {option.help}"]
@@ -89,8 +86,9 @@ def _help(kind: type[Stage]) -> str:
 
 
 def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.ExpandedStage):
-    """The filters that PDAL runs as one object, which joins others by ``|``; `made_from` is kept as
-    long as they are.
+    """Return the filters that PDAL runs as one object, which joins others by ``|``.
+
+    `made_from` is kept as long as they are.
     """
     pdal = pdal_env.bindings()
 
@@ -114,12 +112,12 @@ def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.Expande
         def __repr__(self) -> str:
             return shown
 
-    made = Filter()
+    joined = Filter()
     for stage in stages:
-        one = Step(**stage)
-        one.made_from = made_from
-        made |= one
-    return made
+        step = Step(**stage)
+        step.made_from = made_from
+        joined |= step
+    return joined
 
 
 #: ``Filter.hag_minima(...)``, ``Filter.multiscalefeatures(...)``, ``Filter.modelclassifier(...)``,

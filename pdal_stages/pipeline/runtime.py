@@ -1,7 +1,7 @@
-"""Running an expanded stage inside PDAL: from ``filters.python``'s globals to a stage's run().
+"""Run an expanded stage inside PDAL: from ``filters.python``'s globals to a stage's run().
 
-The script that PDAL executes is a few lines that call :func:`run_stage`; everything else
-lives here, in the installed package, where compiled code can be cached.
+The script that PDAL executes is a few lines that call :func:`run_stage`; everything else lives
+here, in the installed package, where compiled code can be cached.
 
 No exception may reach ``filters.python``: it releases the exception, its type and its traceback
 twice, and Python dies of it then or minutes later. A stage that fails therefore returns normally
@@ -34,14 +34,14 @@ from . import pdal as pdal_env
 
 @dataclass(eq=False)
 class ExpandedStage:
-    """One of our stages after expanding, and what came of its last run in this process."""
+    """One of our stages after expanding, and the results of its last run in this process."""
 
     stage: Stage
-    number: int  #: its index in the given list
-    index: int  #: its index in the expanded list
-    given: dict[str, Any]  #: the stage as it was written
+    number: int  #: its index in the pipeline as written
+    index: int  #: its index in the expanded pipeline
+    as_written: dict[str, Any]  #: its object in the pipeline
     plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
-    context: StageContext = WHOLE_CLOUD  #: what its runs are told
+    context: StageContext = WHOLE_CLOUD  #: of its runs
     reports: list[Report] = field(default_factory=list)  #: one per point view
     failure: StageError | None = None
 
@@ -73,19 +73,20 @@ def stage(ins, outs):
     return run_stage(globals(), ins, outs)
 """
 
-#: Around a stage's message in the name of the array that PDAL refuses.
-_OPENING, _CLOSING = "of a stage that failed:\n\n", "\n\n"
+#: Before and after a stage's message in the name of the array that PDAL refuses.
+_OPENING = "of a stage that failed:\n\n"
+_CLOSING = "\n\n"
 
 _usual_stdout: Any = sys.__stdout__
 #: Stages and callbacks of this process by label, as long as someone holds them; in another process
 #: options are parsed again.
-made: WeakValueDictionary[str, ExpandedStage | Callback] = WeakValueDictionary()
+BY_LABEL: WeakValueDictionary[str, ExpandedStage | Callback] = WeakValueDictionary()
 
 
 def python_filter(
     label: str, source: str, arguments: dict[str, Any], adds: Mapping[str, str]
 ) -> dict[str, Any]:
-    """A ``filters.python`` that runs `source` and adds dimensions (name -> PDAL type)."""
+    """Return a ``filters.python`` that runs `source` and adds dimensions (name -> PDAL type)."""
     return {
         "type": "filters.python",
         "module": label,
@@ -97,8 +98,7 @@ def python_filter(
 
 
 def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
-    """Run an expanded stage, or several together, on one point view; True, also where one failed
-    (see above).
+    """Run an expanded stage, or several together, on one point view; always True (see above).
 
     Parameters
     ----------
@@ -108,8 +108,7 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     ins, outs : dict
         PDAL's dimensions, and the ones to write back.
     """
-    asked = module["pdalargs"]
-    several = asked.get("stages", [asked])
+    several = module["pdalargs"].get("stages", [module["pdalargs"]])
     for arguments in several:
         label = str(arguments.get("label", ""))
         # PDAL's module object stays alive; the register need not grow.
@@ -117,42 +116,48 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         # Only the last may give memory of PDAL's arrays back, which it does with those of a dict.
         seen = {**ins, **outs} if arguments is several[-1] else ChainMap(outs, cast(dict, ins))
         try:
-            _run_one(arguments, label, module, seen, outs)
+            _run_interruptible(arguments, label, module, seen, outs)
         except BaseException as error:
             where = place(arguments.get("stage", "filters.python"), arguments.get("tag"))
             failure = as_stage_error(error, where)
-            if held := made.get(label):
+            if held := BY_LABEL.get(label):
                 held.failure = failure
             outs.clear()
             outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
-            if (
-                _redirected()
-            ):  # PDAL puts it back only after a run that succeeds, and its log is gone by now
+            if _redirected():  # PDAL restores it only after a run that succeeds
                 sys.stdout = _usual_stdout
-                pdal_env.keep(_usual_stdout)
+                pdal_env.keep_alive(_usual_stdout)
             break
     return True
 
 
-@pdal_env.catches
-def _run_one(
+@pdal_env.interruptible
+def _run_interruptible(
     arguments: Mapping[str, Any],
     label: str,
     module: dict[str, Any],
     ins: Mapping[str, Any],
     outs: dict[str, Any],
 ) -> None:
-    """Run a stage or a function on one view. What it raises may be anything, Ctrl-C too."""
+    """Run a stage or a function on one view; any exception may come out, Ctrl-C too."""
     pdal_env.check_interrupt()
-    held = made.get(label)
+    held = BY_LABEL.get(label)
     if isinstance(held, Callback):
         held.function(module, ins, outs)
         return
-    stage, context = (held.stage, held.context) if held else _made_again(arguments)
+    stage, context = (held.stage, held.context) if held else _from_arguments(arguments)
     report = run_on_view(stage, context, module, ins, outs)
     module["out_metadata"] = node(arguments["stage"], leaves(report))
     if held:
         held.reports.append(report)
+
+
+def _from_arguments(arguments: Mapping[str, Any]) -> tuple[Stage, StageContext]:
+    """Return the stage of a pipeline that another process expanded."""
+    named = {"type": arguments["stage"], "tag": arguments.get("tag")}
+    stage = stage_from({**arguments.get("options", {}), **named})
+    context = StageContext(arguments.get("created_before", False))
+    return stage.after(arguments.get("preparation", ())), context
 
 
 def points_of(
@@ -162,7 +167,7 @@ def points_of(
     ins: Mapping[str, Any],
     lent_by_pdal: Set[str] = frozenset(),
 ) -> Points:
-    """The points of a view, as a stage sees them, from what PDAL sets in a script's globals."""
+    """Return the points of a view, as a stage sees them; `module` are the script's globals."""
     metadata = module.get("metadata")
     return stage.points(
         ins,
@@ -175,28 +180,17 @@ def points_of(
 
 
 def points_of_views(
-    arrays: Sequence[np.ndarray], metadata: dict[str, Any], made: Callable[..., Points] = Points
+    arrays: Sequence[np.ndarray], metadata: dict[str, Any], make: Callable[..., Points] = Points
 ) -> Points:
-    """The points of all views that a pipeline gave, with PDAL's metadata of it, as a stage's
-    `points` makes them.
+    """Return the points of all views that a pipeline gave, with the pipeline's metadata.
+
+    `make` is :class:`Points` or a stage's method `points`.
     """
     arrays = [array for array in arrays if len(array)] or list(arrays[:1])
     names = arrays[0].dtype.names or () if arrays else ()
     columns = {name: np.concatenate([array[name] for array in arrays]) for name in names}
-    wkt = wkt_of(reader_metadata(metadata))
-    return made(
-        columns, wkt=wkt, legacy_flags=pdal_env.flags_inside_classification(names, metadata)
-    )
-
-
-def _made_again(arguments: Mapping[str, Any]) -> tuple[Stage, StageContext]:
-    """Return the stage of an expanded pipeline, in another process than the one that expanded
-    it.
-    """
-    named = {"type": arguments["stage"], "tag": arguments.get("tag")}
-    stage = stage_from({**arguments.get("options", {}), **named})
-    created_before = arguments.get("created_before", False)
-    return stage.after(arguments.get("preparation", ())), StageContext(created_before)
+    flags = pdal_env.flags_inside_classification(names, metadata)
+    return make(columns, wkt=wkt_of(reader_metadata(metadata)), legacy_flags=flags)
 
 
 def run_on_view(
@@ -206,8 +200,15 @@ def run_on_view(
     ins: Mapping[str, Any],
     outs: dict[str, Any],
 ) -> Report:
-    """Run a stage on one view; its report."""
-    _refuse_overwritten(module.get("metadata"))
+    """Run a stage on one view; return its report."""
+    if titles := pdal_env.overwritten_dimensions(module.get("metadata")):
+        raise StageError(
+            "extra bytes are named like dimensions of LAS, so PDAL has overwritten these",
+            found=", ".join(titles),
+            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under "
+            'other names; or name them all yourself: readers.las with "ignore_vlr": '
+            '"LASF_Spec/4" and "extra_dims": "Name=type,..."',
+        )
     lent = ins.keys() - outs.keys() if isinstance(ins, dict) else frozenset()
     points = points_of(stage, context, module, ins, lent)
     for name in stage.reads():
@@ -216,9 +217,8 @@ def run_on_view(
     if not points.count:
         return run_on_nothing(stage)
     for name, values in stage.run(points, context).items():
-        target = ins[name].dtype
         # PDAL copies raw memory: exactly this type, contiguous, one value per point.
-        array = np.ascontiguousarray(values, dtype=target)
+        array = np.ascontiguousarray(values, dtype=ins[name].dtype)
         if array.shape != (points.count,):
             raise StageError(
                 f"internal: '{name}' has {array.shape} values for {points.count} points"
@@ -227,24 +227,8 @@ def run_on_view(
     return points.report
 
 
-def _refuse_overwritten(metadata: Any) -> None:
-    """Refuse points whose dimensions PDAL has overwritten with extra bytes, which it does unless we
-    run it.
-    """
-    titles = pdal_env.overwritten_dimensions(metadata)
-    if titles:
-        raise StageError(
-            "extra bytes are named like dimensions of LAS, so PDAL has overwritten these",
-            found=", ".join(titles),
-            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under "
-            "other names; or name "
-            'them all yourself: readers.las with "ignore_vlr": "LASF_Spec/4" and "extra_dims": '
-            '"Name=type,..."',
-        )
-
-
 def run_on_nothing(stage: Stage) -> Report:
-    """A stage's report on no points at all."""
+    """Return a stage's report on no points at all; StageError where it needs some."""
     if stage.needs_points:
         raise StageError(
             f"there are no points to {stage.needs_points}",
@@ -255,7 +239,7 @@ def run_on_nothing(stage: Stage) -> Report:
 
 
 def as_stage_error(error: BaseException, where: str) -> StageError:
-    """Any exception of a stage as one of our errors."""
+    """Return any exception of a stage as one of our errors."""
     if isinstance(error, StageError):
         return error.at(where)
     if isinstance(error, MemoryError):
@@ -269,9 +253,7 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
     return failure
 
 
-def _encodable(text: str) -> str:
-    """Text that PDAL can take: valid UTF-8 without NUL."""
-    return text.encode("utf-8", "replace").decode().replace("\0", "?")
+# ---- PDAL's metadata -----------------------------------------------------------------------------
 
 
 def reader_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
@@ -282,7 +264,7 @@ def reader_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def wkt_of(reference: Any) -> str:
-    """The well-known text in PDAL's description of a spatial reference."""
+    """Return the well-known text in PDAL's description of a spatial reference."""
     srs = reference.get("srs", reference) if isinstance(reference, dict) else None
     if not isinstance(srs, dict):
         return ""
@@ -292,32 +274,35 @@ def wkt_of(reference: Any) -> str:
 def node(
     name: str, children: list[dict[str, Any]], value: str = "", kind: str = ""
 ) -> dict[str, Any]:
-    """A node of PDAL's metadata, as a script gives it."""
+    """Return a node of PDAL's metadata, as a script sets it."""
     return {"name": name, "value": value, "type": kind, "description": "", "children": children}
 
 
 def leaves(report: Report) -> list[dict[str, Any]]:
-    """A report as nodes of PDAL's metadata: every value as text, with its type."""
+    """Return a report as nodes of PDAL's metadata."""
     return [leaf(key, value) for key, value in report.to_dict().items() if value is not None]
 
 
 def leaf(name: str, value: Any) -> dict[str, Any]:
-    """One value as a node of PDAL's metadata."""
-    if isinstance(value, bool):
-        text, kind = str(value).lower(), "boolean"
-    elif isinstance(value, int | np.integer):
-        text, kind = str(int(value)), "integer"
-    elif isinstance(value, float | np.floating):
-        text, kind = repr(float(value)), "double"
-    elif isinstance(value, str):
-        text, kind = value, "string"
-    else:
-        text, kind = json.dumps(value, default=str), "json"
-    return node(name, [], _encodable(text), kind)
+    """Return one value as a node of PDAL's metadata: its text and type."""
+    if isinstance(value, str):
+        return node(name, [], _encodable(value), "string")
+    text = json.dumps(value, default=lambda v: v.item() if isinstance(v, np.generic) else str(v))
+    kind = "integer" if isinstance(value, int | np.integer) else "json"
+    kind = "double" if isinstance(value, float | np.floating) else kind
+    return node(name, [], _encodable(text), "boolean" if isinstance(value, bool) else kind)
+
+
+def _encodable(text: str) -> str:
+    """Return a text that PDAL can take: valid UTF-8 without NUL."""
+    return text.encode("utf-8", "replace").decode().replace("\0", "?")
+
+
+# ---- standard output -----------------------------------------------------------------------------
 
 
 def remember_stdout() -> None:
-    """Keep this process's ``sys.stdout``, to be put back if a stage fails."""
+    """Keep this process's ``sys.stdout``, to be restored if a stage fails."""
     global _usual_stdout
     if not _redirected():
         _usual_stdout = sys.stdout
@@ -330,7 +315,7 @@ def _redirected() -> bool:
 remember_stdout()
 
 
-# ---- functions of this process as filters, which PDAL calls between stages ---------------------------
+# ---- functions of this process as filters, which PDAL calls between stages -----------------------
 
 
 class Callbacks:
@@ -340,21 +325,20 @@ class Callbacks:
         self._held: list[Callback] = []
 
     def filter(
-        self, function: Function, adds: Mapping[str, str] | None = None, **own: Any
+        self, function: Function, adds: Mapping[str, str] | None = None, **wiring: Any
     ) -> dict[str, Any]:
-        """A ``filters.python`` that calls a function and adds dimensions (name -> PDAL type);
-        `own`: its tag, inputs.
+        """Return a ``filters.python`` that calls a function and adds dimensions.
+
+        `adds` maps their names to PDAL's types; `wiring` are the filter's tag and inputs.
         """
         label = f"pdal_stages_callback_{uuid.uuid4().hex}"
         self._held.append(callback := Callback(function))
-        made[label] = callback
-        return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **own}
+        BY_LABEL[label] = callback
+        return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **wiring}
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """The stages, with a check before each one that crashes old PDAL where no point is
-        ground.
-        """
-        if pdal_env.version() >= (2, 9, 0):
+        """Return the stages, with a check before those that crash old PDAL without ground."""
+        if not pdal_env.needs_ground_check():
             return list(stages)
         out: list[dict[str, Any]] = []
         for stage in stages:
@@ -370,15 +354,16 @@ class Callbacks:
 def _check_ground(
     where: str, module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
 ) -> None:
+    """Refuse points of which none has class 2."""
     codes = ins.get("Classification")
     # As PDAL counts: flags inside the class make another class of it. No points at all do no harm.
     if codes is None or not len(codes) or (np.asarray(codes) == 2).any():
         return
+    classes = ", ".join(map(str, np.unique(codes)[:10].tolist()))
     raise StageError(
         "no ground was found: none of the points has class 2",
         where=where,
-        found=f"{len(codes)} points of class {', '.join(map(str, np.unique(codes)[:10].tolist()))}",
+        found=f"{len(codes)} points of class {classes}",
         cure="Classify ground first, with filters.smrf or filters.csf, or use "
-        "filters.hag_morphological, which needs no "
-        "classes",
+        "filters.hag_morphological, which needs no classes",
     )

@@ -1,6 +1,4 @@
-"""Spatial references of several inputs, which must be the same: PDAL merges meters and feet as they
-are.
-"""
+"""Spatial references of inputs, which must be the same: PDAL merges meters and feet as they are."""
 
 from __future__ import annotations
 
@@ -11,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..base.errors import PipelineError, StageError
-from ..base.las import header_there, named_las, projection, read_header
+from ..base.las import header_there, named_las, projection
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from . import pdal as pdal_env
+from .inputs_outputs import readers_files
 from .runtime import reader_metadata, wkt_of
-from .stage_files import reader_files
 
 #: Stages that may bring points into one reference.
 MOVING = (
@@ -37,9 +35,7 @@ class Reference:
     """The spatial reference of an input."""
 
     units: Units
-    plane: frozenset[str] = (
-        frozenset()
-    )  #: the projection's parameters; empty where they are not known
+    plane: frozenset[str] = frozenset()  #: the projection's parameters; empty where not known
     height: str = ""  #: the authority's code of the heights' system, where it is known
     name: str = ""
     wkt: str = ""  #: of the whole system, with the heights' where the file names one
@@ -53,27 +49,22 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str 
     """
     # Without extra bytes: of a file with odd ones, all of it would be copied for a single point.
     plain = {"ignore_vlr": "LASF_Spec/4"} if reader["type"] == "readers.las" else {}
+    path = str(reader["filename"])
     run = pdal_env.execute([plain | dict(reader)], arrays=False)
     srs = reader_metadata(run.metadata).get("srs", {})
     wkt = wkt_of(srs)
     if not wkt and "GDAL failure" in run.log:
-        raise PipelineError(
-            pdal_env.BROKEN_REFERENCE,
-            where=str(reader["filename"]),
-            found=pdal_env.log_lines(run.log)[-1],
-            cure=pdal_env.REFERENCE_CURE,
-        )
+        reason, cure = pdal_env.log_lines(run.log)[-1], pdal_env.REFERENCE_CURE
+        raise PipelineError(pdal_env.BROKEN_REFERENCE, where=path, found=reason, cure=cure)
+    header = header_there(path)
+    count, box = (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
+    middle = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2) if count else None
     try:
-        header = header_there(str(reader["filename"]))
-        count, (x0, y0, x1, y1) = (
-            (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
-        )
-        middle = ((x0 + x1) / 2, (y0 + y1) / 2) if count else None
         units = units_of_wkt(wkt, horizontal=horizontal, vertical=vertical, place=middle)
         if units.assumed:
-            refuse_likely_degrees(count, x0, y0, x1, y1)
+            refuse_likely_degrees(count, *box)
     except StageError as error:
-        raise error.at(str(reader["filename"])) from None
+        raise error.at(path) from None
     words = str(srs.get("proj4") or "").split()
     plane = frozenset(w for w in words if w not in _ALIKE and not _ASIDE.match(w))
     root = parse_wkt(wkt)
@@ -82,8 +73,7 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str 
 
 
 def plane_unit(stages: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any]) -> float | None:
-    """Return the unit of x and y, in meters, that a pipeline's readers give its writers; None where
-    that is not known.
+    """Return the unit of x and y, in meters, that readers give to writers; None if not known.
 
     `metadata` is PDAL's, of the run.
     """
@@ -97,70 +87,63 @@ def plane_unit(stages: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any])
 
 def reference_of_file(path: str, horizontal: str = "", vertical: str = "") -> Reference:
     """Return the reference of a file; see :func:`reference_of`."""
-    las = (
-        {"type": "readers.las", "count": 1}
-        if named_las(path) and read_header(path) is not None
-        else {}
-    )
-    return reference_of(pdal_env.typed([{"filename": path, **las}])[0], horizontal, vertical)
+    las = named_las(path) and header_there(path) is not None
+    one_point = {"type": "readers.las", "count": 1} if las else {}
+    reader = pdal_env.with_types([{"filename": path, **one_point}])[0]
+    return reference_of(reader, horizontal, vertical)
 
 
-def check_one_reference(found: Mapping[str, Reference]) -> list[str]:
-    """Refuse inputs, by path, with different units or reference systems; where one has none, only
-    units are compared.
+def check_one_reference(references: Mapping[str, Reference]) -> list[str]:
+    """Refuse inputs, by path, with different units or reference systems.
 
-    Returns messages: which inputs have no reference, while others have one.
+    Where one has no reference, only units are compared. Return messages: which inputs have no
+    reference, while others have one.
     """
-    units: dict[object, str] = {}
-    planes: dict[object, str] = {}
-    heights: dict[object, str] = {}
-    for path, one in found.items():
-        across, upward = one.units.horizontal, one.units.vertical
-        assumed = ", as there is no spatial reference" if one.units.assumed else ""
-        units.setdefault(
-            (across, upward), f"{across:g} m across and {upward:g} m upward in {path}{assumed}"
-        )
-        for kinds, said in ((planes, one.plane), (heights, one.height)):
-            if said:
-                kinds.setdefault(said, f"{one.name} in {path}")
-    of_kind = {
-        "units of length": units,
-        "reference systems": planes,
-        "reference systems of heights": heights,
+    kinds: dict[str, dict[object, str]] = {
+        "units of length": {},
+        "reference systems": {},
+        "reference systems of heights": {},
     }
-    for what, kinds in of_kind.items():
-        if len(kinds) > 1:
+    for path, reference in references.items():
+        across, upward = reference.units.horizontal, reference.units.vertical
+        assumed = ", as there is no spatial reference" if reference.units.assumed else ""
+        text = f"{across:g} m across and {upward:g} m upward in {path}{assumed}"
+        named = f"{reference.name} in {path}"
+        values = ((across, upward), text), (reference.plane, named), (reference.height, named)
+        for inputs, (value, shown) in zip(kinds.values(), values, strict=True):
+            if value:
+                inputs.setdefault(value, shown)
+    for what, inputs in kinds.items():
+        if len(inputs) > 1:
             raise StageError(
                 f"the inputs have different {what}",
-                found="; ".join(kinds.values()),
+                found="; ".join(inputs.values()),
                 cure="Give them one spatial reference first: pdal translate IN OUT reprojection "
                 "--filters.reprojection.out_srs=EPSG:CODE",
             )
-    paths = [path for path, one in found.items() if not one.name]
-    if not paths or len(paths) == len(found):
+    paths = [path for path, reference in references.items() if not reference.name]
+    if not paths or len(paths) == len(references):
         return []
-    named = ", ".join(paths[:3]) + (f" and {len(paths) - 3:,} more" if len(paths) > 3 else "")
+    listed = ", ".join(paths[:3]) + (f" and {len(paths) - 3:,} more" if len(paths) > 3 else "")
     has, taken = ("has", "it is") if len(paths) == 1 else ("have", "they are")
-    return [f"{named} {has} {NO_REFERENCE} {taken} assumed to have that of the other inputs"]
+    return [f"{listed} {has} {NO_REFERENCE} {taken} assumed to have that of the other inputs"]
 
 
 def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:
-    """Refuse a pipeline whose LAS readers read different references, unless a stage moves points;
-    returns messages.
+    """Refuse a pipeline whose LAS readers read different references; return messages.
+
+    Not where a stage moves points.
     """
     if any(stage["type"] in MOVING for stage in stages):
         return []
-    readers: dict[str, tuple[str, dict[str, Any]]] = {}
+    kinds: dict[str, dict[str, Any]] = {}  # PDAL is asked once for equal references
+    kind_of: dict[str, str] = {}
     for stage in stages:
         options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}
-        for path in reader_files(stage, las=True):
-            readers[path] = (
-                f"{projection(path)} {options}",
-                {**options, "filename": path, "count": 1},
-            )
-    kinds = dict(readers.values())
+        for path in readers_files([stage], las=True):
+            kind_of[path] = f"{projection(path)} {options}"
+            kinds[kind_of[path]] = {**options, "filename": path, "count": 1}
     if len(kinds) < 2:
         return []
     of_kind = {kind: reference_of(reader, horizontal) for kind, reader in kinds.items()}
-    found = {path: of_kind[kind] for path, (kind, _) in readers.items()}
-    return check_one_reference(found)
+    return check_one_reference({path: of_kind[kind] for path, kind in kind_of.items()})

@@ -1,6 +1,4 @@
-"""Worker processes on this machine: pools of one process each, so that one can die without the
-others.
-"""
+"""Worker processes on this machine: pools of one process each, so that one can die alone."""
 
 from __future__ import annotations
 
@@ -26,12 +24,12 @@ from ..base.files import NO_ROOM
 from ..base.messages import PlainStream
 from ..base.progress import Progress
 from ..base.threads import CORES, available_threads
-from .pdal import check_interrupt, gentle
+from .pdal import check_interrupt, deferred_interrupts
 
 #: The reason where a worker died.
 KILLED = "its worker process died: too little memory, or a crash in a library"
 #: One task at a time in a process: PDAL's threads are ours, and memory is stated for one.
-_one = threading.Lock()
+_one_task = threading.Lock()
 
 
 @dataclass
@@ -44,23 +42,23 @@ class TaskResult:
     cost: dict[str, float] = field(default_factory=dict)
 
 
-def perform(task: Callable[[], Any]) -> TaskResult:
-    """Call a task; errors are part of the answer, except Ctrl-C."""
-    with _one:
+def perform_task(task: Callable[[], Any]) -> TaskResult:
+    """Call a task; errors are part of the result, except Ctrl-C."""
+    with _one_task:
         started, cpu = time.perf_counter(), time.process_time()
-        answer = TaskResult()
+        out = TaskResult()
         try:
-            answer.result = task()
+            out.result = task()
         except InterruptedStage:
             raise KeyboardInterrupt from None
         except Exception as error:
-            answer.reason = _reason(error)
-        answer.cost = {
+            out.reason = _reason(error)
+        out.cost = {
             "seconds": time.perf_counter() - started,
             "cpu_seconds": time.process_time() - cpu,
             "peak_mb": _peak(),
         }
-        return answer
+        return out
 
 
 def _reason(error: Exception) -> str:
@@ -69,13 +67,13 @@ def _reason(error: Exception) -> str:
     if isinstance(error, MemoryError):
         return "memory ran out. Take smaller tiles or fewer workers"
     if getattr(error, "errno", None) in NO_ROOM:
-        return f"a temporary file beside the outputs could not be written ({error}). Make room on the disk"
+        return f"a temporary file could not be written ({error}). Make room on the disk"
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
 
 
 def _peak() -> float:
-    """The most memory this process has held, megabytes."""
+    """Return the most memory that this process has held, in megabytes."""
     try:
         import resource
     except ImportError:  # Windows
@@ -92,24 +90,26 @@ class ThisProcess(AbstractContextManager):
     def __init__(self, threads: int) -> None:
         self.threads = threads
 
-    def __exit__(self, *exc: object) -> None: ...
+    def __exit__(self, *exc: object) -> None:
+        """Leave the process as it is."""
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Do a task at once."""
         future: Future = Future()
-        with gentle():
-            future.set_result(perform(task))
+        with deferred_interrupts():
+            future.set_result(perform_task(task))
             check_interrupt()
         return future
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """All of them."""
+        """Return all of them."""
         return set(futures)
 
 
 class WorkerProcesses(AbstractContextManager):
-    """Tasks in processes of their own, one at a time in each; they end with this process, however
-    that ends.
+    """Tasks in processes of their own, one at a time in each.
+
+    They end with this process, however that ends.
     """
 
     def __init__(self, slots: int, threads: int) -> None:
@@ -118,6 +118,7 @@ class WorkerProcesses(AbstractContextManager):
         self._busy: dict[Future, ProcessPoolExecutor] = {}
 
     def __exit__(self, *exc: object) -> None:
+        """End the processes."""
         for pool in [*self._idle, *self._busy.values()]:
             for process in list((pool._processes or {}).values()):
                 process.kill()
@@ -129,7 +130,7 @@ class WorkerProcesses(AbstractContextManager):
         """Send a task to a free worker."""
         if self._idle:
             pool = self._idle.pop()
-            future = pool.submit(perform, task)
+            future = pool.submit(perform_task, task)
         else:
             with _environment(self.threads):
                 try:
@@ -139,12 +140,12 @@ class WorkerProcesses(AbstractContextManager):
                     raise StageError(
                         "worker processes cannot be started", found=error, cure=cure
                     ) from None
-                future = pool.submit(perform, task)
+                future = pool.submit(perform_task, task)
         self._busy[future] = pool
         return future
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """Those that are done, at least one."""
+        """Wait for at least one; return those that are done."""
         done = wait(list(futures), return_when=FIRST_COMPLETED).done
         for future in done:
             pool = self._busy.pop(future)
@@ -157,19 +158,17 @@ class WorkerProcesses(AbstractContextManager):
 
 
 def _stop_sending(pool: Any) -> None:
-    """Let go of a large task that a dead worker did not read; Python before 3.11.5 would wait for
-    it (gh-94777).
+    """Drop a large task that a dead worker did not read.
+
+    Python before 3.11.5 would wait for it (gh-94777).
     """
     if sys.version_info < (3, 11, 5):
-        with (
-            suppress(OSError),
-            open(os.devnull) as nothing,
-        ):  # the pool's own thread closes the reader
+        with suppress(OSError), open(os.devnull) as nothing:  # the pool's thread closes the reader
             os.dup2(nothing.fileno(), pool._call_queue._reader.fileno())
 
 
 def _begin() -> None:
-    """First in a worker."""
+    """Set up a worker process."""
     os.dup2(2, 1)  # what libraries print is no result of the command
     sys.stdout, sys.stderr = PlainStream(sys.stdout), PlainStream(sys.stderr)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -184,10 +183,10 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """The environment of a process started meanwhile: its share of the cores, no modules of the
-    current folder, no Ctrl-C.
+    """Set the environment for a process that is started meanwhile.
 
-    The program is not imported in it, so a script needs no ``if __name__ == "__main__"``.
+    It gets its share of the cores, no modules of the current folder, and no Ctrl-C. The program is
+    not imported in it, so a script needs no ``if __name__ == "__main__"``.
     """
     names = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES]
     wanted = dict.fromkeys(names, str(threads)) | {
@@ -215,22 +214,22 @@ def _environment(threads: int) -> Iterator[None]:
 def run_tasks(
     workers: Any, waiting: deque, task_of: Callable[[Any], Callable[[], Any]]
 ) -> Iterator[tuple[Any, TaskResult]]:
-    """Yield (item, answer) for every waiting item, as they finish; items may be added after every
-    answer.
+    """Yield (item, result) for every waiting item, as they finish.
 
-    `workers` have slots, submit and wait; `task_of` is called for an item's task just before it is
-    sent.
+    Items may be added after every result. `workers` have slots, submit and wait; `task_of` is
+    called for an item's task just before it is sent.
     """
-    out: dict[Any, Any] = {}
-    while waiting or out:
-        while waiting and len(out) < workers.slots:
+    running: dict[Any, Any] = {}
+    while waiting or running:
+        while waiting and len(running) < workers.slots:
             item = waiting.popleft()
-            out[workers.submit(task_of(item))] = item
-        for future in workers.wait(out):
-            yield out.pop(future), _answer(future)
+            running[workers.submit(task_of(item))] = item
+        for future in workers.wait(running):
+            yield running.pop(future), _result_of(future)
 
 
-def _answer(future: Any) -> TaskResult:
+def _result_of(future: Any) -> TaskResult:
+    """Return the result of a task that is done, or why there is none."""
     error = future.exception()
     if error is None:
         return future.result()
@@ -242,7 +241,7 @@ def _answer(future: Any) -> TaskResult:
 def each_file(
     function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
 ) -> Iterator[Any]:
-    """The result for each item of work, the function's arguments, as they finish.
+    """Yield the result for each item of work, the function's arguments, as they finish.
 
     The function must be importable by other processes. They share the cores. A single worker is
     this process. At the end a StageError names the first files that failed.
@@ -254,12 +253,12 @@ def each_file(
         Progress(len(work), "reading", "files") as line,
         WorkerProcesses(count, threads) if count > 1 else ThisProcess(threads) as pool,
     ):
-        for _, answer in run_tasks(pool, deque(work), lambda item: partial(function, *item)):
+        for _, task in run_tasks(pool, deque(work), lambda item: partial(function, *item)):
             line.update()
-            if answer.reason:
-                failed.append(answer.reason)
+            if task.reason:
+                failed.append(task.reason)
             else:
-                yield answer.result
+                yield task.result
     if failed and len(work) == 1:
         raise StageError(failed[0])
     if failed:

@@ -15,7 +15,8 @@ from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs
 from ..base.las_check import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
-from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of, writer_of
+from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
+from ..pipeline.pdal import knows_copc, writer_of
 from .inputs import InputSource, one_format
 from .jobs import Job, TiledRun, messages_on_folders
 from .options import TilingOptions, fits_whole
@@ -58,7 +59,7 @@ class ClassifyTask:
         if self._per_tile:
             return []
         target = str(Path(self.output) / "#") if is_folder(self.output) else self.output
-        return outputs_of(self.files, target, copc=self.in_one_piece)
+        return outputs_of(self.files, target, copc=self.in_one_piece and knows_copc())
 
     @contextmanager
     def folders(self) -> Iterator[None]:

@@ -14,7 +14,7 @@ from typing import Any
 from ..base.errors import StageError, optional_import
 from ..base.version import build
 from ..pipeline import pdal as pdal_env
-from ..pipeline.workers import TaskResult, perform
+from ..pipeline.workers import TaskResult, perform_task
 
 #: Seconds to wait for the scheduler.
 _CONNECT = 10.0
@@ -121,7 +121,7 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
             f"a worker of the scheduler does not see the output folder (found no {folder} on "
             f"{here}). Inputs, model and outputs must have the same paths on all hosts"
         )
-    answer = perform(pickle.loads(task))
+    answer = perform_task(pickle.loads(task))
     if answer.reason and here != host:
         answer.reason = f"on {here}: {answer.reason}"
     return answer

@@ -19,10 +19,16 @@ from ..base.errors import OptionError, PipelineError, StageError
 from ..base.octree_check import check_ept, read_ept
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import ept_address, is_ept, is_las, locations
+from ..pipeline.inputs_outputs import (
+    LAS_READERS,
+    ept_address,
+    is_ept,
+    is_las,
+    locations,
+    named_files,
+)
 from ..pipeline.las_output import replaced
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
-from ..pipeline.stage_files import LAS_READERS, named_files
 from .checkpoint import fingerprint
 from .options import Density, Extent, TilingOptions, block_bytes, choose_tiles, tiles_per_square
 from .plan import TilePlan, outputs_for

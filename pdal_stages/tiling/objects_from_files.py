@@ -20,9 +20,10 @@ from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
 from ..objects.detect import find_objects
 from ..objects.results import Objects
-from ..pipeline.inputs_outputs import input_files, stage_files
+from ..pipeline.expansion import stage_files
+from ..pipeline.inputs_outputs import input_files
+from ..pipeline.json_source import Override
 from ..pipeline.las_chunks import can_read_chunks, read_columns
-from ..pipeline.overrides import Override
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.object_layers import write_objects

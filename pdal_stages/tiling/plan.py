@@ -13,11 +13,10 @@ from typing import Any
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.model_file import shipped
-from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of
-from ..pipeline.overrides import Override
+from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of, writes_las
+from ..pipeline.json_source import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import MOVING
-from ..pipeline.stage_files import writes_las
 from ..stages.base import Blocks, Stage, first_round_of
 from .tile_grid import Box, TileGrid
 
@@ -148,7 +147,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     steps = []
     for index, stage in enumerate(source.stages):
         made = ours.get(index)
-        given = dict(stage if made is None else made.given)
+        given = dict(stage if made is None else made.as_written)
         steps.append(_Step(given, source.where(index), None if made is None else made.stage))
     _check_linear(steps)
     readers, filters, writers = ([s for s in steps if s.rank == rank] for rank in (0, 1, 2))

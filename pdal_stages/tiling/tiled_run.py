@@ -21,9 +21,8 @@ from ..base.jit import count_cached_kernels
 from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
-from ..pipeline.json_source import PipelineSource
+from ..pipeline.json_source import Override, PipelineSource
 from ..pipeline.las_output import files_with_flags_to_split
-from ..pipeline.overrides import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .checkpoint import Store, fingerprint

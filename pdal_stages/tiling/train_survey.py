@@ -23,8 +23,10 @@ from ..classifier.training_clouds import TiledCloud, TrainingCloud
 from ..classifier.training_options import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
-from ..pipeline.inputs_outputs import is_ept, is_las, overridden, reader_of, stage_files
-from ..pipeline.overrides import Override
+from ..pipeline.expansion import stage_files
+from ..pipeline.inputs_outputs import is_ept, is_las
+from ..pipeline.json_source import Override, overridden
+from ..pipeline.pdal import reader_of
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views
 from ..pipeline.spatial_reference import check_readers

@@ -21,10 +21,10 @@ from ..base.files import whole_files
 from ..base.las_check import check_complete
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
+from ..pipeline.inputs_outputs import LAS_WRITERS
 from ..pipeline.las_chunks import laspy_header, read_chunks
 from ..pipeline.runtime import Callbacks
 from ..pipeline.spatial_reference import plane_unit
-from ..pipeline.stage_files import LAS_WRITERS
 from ..stages.points import class_counts
 from .checkpoint import load_arrays, written
 from .inputs import InputSource

@@ -33,8 +33,12 @@ from pdal_stages.classifier.model import assemble
 from pdal_stages.classifier.registry import classifier_of
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
-from pdal_stages.pipeline.json_source import decode, parse_pipeline
-from pdal_stages.pipeline.overrides import apply_overrides, parse_overrides
+from pdal_stages.pipeline.json_source import (
+    apply_overrides,
+    decode,
+    parse_overrides,
+    parse_pipeline,
+)
 from pdal_stages.tiling import inputs
 from pdal_stages.tiling import write_outputs as outputs
 from pdal_stages.tiling.checkpoint import Store
@@ -108,7 +112,7 @@ def pipeline(data: bytes) -> str:
     )
     with contextlib.suppress(StageError):  # one that fits no stage
         source.stages = apply_overrides(source.stages, overrides)
-    source.stages = pdal_env.typed(source.stages)
+    source.stages = pdal_env.with_types(source.stages)
     expanded = expand(source)
     assert json.loads(json.dumps(expanded.stages, allow_nan=False)) == expanded.stages
     types = [str(stage.get("type", "")) for stage in expanded.stages]

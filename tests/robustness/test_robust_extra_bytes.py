@@ -15,7 +15,7 @@ import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_repair import extra_dimensions
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.inputs_outputs import reader_of
+from pdal_stages.pipeline.pdal import reader_of
 
 pytestmark = pytest.mark.pdal
 

@@ -117,7 +117,7 @@ def test_any_json_is_expanded_or_refused(given_stages, as_object, indent):
     try:
         source = parse_pipeline(json.dumps(value, indent=indent))
         assert source.stages == given_stages
-        source.stages = pdal_env.typed(source.stages)
+        source.stages = pdal_env.with_types(source.stages)
         expanded = expand(source)
         assert json.loads(json.dumps(expanded.stages, allow_nan=False)) == expanded.stages
     except StageError:
