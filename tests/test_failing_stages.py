@@ -122,7 +122,7 @@ def test_stages_that_pdal_leaves_out(tmp_path, monkeypatch):
     }
     for stop in (False, True):
         if stop:  # as if it had not been called
-            monkeypatch.setattr(runtime, "_run_one", lambda *_: None)
+            monkeypatch.setattr(runtime, "_run_interruptible", lambda *_: None)
         made = ps.run_pipeline(
             [*none, {"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures"}]
         )

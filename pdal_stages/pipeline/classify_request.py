@@ -99,10 +99,11 @@ class ClassifyRequest:
             )
         prepared, keep_ground = self._prepared()
         noise: dict[str, Any] = {"type": "filters.detachednoise"}
-        wheres = [f"({self.where})"] * bool(self.where)
-        wheres += [f"Classification != {GROUND}"] * keep_ground
-        if wheres:
-            noise["where"] = " && ".join(wheres)
+        where, others = self.where, f"Classification != {GROUND}"
+        if keep_ground:
+            where = f"({where}) && {others}" if where else others
+        if where:
+            noise["where"] = where
         classifier = {**self._classifier, **({"given_ground": True} if keep_ground else {})}
         first = [noise] if self.noise else []
         return [*first, *prepared, classifier, *self._corrections(keep_ground)]

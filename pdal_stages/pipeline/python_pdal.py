@@ -32,8 +32,8 @@ class _Family:
             raise AttributeError(str(error)) from None  # as completion and hasattr expect
         signature = _signature(kind)
 
-        def make(*given: Any, **options: Any):
-            options = signature.bind_partial(*given).arguments | options
+        def make(*by_place: Any, **options: Any):
+            options = signature.bind_partial(*by_place).arguments | options
             merge = options.pop("merge", True)
             if not isinstance(merge, bool):  # filters.accuracy has an option of this name
                 options["merge"], merge = merge, True
