@@ -13,8 +13,8 @@ from typing import Any
 
 from ..base.errors import StageError
 from ..base.messages import PlainStream, print_messages
-from .crash_watcher import INTERRUPTED, watch_for_crash
 from .parser import parse
+from .signals import INTERRUPTED, watch_for_crash
 
 #: Under this limit on addresses, in bytes, libraries crash or wait forever for threads.
 _LEAST_MEMORY = 2**30

@@ -1,11 +1,11 @@
-"""The command ``classify``: its flags, the record they are parsed into, and its two ways to run."""
+"""The command ``classify``: its flags, the request they are parsed into, and its two ways to run."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
 import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,20 @@ from ..base.files import Output
 from ..base.messages import count_of, one_line, print_messages
 from . import signals
 from .parser import INPUTS, Parser, add_stage_options, stage_options
-from .tile_options import RunFiles, add_tile_options, tiling_options
-from .tile_results import end_run, print_classes, print_output, print_plan, print_run
+from .tiled_runs import (
+    add_tile_options,
+    end_run,
+    print_classes,
+    print_output,
+    print_plan,
+    print_run,
+    run_files,
+    tiling_options,
+)
 
 if TYPE_CHECKING:
     from ..pipeline.classify_request import ClassifyRequest
+    from ..pipeline.json_source import Override
     from ..stages.write_objects import WriteObjects
     from ..tiling.classify import ClassifyTask
     from ..tiling.jobs import TiledRun
@@ -39,14 +48,12 @@ def add_commands(parser: Parser) -> None:
     add("--model", default="standard", help="A model file or a shipped model (default: standard)")
     ground = "given: points of class 2 are the ground, and stay so (default: found)"
     add("--ground", choices=("found", "given"), default="found", help=ground)
-    add(
-        "--dimensions",
-        metavar="LIST",
-        help="Extra dimensions to write besides the input's own, e.g. "
-        "Reliability,Margin,Probability_6, or all, or none; "
-        "default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 (1.6 %%), which "
-        "keeps files small",
+    dimensions = (
+        "Extra dimensions to write besides the input's own, e.g. Reliability,Margin,Probability_6, "
+        "or all, or none; default HeightAboveGround,Reliability, rounded to 1/32 (3 cm) and 1/64 "
+        "(1.6 %%), which keeps files small"
     )
+    add("--dimensions", metavar="LIST", help=dimensions)
     for flag, default, help in (
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
         ("--bridges", False, "Find bridge decks, class 17"),
@@ -54,14 +61,11 @@ def add_commands(parser: Parser) -> None:
         ("--towers", False, "Find wires, and their towers, class 15"),
     ):
         add(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
-    add(
-        "--polygons",
-        action="append",
-        default=[],
-        metavar="FILE=CODE",
-        help="Class for ground inside polygons, e.g. lakes.gpkg=9; for other classes: "
-        "bridges.gpkg=17:2,6; may be repeated",
+    polygons = (
+        "Class for ground inside polygons, e.g. lakes.gpkg=9; for other classes: "
+        "bridges.gpkg=17:2,6; may be repeated"
     )
+    add("--polygons", action="append", default=[], metavar="FILE=CODE", help=polygons)
     add("--objects", metavar="FILE", help="Also write buildings, trees and more to a vector file")
     add_stage_options(add, "filters.modelclassifier", *_CLASSIFIER_OPTIONS)
     add("--where", help="Classify only points that meet this condition")
@@ -69,63 +73,7 @@ def add_commands(parser: Parser) -> None:
     add_tile_options(parser.commands["classify"], survey=True)
 
 
-@dataclass(frozen=True)
-class ClassifyCommand:
-    """A command line of ``classify``."""
-
-    task: ClassifyTask  #: what to classify, and how
-    files: RunFiles  #: what to write about the run
-    objects: WriteObjects | None  #: writes the objects of the outputs, where they were requested
-    dry_run: bool
-    is_program: bool  #: whether this process runs for the command alone
-    again: str  #: the command that continues the run if it is interrupted
-
-    @classmethod
-    def parse(cls, options: argparse.Namespace) -> ClassifyCommand:
-        """Return what the flags ask for; OptionError where they cannot go together."""
-        from ..tiling.classify import ClassifyTask
-        from ..tiling.objects_from_files import OPTIONS_OF, refuse_tiles, writer
-
-        files, overrides = RunFiles.parse(options), list(options.overrides)
-        object_options = [
-            override
-            for override in overrides
-            if options.objects and not override.by_tag and override.selector in OPTIONS_OF
-        ]
-        overrides = [override for override in overrides if override not in object_options]
-        wants_objects = options.objects and not options.dry_run  # the folder may not be there yet
-        extra_files = [
-            *files.outputs,
-            *([Output(options.objects, "objects")] * bool(wants_objects)),
-        ]
-        task = ClassifyTask(
-            tuple(options.inputs),
-            options.output,
-            _request(options, tuple(overrides)),
-            tiling_options(options),
-            tuple(extra_files),
-        )
-        print_messages(*task.request.cost)
-        objects = None
-        if wants_objects:
-            with task.folders():
-                objects = writer(options.objects, object_options)
-                refuse_tiles(task)
-        words = [word for word in options.arguments if word != "--resume"]
-        same = shlex.join(["pdal-stages", *words])
-        again = (same if len(words) <= _MOST_WORDS else "the same command with") + " --resume"
-        return cls(task, files, objects, options.dry_run, options.is_program, again)
-
-    def write_objects(self) -> dict[str, Any]:
-        """Find and write the objects of the outputs; return their files, and counts by kind."""
-        from ..tiling.objects_from_files import objects_of_files
-
-        assert self.objects is not None
-        workers = max(1, self.task.options.local_workers)
-        return objects_of_files(self.task.outputs, self.objects, workers)
-
-
-def _request(options: argparse.Namespace, overrides: tuple) -> ClassifyRequest:
+def _request(options: argparse.Namespace, overrides: Sequence[Override]) -> ClassifyRequest:
     """Return how points are to be classified."""
     from ..pipeline.classify_request import WRITTEN, ClassifyRequest
 
@@ -134,7 +82,7 @@ def _request(options: argparse.Namespace, overrides: tuple) -> ClassifyRequest:
         listed = tuple(name.strip() for name in options.dimensions.split(",") if name.strip())
     return ClassifyRequest(
         options.model,
-        overrides,
+        tuple(overrides),
         options.where,
         listed,
         stage_options(options, *_CLASSIFIER_OPTIONS),
@@ -149,49 +97,77 @@ def _request(options: argparse.Namespace, overrides: tuple) -> ClassifyRequest:
 
 def _classify(options: argparse.Namespace) -> int:
     """Run the command in one piece or in tiles; return the exit code."""
-    command = ClassifyCommand.parse(options)
-    names = {code: one_line(name) for code, name in command.task.request.loaded.classes}
-    if not command.task.in_one_piece:
-        return _classify_tiles(command, names)
-    signals.end_at_ctrl_c(command.is_program)
-    if command.is_program and not command.task.request.polygons:
+    from ..tiling.classify import ClassifyTask
+
+    files, overrides = run_files(options), list(options.overrides)
+    objects: WriteObjects | None = None
+    if options.objects:
+        from ..tiling.objects_from_files import OPTIONS_OF, refuse_tiles, writer
+
+        of_objects = [o for o in overrides if not o.by_tag and o.selector in OPTIONS_OF]
+        overrides = [override for override in overrides if override not in of_objects]
+    wants_objects = options.objects and not options.dry_run  # the folder may not be there yet
+    task = ClassifyTask(
+        tuple(options.inputs),
+        options.output,
+        _request(options, overrides),
+        tiling_options(options),
+        (*files, Output(options.objects, "objects")) if wants_objects else tuple(files),
+    )
+    print_messages(*task.request.cost)
+    if wants_objects:
+        with task.folders():
+            objects = writer(options.objects, of_objects)
+            refuse_tiles(task)
+    names = {code: one_line(name) for code, name in task.request.loaded.classes}
+    if task.in_one_piece:
+        run, interrupted = _classify_whole(task, options), False
+    else:
+        run, interrupted = signals.run_until_interrupted(
+            lambda: task.run_tiles(
+                dry_run=options.dry_run, finished=partial(print_output, names=names)
+            )
+        )
+        print_plan(run) if options.dry_run else print_run(run)
+    if not options.dry_run:
+        print_classes(run.summary["classes"], run.summary["left_alone"], names)
+        if objects is not None and not interrupted and not run.failures:
+            _write_objects(task, objects, run, files)
+    return end_run(files, run, _repeated_command(options) if interrupted else "")
+
+
+def _classify_whole(task: ClassifyTask, options: argparse.Namespace) -> TiledRun:
+    """Classify one file in one piece, and print the result."""
+    signals.end_at_ctrl_c(options.is_program)
+    if options.is_program and not options.polygons:
         # laspy imports them for nothing, half of its time.
         absent: Any = dict.fromkeys({"requests", "pyproj"} - sys.modules.keys())
         sys.modules.update(absent)
-    run = command.task.run_whole(dry_run=command.dry_run)
-    if command.dry_run:
+    run = task.run_whole(dry_run=options.dry_run)
+    if options.dry_run:
         print("1 input, in one piece")
     else:
         print_messages(*run.messages)
-        points = count_of(run.summary["points"], "point")
-        print(f"{points} written to {command.task.outputs[0]}")
-        print_classes(run.summary["classes"], run.summary["left_alone"], names)
-        _add_objects(command, run)
-    return end_run(command.files, run, "")
+        print(f"{count_of(run.summary['points'], 'point')} written to {task.outputs[0]}")
+    return run
 
 
-def _add_objects(command: ClassifyCommand, run: TiledRun) -> None:
-    """Write the objects that the command asks for; what is known of the run, if that fails."""
-    if command.objects is None:
-        return
+def _write_objects(
+    task: ClassifyTask, objects: WriteObjects, run: TiledRun, files: Sequence[Output]
+) -> None:
+    """Write the objects of the outputs; where that fails, what is known of the run is written."""
+    from ..tiling.objects_from_files import objects_of_files
+
     try:
-        run.objects = command.write_objects()
+        workers = max(1, task.options.local_workers)
+        run.objects = objects_of_files(task.outputs, objects, workers)
     except StageError:
-        end_run(command.files, run, "")
+        end_run(files, run, "")
         raise
 
 
-def _classify_tiles(command: ClassifyCommand, names: dict[int, str]) -> int:
-    """Run the command in tiles; `names` are the model's classes by code. Return the exit code."""
-    print_finished = partial(print_output, names=names)
-    run, interrupted = signals.run_until_interrupted(
-        lambda: command.task.run_tiles(dry_run=command.dry_run, finished=print_finished)
-    )
-    if command.dry_run:
-        print_plan(run)
-    else:
-        print_run(run)
-        print_classes(run.summary["classes"], run.summary["left_alone"], names)
-        if not interrupted and not run.failures:
-            _add_objects(command, run)
-    return end_run(command.files, run, command.again if interrupted else "")
+def _repeated_command(options: argparse.Namespace) -> str:
+    """Return the command that continues an interrupted run."""
+    words = [word for word in options.arguments if word != "--resume"]
+    command = shlex.join(["pdal-stages", *words])
+    return f"{command if len(words) <= _MOST_WORDS else 'the same command with'} --resume"

@@ -12,7 +12,7 @@ from ..base.files import JSON, Output, check_outputs
 from ..base.messages import print_messages
 from . import signals
 from .parser import INPUTS, Parser, add_stage_options, stage_options
-from .tile_options import add_tile_sizes, tiling_options
+from .tiled_runs import add_tile_sizes, tiling_options
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
 _TRAINING_OPTIONS = (

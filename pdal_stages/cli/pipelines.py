@@ -8,18 +8,24 @@ import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs, write_json, write_whole
 from ..base.messages import print_messages
 from . import signals
 from .parser import Parser
-from .tile_options import RunFiles, add_tile_options, requests_tiles, tiling_options
-from .tile_results import end_run, print_plan, print_run
+from .tiled_runs import (
+    add_tile_options,
+    end_run,
+    print_plan,
+    print_run,
+    requests_tiles,
+    run_files,
+    tiling_options,
+)
 
 if TYPE_CHECKING:
-    from ..pipeline.json_source import PipelineSource
     from ..pipeline.run import Pipeline
 
 #: Lines of PDAL's log that are shown without -v.
@@ -45,11 +51,8 @@ def add_commands(parser: Parser) -> None:
     _input(add)
     add("-o", "--output", metavar="FILE", help="Write to a file, not to standard output")
 
-    _input(
-        parser.command(
-            "validate", _validate, "Check a pipeline without reading points", overrides=True
-        )
-    )
+    help = "Check a pipeline without reading points"
+    _input(parser.command("validate", _validate, help, overrides=True))
 
 
 def _input(add: Callable) -> None:
@@ -59,27 +62,20 @@ def _input(add: Callable) -> None:
     add("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
 
 
-def _source(options: argparse.Namespace) -> Path | PipelineSource:
-    """Return the path of the pipeline file, or what was read from standard input."""
-    if options.stdin:
-        from ..pipeline.json_source import decode, parse_pipeline
-
-        raw = getattr(sys.stdin, "buffer", None)
-        text = decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()
-        return parse_pipeline(text or " ", "standard input")
-    name = options.file or options.file_option
-    if not name:
-        raise StageError(
-            "no pipeline file was given", cure=f"Usage: pdal-stages {options.command} job.json"
-        )
-    return Path(name)
-
-
-def _build(options: argparse.Namespace) -> Pipeline:
-    """Return the pipeline with its overrides."""
+def _build(options: argparse.Namespace, whole: bool = True) -> Pipeline:
+    """Return the pipeline of a file or of standard input, with its overrides."""
+    from ..pipeline.json_source import decode, parse_pipeline
     from ..pipeline.run import Pipeline
 
-    return Pipeline(_source(options), options.overrides)
+    source: Any = Path(options.file or options.file_option or "")
+    if options.stdin:
+        raw = getattr(sys.stdin, "buffer", None)
+        text = decode(raw.read(), "standard input") if raw is not None else sys.stdin.read()
+        source = parse_pipeline(text, "standard input")
+    elif not source.name:
+        usage = f"Usage: pdal-stages {options.command} job.json"
+        raise StageError("no pipeline file was given", cure=usage)
+    return Pipeline(source, options.overrides, whole=whole)
 
 
 def _pipeline(options: argparse.Namespace) -> int:
@@ -88,21 +84,21 @@ def _pipeline(options: argparse.Namespace) -> int:
         return _run_tiles(options)
     if options.validate:
         return _validate(options)
-    pipeline, files = _build(options), RunFiles(options.metadata)
-    pipeline.check_outputs(*files.outputs)
+    pipeline = _build(options)
+    pipeline.check_outputs(*run_files(options))
     before = list(pipeline.expanded.warnings)
     print_messages(*before)
     signals.end_at_ctrl_c(options.is_program)
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(options.verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot
     # read to 0, say.
-    lines = pipeline.log_lines
-    shown = lines if options.verbose > 1 else lines[:_LOG_LINES]
-    print_messages(*(f"PDAL says: {line}" for line in shown))
-    if len(lines) > len(shown):
-        print_messages(f"PDAL says {len(lines) - len(shown):,} more lines; -v 2 shows them")
-    if files.metadata:
-        write_json(files.metadata, pipeline.metadata, indent=2)
+    lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
+    if options.verbose < 2 and len(lines) > _LOG_LINES:
+        more = f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v 2 shows them"
+        lines = [*lines[:_LOG_LINES], more]
+    print_messages(*lines)
+    if options.metadata:
+        write_json(options.metadata, pipeline.metadata, indent=2)
     print_messages(*(line for line in pipeline.messages if line not in before))
     return 0
 
@@ -110,12 +106,11 @@ def _pipeline(options: argparse.Namespace) -> int:
 def _run_tiles(options: argparse.Namespace) -> int:
     """Run a pipeline in tiles; return the exit code."""
     from ..pipeline.inputs_outputs import writers_outputs
-    from ..pipeline.run import Pipeline
     from ..tiling.plan import make_plan
     from ..tiling.tiled_run import run_tiled
 
-    tiling, files = tiling_options(options), RunFiles.parse(options)
-    pipeline = Pipeline(_source(options), options.overrides, whole=False)
+    tiling, files = tiling_options(options), run_files(options)
+    pipeline = _build(options, whole=False)
     if options.validate:
         make_plan(pipeline, tiling.buffer)
         print(pipeline.validate())
@@ -126,7 +121,7 @@ def _run_tiles(options: argparse.Namespace) -> int:
         for output in writers_outputs(pipeline.expanded.stages)
         if "#" not in output.path and Path(output.path).parent.is_dir()
     ]
-    check_outputs([*outputs, *files.outputs], pipeline.inputs())
+    check_outputs([*outputs, *files], pipeline.inputs())
     run, interrupted = signals.run_until_interrupted(
         lambda: run_tiled(pipeline, tiling, dry_run=options.dry_run)
     )
@@ -153,8 +148,7 @@ def _validate(options: argparse.Namespace) -> int:
         print_messages(*pipeline.expanded.warnings)
         return 0
     except StageError as error:
-        print(
-            json.dumps({"valid": False, "error_detail": str(error), "streamable": False}, indent=2)
-        )
+        verdict = {"valid": False, "error_detail": str(error), "streamable": False}
+        print(json.dumps(verdict, indent=2))
         print_messages(str(error))
         return 1

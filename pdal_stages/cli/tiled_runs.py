@@ -1,23 +1,103 @@
-"""What is printed and written about runs in tiles, and their exit codes."""
+"""Runs in tiles at the command line: their flags, what is printed and written, exit codes."""
 
 from __future__ import annotations
 
+import argparse
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..base.asprs import class_name
-from ..base.files import write_json, write_whole
+from ..base.errors import OptionError
+from ..base.files import HTML, JSON, Output, write_json, write_whole
+from ..base.memory import parse_size
 from ..base.messages import count_of, print_messages
 from ..stages.registry import describe_count
+from ..tiling.options import PER, TilingOptions
 
 if TYPE_CHECKING:
     from ..tiling.jobs import Job, TiledRun
-    from .tile_options import RunFiles
 
+#: Kinds of reports by the suffix of the file.
+_REPORTS = {".html": HTML, ".htm": HTML, ".json": JSON}
 _MOST_FAILURES = 20  #: are printed; reports have all
 _MOST_TILES = 50  #: of a dry run are printed
+
+
+def run_files(options: argparse.Namespace) -> list[Output]:
+    """Return the files about a run that flags name; OptionError for reports of other kinds."""
+    files = [Output(options.metadata, "metadata", JSON)] if options.metadata else []
+    for name in options.report:
+        kind = _REPORTS.get(Path(name).suffix.lower())
+        if kind is None:
+            raise OptionError("--report writes .html or .json", found=name)
+        files.append(Output(name, "report", kind))
+    return files
+
+
+def add_tile_options(command: argparse.ArgumentParser, survey: bool = False) -> None:
+    """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
+    when = "Several inputs and large files are cut into tiles" if survey else "Run in tiles"
+    add = add_tile_sizes(command, f"{when} (docs/large-areas.md).")
+    scheduler = "A running Dask scheduler, tcp://HOST:8786"
+    add("--scheduler", default="", metavar="ADDRESS", help=scheduler)
+    per = "One output per input or per tile (auto: per input)"
+    add("--per", choices=PER, default="auto", help=per)
+    buffer = argparse.SUPPRESS if survey else "How far PDAL's own filters look beyond a tile"
+    add("--buffer", type=float, metavar="METERS", help=buffer)
+    add("--resume", action="store_true", help="Continue a run that was stopped or failed")
+    add("--dry-run", action="store_true", help="Show tiles, memory and disk needed, then stop")
+    report = "Write a report, .html or .json"
+    add("--report", action="append", default=[], metavar="FILE", help=report)
+
+
+def add_tile_sizes(
+    command: argparse.ArgumentParser,
+    what: str = "Points that do not fit in memory are read in tiles, which give the same model.",
+) -> Callable:
+    """Add the flags of ``train``, whose only output is a model; return what adds more."""
+    add = command.add_argument_group("large areas", what).add_argument
+    side = "Side of the tiles in the cloud's unit (default: auto)"
+    add("--tile", type=_tile_side, metavar="SIZE", help=side)
+    add("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
+    workers = "Worker processes, 0 for none (default: half the cores)"
+    add("--workers", type=int, metavar="N", help=workers)
+    return add
+
+
+def _tile_side(text: str) -> float | str:
+    """Return the value of ``--tile``."""
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"a length or auto, not {text!r}") from None
+
+
+def tiling_options(options: argparse.Namespace) -> TilingOptions:
+    """Return the options of tiles from the flags."""
+    names = {field.name for field in fields(TilingOptions)}
+    values = {name: value for name, value in vars(options).items() if name in names}
+    values["tile"] = None if options.tile == "auto" else options.tile
+    values["memory"] = None if options.memory is None else parse_size(options.memory)
+    return TilingOptions(**values)
+
+
+def requests_tiles(options: argparse.Namespace) -> bool:
+    """Return whether ``pipeline`` runs in tiles; refuse other flags of tiles without it."""
+    if options.tile is None:
+        add_tile_options(usual := argparse.ArgumentParser())
+        for name, default in vars(usual.parse_args([])).items():
+            if getattr(options, name) != default:
+                raise OptionError(
+                    f"--{name.replace('_', '-')} needs --tile",
+                    cure="Give the side of the tiles, e.g. --tile 500, or --tile auto",
+                )
+    return options.tile is not None
+
+
+# ---- results -------------------------------------------------------------------------------------
 
 
 def print_classes(
@@ -107,21 +187,21 @@ def _print_failures(run: TiledRun) -> None:
         print_messages(f"and {len(failures) - _MOST_FAILURES:,} more; see --report")
 
 
-def end_run(files: RunFiles, run: TiledRun, again: str) -> int:
+def end_run(files: Sequence[Output], run: TiledRun, again: str) -> int:
     """Write metadata and reports; return the exit code.
 
-    `again` says how to continue an interrupted run, else it is empty.
+    `again` tells how to continue an interrupted run, else it is empty.
     """
     content = run.to_dict()
-    if files.metadata:
-        write_json(files.metadata, content if run.metadata is None else run.metadata, "metadata")
-    for name in files.reports:
-        if Path(name).suffix.lower() != ".json":
+    for file in files:
+        if file.kind == HTML:
             from ..reports.run_page import run_page
 
-            write_whole(name, run_page(content).encode(), "report")
+            write_whole(file.path, run_page(content).encode(), file.what)
+        elif file.what == "metadata" and run.metadata is not None:
+            write_json(file.path, run.metadata, file.what)
         else:
-            write_json(name, content, "report")
+            write_json(file.path, content, file.what)
     if not again:
         return 1 if run.failures else 0
     states = run.summary["states"]
