@@ -69,6 +69,8 @@ class Cloud(NamedTuple):
 
 #: Codes of noise.
 NOISE = (7, 18)
+#: Codes of points that LiDAR HD puts on water and under bridges: no scanner has them.
+ADDED = (64, 65, 66, 67)
 #: Surveys whose decks have another code than 17.
 DECKS = {"Delft": 26}
 #: Surveys into which holes are dug: of every landscape, country and density.
@@ -144,7 +146,8 @@ def clouds(data: Path) -> Iterator[tuple[str, Cloud]]:
                 for hole in HOLES:
                     yield f"{name} + {hole}", dug(cloud, hole)
     if (path := data / "bridge" / "pont.laz").exists():
-        yield "pont", read_labeled(path, "survey", {2: 2, 4: 5, 5: 5, 6: 6}, 0)
+        pont = read_labeled(path, "survey", {2: 2, 4: 5, 5: 5, 6: 6}, 0)
+        yield "pont", pont.take(~np.isin(pont.codes, ADDED))
     for path in sorted(data.glob("isprs_filter/*.laz")):
         yield path.stem, read_labeled(path, "ISPRS", {2: 2}, 5)
 
@@ -302,15 +305,13 @@ ROWS: dict[str, dict[str, Row]] = {
     },
     "decks": {
         "as it is": Row(),
-        "no clearance over what is in sight": rule(decks, sight=0),
         "water without points is a wall": rule(decks, max_water=0),
-        "narrow layers are not grown": rule(decks, grown=0),
+        "narrow layers are not grown": rule(decks, grow_rounds=0),
         "ends need not lead on": rule(decks, min_end_ratio=0.0),
         "sides need no drop": rule(decks, min_side_ratio=0.0),
         "walls do not matter": rule(decks, max_wall_ratio=9.0),
         "drops may be gentle": rule(decks, min_wall_slope=0.0),
         "layers need not be solid": rule(decks, min_neighbors=0),
-        "leaves above an edge are walls": rule(decks, headroom_m=99.0),
     },
     "wires": {
         "as it is": Row(),
@@ -325,13 +326,10 @@ ROWS: dict[str, dict[str, Row]] = {
     },
     "towers": {
         "as it is": Row(),
-        "rings around may be full": rule(towers, max_clear_ratio=1e9),
-        "trees may widen a body": rule(towers, max_aside_ratio=9.0),
-        "slim bodies need clear rings": rule(towers, max_crowd_ratio=0.0),
-        "slim bodies may stand in a crowd": rule(towers, max_crowd_ratio=1e9),
         "wires need not rise": rule(towers, min_rise=-9.0),
-        "bodies need not be filled": rule(towers, min_filled=0.0),
-        "one size": rule(towers, max_scale=1.0),
+        "one size": rule(towers, max_arm_m=10.0),
+        "bodies of 3 cells": rule(towers, half_body=3),
+        "narrow at the top": rule(towers, top_m=1.5),
     },
 }
 

@@ -35,7 +35,7 @@ def found(xyz, height, wire):
     [
         ("highest voltage", 1.0),
         ("high voltage, uphill", 1.0),
-        ("two lines beside each other", 1.0),
+        ("two lines beside each other", 0.8),
     ],
 )
 def test_supports_of_lines(name, share):
@@ -95,7 +95,8 @@ def test_a_real_tower(data_dir):
     height = filtered_ground(las.xyz, mask=real)["HeightAboveGround"]
     tower = find_towers(las.xyz, height, find_wires(las.xyz, height, real), real)
     assert tower[codes == 15].mean() > 0.8
-    assert np.isin(codes[tower], (1, 15)).all()  # its feet, up to 6 m, have no label
+    assert np.isin(codes[tower], (1, 14, 15)).all()  # its feet, up to 6 m, have no label
+    assert (codes[tower] == 14).mean() < 0.05  # ends of wires
     away = np.hypot(*(las.xyz[tower, :2] - las.xyz[codes == 15, :2].mean(axis=0)).T)
     assert away.max() < 15
 

@@ -3,17 +3,14 @@
 After the profiles of Sithole and Vosselman [S06], on a raster of vertical layers in cells of a
 meter:
 
-1. A layer is solid if most of the cells around hold a layer that one can step on to. 2. In eight
-directions one walks from a solid layer to the next until there is none ahead. Such an edge is a
-drop (something
-   lies lower ahead), open (nothing lies ahead, as over water without returns), or a wall. What lies
-   beyond the survey is not known, and counts as a wall.
+1. A layer is solid if most of the cells around it hold a layer that one can step on to.
+2. From each solid layer one walks in eight directions to the next until there is none ahead. Such
+   an edge is a drop where something lies lower right ahead, open where no points lie ahead, as
+   over water without returns, and a wall otherwise. Beyond the survey all is wall.
 3. Layers with drops or open edges at two opposite sides, close together, are narrow. Layers beside
-them that are not ground
-   belong to them.
-4. Narrow layers that hang together are a deck if they lead on to ground at two opposite ends,
-across their width, and drop
-   at both sides between these.
+   them that are not ground belong to them.
+4. Connected narrow layers are a deck if they lead on to ground at two opposite ends, across their
+   width, and drop at both sides between these, with few walls.
 
 Decks that leave the cloud, that are longer or wider than :class:`DeckRules` has it, and bridges
 hardly above what they cross are not detected. Below 2 points/m2 cells are too empty.
@@ -40,69 +37,60 @@ CELL_M = 1.0
 
 
 class DeckRules(NamedTuple):
-    """Thresholds of the detector; kernels take them as they are. Most were set on a bridge of 57
-    points/m2 (LiDAR HD) and hold from half to twice their value there; none marks anything but a
-    bridge in 30 labeled surveys."""
+    """Thresholds of the detector, a named tuple because compiled kernels read it.
+
+    Most were set on a bridge of 57 points/m2 (LiDAR HD) and hold from half to twice their value
+    there; none marks anything but a bridge in 30 labeled surveys.
+    """
 
     max_step_m: float = 0.35  #: from one cell to another: a curb
-    max_grade: float = 0.25  #: and so much more per meter: ramps of footbridges
+    max_grade: float = 0.25  #: that step grows by this much per meter: ramps of footbridges
     max_gap: int = 5  #: cells without a solid layer that one walks across: a car
-    min_neighbors: int = (
-        5  #: of the 8 cells around a solid layer: what those on a straight edge have
-    )
+    #: of the 8 cells around a solid layer: what layers on a straight edge have
+    min_neighbors: int = 5
     max_width: int = 40  #: cells: a motorway has 30 m
     max_length: int = 250  #: cells along either axis; tiles read farther than that around
     min_cells: int = 20  #: fewer tell no direction
-    min_drop_m: float = 2.0  #: to something lower right ahead: two steps of stairs and more
-    min_wall_slope: float = (
-        1.25  #: rise over run of that drop: banks of 45 degrees are walls of nothing
-    )
-    min_clearance_m: float = (
-        1.2  #: to something lower in sight, such as water in a canal or the other bank
-    )
-    headroom_m: float = 1.5  #: leaves and lamps higher than that beside an edge hide nothing
-    #: cells from a place without points to others in all four quadrants; else the survey ends there
+    min_drop_m: float = 2.0  #: to something lower right ahead: more than two steps of stairs
+    min_wall_slope: float = 1.25  #: rise over run of that drop: a bank of 45 degrees is no flank
+    #: cells from a place without points to others in all four quadrants: else the survey ends there
     max_water: int = 60
-    sight: int = 30  #: cells within which something lower is looked for, 45 degrees to either side
-    grown: int = (
-        3  #: times that layers beside become narrow, up to `link` cells on: abutments under leaves
-    )
-    link: int = 2  #: cells across which layers hang together
-    min_end_ratio: float = (
-        0.5  #: layers that lead on to ground at an end, per cell of the deck's width
-    )
+    #: times that layers beside become narrow, up to `link` cells away: abutments under leaves
+    grow_rounds: int = 3
+    link: int = 2  #: cells across which layers are connected
+    min_end_ratio: float = 0.5  #: layers that lead on to ground at an end, per cell of the width
     min_side_ratio: float = 0.25  #: layers at a drop at a side, per cell of the deck's length
-    max_wall_ratio: float = (
-        0.3  #: layers at a wall at a side, per cell of both sides: crowns have many
-    )
-    surface_m: float = (
-        0.4  #: points of the deck lie so near to its layers: crossfall, noise, parapets' feet
-    )
-    beside: int = (
-        2  #: cells from a layer to points of the deck: its edge, where the lowest layer is below
-    )
+    max_wall_ratio: float = 0.3  #: layers at walls, per cell of both sides: crowns have many
+    #: height from its layers within which points are of the deck: crossfall, feet of parapets
+    surface_m: float = 0.4
+    #: cells from a layer to points of the deck: its edge, where the lowest layer is below
+    beside: int = 2
 
     @property
     def reach_m(self) -> float:
-        """How far away points can change whether a point is of a deck."""
-        grown = self.grown * self.link + self.link
-        edge = self.max_width + self.max_gap + max(self.sight, self.max_water)
+        """Distance in meters up to which other points decide whether a point is of a deck."""
+        grown = self.grow_rounds * self.link + self.link
+        edge = self.max_width + self.max_gap + self.max_water
         return (self.beside + self.max_length + grown + edge + 2) * CELL_M
 
 
 RULES = DeckRules()
-#: How a walk ends.
-_WALL, _DROP, _OPEN, _GOES_ON = range(4)
-#: The eight directions, by column and row.
-_EAST, _NORTH = np.array([1, 1, 0, -1, -1, -1, 0, 1]), np.array([0, 1, 1, 1, 0, -1, -1, -1])
-_FAR = np.float32(1e9)
+#: What a layer ends at in a direction, where it does.
+WALL = 1
+DROP = 2
+OPEN = 3
+#: Columns and rows to the cell ahead in the eight directions.
+EAST = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+NORTH = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+#: Cosine from which on a direction counts as across a deck: within 37 degrees.
+ACROSS = 0.8
 
 
 class _Layers(NamedTuple):
     """Vertical layers of a raster, in the order of their cells."""
 
     z: NDArray[np.float64]  #: (n,) height of the lowest point, meters
-    start: NDArray[np.int64]  #: (height * width + 1) the first layer of each cell
+    start: NDArray[np.int64]  #: (height * width + 1,) the first layer of each cell
     height: int
     width: int
 
@@ -117,23 +105,22 @@ def find_decks(
 ) -> NDArray[np.bool_]:
     """Return which points (n,) are of bridge decks.
 
-    Coordinates in meters, finite; `ground` is what a ground filter calls ground, decks among it or
-    not; points that are not to `use` are not seen.
+    Coordinates (n,) are in meters, finite; `ground` (n,) is what a ground filter calls ground,
+    with decks or without; points that are not in `use` (n,) are ignored.
     """
-    out, used = np.zeros(len(x), bool), np.flatnonzero(use)
+    is_deck, used = np.zeros(len(x), bool), np.flatnonzero(use)
     if not len(used):
-        return out
+        return is_deck
     column, row = (cell_numbers(axis[used], CELL_M) for axis in (x, y))
-    link = max(rules.sight, rules.max_water) + 1
-    for part, own in patches(column, row, int(rules.reach_m / CELL_M), link):
+    for part, inner in patches(column, row, int(rules.reach_m / CELL_M), rules.max_water + 1):
         points = used[part]
-        found = _find(column[part], row[part], z[points], ground[points], rules)
-        out[points[own]] = found[own]
-    return out
+        decks = _find_in_piece(column[part], row[part], z[points], ground[points], rules)
+        is_deck[points[inner]] = decks[inner]
+    return is_deck
 
 
-def _find(column, row, z, ground, rules) -> NDArray[np.bool_]:
-    """Find the decks among the points (n,) of a piece."""
+def _find_in_piece(column, row, z, ground, rules) -> NDArray[np.bool_]:
+    """Return which points (n,) of a piece are of decks."""
     window = GridWindow.enclosing(column, row)
     cell = window.flat_index(column, row)
     order, begins = levels(z, cell)
@@ -141,58 +128,53 @@ def _find(column, row, z, ground, rules) -> NDArray[np.bool_]:
     lowest = order[first]
     start = np.searchsorted(cell[lowest], np.arange(window.width * window.height + 1))
     layers = _Layers(z[lowest], start, window.height, window.width)
-    on_ground = np.logical_or.reduceat(ground[order], first)
-    solid = _solid(layers, rules)
-    deck = _deck_layers(layers, solid, on_ground, rules)
+    solid = _find_solid(layers, rules)
+    deck = _find_deck_layers(layers, solid, np.logical_or.reduceat(ground[order], first), rules)
     if not deck.any():
         return np.zeros(len(z), bool)
-    return _points_of(z, column - window.left, row - window.bottom, layers, deck, solid, rules)
+    return _take_points(z, column - window.left, row - window.bottom, layers, deck, solid, rules)
 
 
-def _deck_layers(layers, solid, ground, rules) -> NDArray[np.bool_]:
-    """Find the layers (n,) of decks."""
-    held = (np.diff(layers.start) > 0).reshape(layers.height, layers.width)
-    far, end, edge = _walks(layers, solid, _within_survey(held, rules.max_water), rules)
-    left, right = end[:, :4], end[:, 4:]
-    over = ((left == _DROP) | (left == _OPEN)) & ((right == _DROP) | (right == _OPEN))
-    narrow = (over & (far[:, :4] + far[:, 4:] <= rules.max_width)).any(axis=1)
+def _find_deck_layers(layers, solid, ground, rules) -> NDArray[np.bool_]:
+    """Return which layers (n,) are of decks; `solid` and `ground` (n,) describe the layers."""
+    has_points = (np.diff(layers.start) > 0).reshape(layers.height, layers.width)
+    distance, edge = _walk(layers, solid, _lie_in_survey(has_points, rules.max_water), rules)
+    narrow = (distance[:, :4] + distance[:, 4:] <= rules.max_width).any(axis=1)
     rim = narrow
-    for _ in range(rules.grown):
-        _, other = _steps(layers, solid, rim, rules)
+    for _ in range(rules.grow_rounds):
+        _, beside = _pair_steps(layers, solid, rim, rules)
         rim = np.zeros(len(narrow), bool)
-        rim[other] = True
+        rim[beside] = True
         rim &= ~narrow & ~ground
         narrow = narrow | rim
-    one, other = _steps(layers, solid, narrow, rules)
-    layer, number = np.flatnonzero(narrow), np.cumsum(narrow) - 1
-    inside, part = narrow[other], np.empty(len(layer), np.int64)
-    number_sets(number[one[inside]], number[other[inside]], part)
-    out = np.zeros(len(narrow), bool)
+    is_deck, layer = np.zeros(len(narrow), bool), np.flatnonzero(narrow)
     if len(layer):
-        leads = np.bincount(one[~inside & ground[other]], minlength=len(narrow))[layer] > 0
-        cell = np.repeat(np.arange(held.size), np.diff(layers.start))[layer]
-        out[layer] = _are_decks(part, *np.divmod(cell, layers.width), leads, edge[layer], rules)[
-            part
-        ]
-    return out
+        first, second = _pair_steps(layers, solid, narrow, rules)
+        number, inside, part = np.cumsum(narrow) - 1, narrow[second], np.empty(len(layer), int)
+        number_sets(number[first[inside]], number[second[inside]], part)
+        leads = np.bincount(first[~inside & ground[second]], minlength=len(narrow))[layer] > 0
+        cell = np.searchsorted(layers.start, layer, "right") - 1
+        row, column = np.divmod(cell, layers.width)
+        is_deck[layer] = _judge_parts(part, row, column, leads, edge[layer], rules)[part]
+    return is_deck
 
 
-def _are_decks(part, row, column, leads, edge, rules) -> NDArray[np.bool_]:
-    """Judge the parts that narrow layers (k,) belong to by their ends and sides.
+def _judge_parts(part, row, column, leads, edge, rules) -> NDArray[np.bool_]:
+    """Return which parts of narrow layers are decks, judged by their ends and sides.
 
-    `leads` tells the layers that lead on to ground, `edge` (k, 8) their edges by direction.
+    `part`, `row` and `column` (k,) place the layers, `leads` (k,) tells those that lead on to
+    ground, `edge` (k, 8) what they end at by direction.
     """
     size = np.bincount(part)
 
     def sums(values):
         return np.bincount(part, values, len(size))
 
-    drop = edge == _DROP
-    # The deck runs across its drops. Places from its middle, times the size: whole numbers,
-    # wherever the raster begins.
-    xx, xy, yy = (
-        sums((drop * by).sum(axis=1)) for by in (_EAST * _EAST, _EAST * _NORTH, _NORTH * _NORTH)
-    )
+    drop = edge == DROP
+    # The deck runs across its drops. Distances from its middle are multiplied by the size: whole
+    # numbers, wherever the raster begins.
+    products = EAST * EAST, EAST * NORTH, NORTH * NORTH
+    xx, xy, yy = (sums((drop * product).sum(axis=1)) for product in products)
     turn = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
     cos, sin = np.cos(turn)[part], np.sin(turn)[part]
     north, east = (at * size[part] - sums(at)[part] for at in (row, column))
@@ -204,24 +186,24 @@ def _are_decks(part, row, column, leads, edge, rules) -> NDArray[np.bool_]:
     good = (size >= rules.min_cells) & (extent <= rules.max_length)
     for end in (along < -0.5 * half[part], along > 0.5 * half[part]):
         good &= sums(leads & end) >= rules.min_end_ratio * size / length
-    aside = (_NORTH * cos[:, None] - _EAST * sin[:, None]) / np.hypot(_EAST, _NORTH)
-    for side in (aside > 0.8, aside < -0.8):
+    aside = (NORTH * cos[:, None] - EAST * sin[:, None]) / np.hypot(EAST, NORTH)
+    for side in (aside > ACROSS, aside < -ACROSS):
         good &= sums((drop & side).any(axis=1)) >= rules.min_side_ratio * length
-    walls = sums(((edge == _WALL) & (np.abs(aside) > 0.8)).any(axis=1))
+    walls = sums(((edge == WALL) & (np.abs(aside) > ACROSS)).any(axis=1))
     return good & (walls <= rules.max_wall_ratio * 2 * length)
 
 
 @device
-def _most(column, row, rules):
-    """Return the highest step to a cell so many columns and rows away, meters."""
-    return rules.max_step_m + rules.max_grade * np.sqrt(float(column * column + row * row))
+def _max_step(columns, rows, rules):
+    """Return the highest step, in meters, to a cell so many columns and rows away."""
+    return rules.max_step_m + rules.max_grade * np.sqrt(float(columns * columns + rows * rows))
 
 
 @njit
-def _solid(layers, rules):
-    """Find the layers (n,) that most cells around continue."""
+def _find_solid(layers, rules):
+    """Return which layers (n,) most cells around continue."""
     z, start, h, w = layers
-    out = np.zeros(len(z), np.bool_)
+    solid = np.zeros(len(z), np.bool_)
     for j in range(h):
         for i in range(w):
             for n in range(start[j * w + i], start[j * w + i + 1]):
@@ -231,149 +213,137 @@ def _solid(layers, rules):
                         if a == i and b == j:
                             continue
                         for m in range(start[b * w + a], start[b * w + a + 1]):
-                            if abs(z[m] - z[n]) <= _most(a - i, b - j, rules):
+                            if abs(z[m] - z[n]) <= _max_step(a - i, b - j, rules):
                                 near += 1
                                 break
-                out[n] = near >= rules.min_neighbors
-    return out
+                solid[n] = near >= rules.min_neighbors
+    return solid
 
 
 @njit
-def _within_survey(held, reach):
-    """Find the cells (h, w) that have held ones in all four quadrants, `reach` cells away at most
-    along either axis."""
-    h, w = held.shape
-    out = np.ones((h, w), np.bool_)
+def _lie_in_survey(has_points, reach):
+    """Return the cells (h, w) with points in all four quadrants, at most `reach` cells away.
+
+    `has_points` (h, w) tells the cells with points; distances are along either axis.
+    """
+    h, w = has_points.shape
+    inside = np.ones((h, w), np.bool_)
     for up in range(2):
         for right in range(2):
-            far = np.full((h + 2, w + 2), reach + 1)  # with a rim
+            away = np.full((h + 2, w + 2), reach + 1)  # with a rim
             for jj in range(h):
                 j = jj if up else h - 1 - jj
                 for ii in range(w):
                     i = ii if right else w - 1 - ii
                     b, a = (j if up else j + 2), (i if right else i + 2)
-                    near = min(far[b, i + 1], far[j + 1, a], far[b, a])
-                    far[j + 1, i + 1] = 0 if held[j, i] else 1 + near
-                    out[j, i] &= far[j + 1, i + 1] <= reach
-    return out
+                    near = min(away[b, i + 1], away[j + 1, a], away[b, a])
+                    away[j + 1, i + 1] = 0 if has_points[j, i] else 1 + near
+                    inside[j, i] &= away[j + 1, i + 1] <= reach
+    return inside
 
 
 @njit
-def _walks(layers, solid, within, rules):
-    """Walk from each layer in eight directions: how far it is to an edge and which (n, 8); and the
-    layer's own edges (n, 8).
+def _walk(layers, solid, in_survey, rules):
+    """Walk from each solid layer in eight directions.
 
-    Where an edge is farther than the widest deck, the distance is endless.
+    Return the distance (n, 8) float32 in cells to where the walk ends at a drop or open, infinite
+    where it ends at a wall; and DROP, OPEN or WALL (n, 8) int8 where a layer itself is such an end.
     """
     z, start, h, w = layers
-    far, end = np.full((len(z), 8), _FAR, np.float32), np.full((len(z), 8), _WALL, np.int8)
-    edge = np.full((len(z), 8), _GOES_ON, np.int8)
+    distance = np.full((len(z), 8), np.inf, np.float32)
+    edge = np.zeros((len(z), 8), np.int8)
     for d in range(8):
-        di, dj = _EAST[d], _NORTH[d]
-        step = np.sqrt(float(di * di + dj * dj))
+        east, north = EAST[d], NORTH[d]
+        step = np.sqrt(float(east * east + north * north))
         for jj in range(h):
-            j = h - 1 - jj if dj > 0 else jj
+            j = h - 1 - jj if north > 0 else jj
             for ii in range(w):
-                i = w - 1 - ii if di > 0 else ii
+                i = w - 1 - ii if east > 0 else ii
                 for n in range(start[j * w + i], start[j * w + i + 1]):
                     if not solid[n]:
                         continue
-                    found = -1
-                    for s in range(1, int(rules.max_gap / step + 0.5) + 1):
-                        y, x = j + s * dj, i + s * di
-                        if y < 0 or x < 0 or y >= h or x >= w:
-                            break
-                        nearest = _most(s * di, s * dj, rules)
-                        for m in range(start[y * w + x], start[y * w + x + 1]):
-                            if solid[m] and abs(z[m] - z[n]) <= nearest:
-                                found, nearest = m, abs(z[m] - z[n])
-                        if found >= 0:
-                            if far[found, d] + s * step <= rules.max_width:
-                                far[n, d] = far[found, d] + s * step
-                                end[n, d] = end[found, d]
-                            break
-                    if found < 0:
-                        edge[n, d] = _edge(layers, solid, within, j, i, di, dj, z[n], rules)
-                        far[n, d], end[n, d] = 0.0, edge[n, d]
-    return far, end, edge
+                    place = j, i, north, east
+                    ahead, steps = _look_ahead(layers, solid, in_survey, place, z[n], rules)
+                    if ahead >= 0:
+                        distance[n, d] = distance[ahead, d] + steps * step
+                    else:
+                        edge[n, d] = -ahead
+                        distance[n, d] = np.inf if ahead == -WALL else 0.0
+    return distance, edge
 
 
 @device
-def _edge(layers, solid, within, j, i, di, dj, level, rules):
-    """Tell what lies ahead of a layer where no walk goes on."""
+def _look_ahead(layers, solid, in_survey, place, level, rules):
+    """Return the next solid layer ahead that one can step on to, and how many steps away it is.
+
+    -DROP, -OPEN or -WALL where there is none. `place` is the row and column of the layer and the
+    step in rows and columns; `level` its height.
+    """
     z, start, h, w = layers
-    step = np.sqrt(float(di * di + dj * dj))
-    ahead = int(rules.max_gap / step + 0.5)
-    blocked = False
-    for s in range(1, ahead + 1):
-        for side in range(-1, 2):
-            y, x = j + s * dj + side * di, i + s * di - side * dj
-            if not (0 <= y < h and 0 <= x < w):
-                continue
-            for m in range(start[y * w + x], start[y * w + x + 1]):
-                if side == 0 and z[m] < level - max(
-                    rules.min_drop_m, rules.min_wall_slope * s * step
-                ):
-                    return _DROP
-                near = level - rules.min_clearance_m < z[m] < level + rules.headroom_m
-                blocked |= s > 1 and (solid[m] or near)
-    if blocked:
-        return _WALL
-    y, x = j + ahead * dj, i + ahead * di
-    if not (0 <= y < h and 0 <= x < w and within[y, x]):
-        return _WALL
-    reach = rules.sight
-    for b in range(max(j - reach, 0) - j, min(j + reach + 1, h) - j):
-        for a in range(max(i - reach, 0) - i, min(i + reach + 1, w) - i):
-            along, squared = a * di + b * dj, a * a + b * b
-            if along <= 0 or squared > reach * reach:
-                continue
-            if 2 * along * along < squared * (di * di + dj * dj):
-                continue
-            m = start[(j + b) * w + i + a]
-            if m < start[(j + b) * w + i + a + 1] and z[m] < level - rules.min_clearance_m:
-                return _DROP
-    return _OPEN
+    j, i, north, east = place
+    step, drops, empty = np.sqrt(float(east * east + north * north)), False, True
+    steps = int(rules.max_gap / step + 0.5)
+    for s in range(1, steps + 1):
+        y, x = j + s * north, i + s * east
+        if y < 0 or x < 0 or y >= h or x >= w:
+            empty = False
+            break
+        next_layer, least = -1, _max_step(s * east, s * north, rules)
+        drop = max(rules.min_drop_m, rules.min_wall_slope * s * step)
+        for m in range(start[y * w + x], start[y * w + x + 1]):
+            if solid[m] and abs(z[m] - level) <= least:
+                next_layer, least = m, abs(z[m] - level)
+            drops |= z[m] < level - drop
+            empty &= s == 1
+        if next_layer >= 0:
+            return next_layer, s
+    if drops:
+        return -DROP, 0
+    if empty and in_survey[j + steps * north, i + steps * east]:
+        return -OPEN, 0
+    return -WALL, 0
 
 
 @njit
-def _steps(layers, solid, some, rules):
-    """Pairs (k,), (k,) of some layers and of solid ones up to `link` cells away that one can step
-    on to."""
+def _pair_steps(layers, solid, chosen, rules):
+    """Return pairs (k,), (k,) of chosen layers and of solid ones that one can step on to.
+
+    The second lies up to `link` cells away from the first.
+    """
     z, start, h, w = layers
-    one, other, count = np.empty(1024, np.int64), np.empty(1024, np.int64), 0
+    first, second, count = np.empty(1024, np.int64), np.empty(1024, np.int64), 0
     for j in range(h):
         for i in range(w):
             for n in range(start[j * w + i], start[j * w + i + 1]):
-                if not some[n]:
+                if not chosen[n]:
                     continue
                 for b in range(max(j - rules.link, 0), min(j + rules.link + 1, h)):
                     for a in range(max(i - rules.link, 0), min(i + rules.link + 1, w)):
                         for m in range(start[b * w + a], start[b * w + a + 1]):
                             step = abs(z[m] - z[n])
-                            if m == n or not solid[m] or step > _most(a - i, b - j, rules):
+                            if m == n or not solid[m] or step > _max_step(a - i, b - j, rules):
                                 continue
-                            if count == len(one):
-                                one = np.concatenate((one, one))
-                                other = np.concatenate((other, other))
-                            one[count], other[count] = n, m
+                            if count == len(first):
+                                first = np.concatenate((first, first))
+                                second = np.concatenate((second, second))
+                            first[count], second[count] = n, m
                             count += 1
-    return one[:count], other[:count]
+    return first[:count], second[:count]
 
 
 @njit
-def _points_of(z, column, row, layers, deck, solid, rules):
-    """Find the points (n,) whose nearest solid layer, of those about as high, is a deck's."""
+def _take_points(z, column, row, layers, deck, solid, rules):
+    """Return the points (n,) whose nearest solid layer, of those about as high, is a deck's."""
     heights, start, h, w = layers
-    out = np.zeros(len(z), np.bool_)
+    taken = np.zeros(len(z), np.bool_)
     for p in range(len(z)):
         nearest = 2 * (rules.beside + 1) ** 2
         for b in range(max(row[p] - rules.beside, 0), min(row[p] + rules.beside + 1, h)):
             for a in range(max(column[p] - rules.beside, 0), min(column[p] + rules.beside + 1, w)):
-                far = (a - column[p]) ** 2 + (b - row[p]) ** 2
+                away = (a - column[p]) ** 2 + (b - row[p]) ** 2
                 for m in range(start[b * w + a], start[b * w + a + 1]):
                     if not solid[m] or abs(heights[m] - z[p]) > rules.surface_m:
                         continue
-                    if far < nearest or (far == nearest and deck[m]):
-                        nearest, out[p] = far, deck[m]
-    return out
+                    if away < nearest or (away == nearest and deck[m]):
+                        nearest, taken[p] = away, deck[m]
+    return taken
