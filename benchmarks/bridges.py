@@ -109,7 +109,7 @@ def main() -> None:
         town = make_town(300.0, density, seed, progress=False)
         true, use = town.classification, town.classification != 7
         decks(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 17, true == 1)
-        ends = true_objects(town.options).cables[..., :2].reshape(-1, 2)
+        ends = true_objects(town.size, town.seed).cables[..., :2].reshape(-1, 2)
         held = (true == 15) & (cKDTree(ends).query(town.xyz[:, :2])[0] < AT_POLE)
         name = f"town {seed}, {density:g} points/m2"
         wires(name, town.xyz, use, true == 14, true == 15, true == 14, held)

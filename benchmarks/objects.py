@@ -19,7 +19,8 @@ from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
 from pdal_stages.objects.comparison import compare_buildings, match_by_overlap, match_by_place
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
-from pdal_stages.synthetic import TownOptions, make_town
+from pdal_stages.synthetic import make_town
+from pdal_stages.synthetic.town import ORIGIN
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from town_truth import true_objects
@@ -88,8 +89,8 @@ def town(seed, codes=None, refuse=()):
     `refuse`: reasons of objects that are left out.
     """
     town_points = make_town(SIZE, DENSITY, seed, progress=False)
-    true = true_objects(TownOptions(SIZE, DENSITY, seed))
-    x0, y0 = town_points.options.origin[:2]
+    true = true_objects(SIZE, seed)
+    x0, y0 = ORIGIN[:2]
     square = shapely.box(x0, y0, x0 + SIZE, y0 + SIZE)
     codes, reliability = (town_points.classification, None) if codes is None else codes(town_points)
     cells = Cells.from_points(*town_points.xyz.T, codes, 0.5, reliability=reliability)

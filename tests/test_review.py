@@ -13,10 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.review import review_output
+from pdal_stages.review import review_files
 from pdal_stages.review.expected_errors import RULES, ReviewCells, find_patches
-from pdal_stages.review.review_files import Review
-from pdal_stages.review.review_output import styles
+from pdal_stages.review.review_files import Review, styles
 
 
 def cloud(seed, n=3000, wide=60.0):
@@ -69,8 +68,8 @@ def test_places_are_told_in_the_coordinates_of_the_files():
     )
     x, y = feet.rows[0]["at"]
     assert np.allclose(np.multiply((x, y), foot), meters.rows[0]["at"], atol=1e-3)
-    assert review_output.lines(feet.to_dict())[-1].endswith(f"a.laz at {x:.1f}, {y:.1f}")
-    assert review_output.review_layers(feet)["patches"].shapes[0].contains(shapely.Point(x, y))
+    assert review_files.lines(feet.to_dict())[-1].endswith(f"a.laz at {x:.1f}, {y:.1f}")
+    assert review_files.review_layers(feet)["patches"].shapes[0].contains(shapely.Point(x, y))
 
 
 def test_patches_hold_each_cell_once_and_come_best_first():
@@ -150,7 +149,7 @@ def test_all_files_are_written_or_none(folder, tmp_path, monkeypatch, run, last)
     def full(*_):
         raise StageError("no room")
 
-    monkeypatch.setattr(review_output, last, full)
+    monkeypatch.setattr(review_files, last, full)
     out = [tmp_path / f"r.{ending}" for ending in ("gpkg", "json", "html")]
     code, _, err = run("review", folder / "whole.laz", out[0], "--json", out[1], "--html", out[2])
     assert code == 1 and "no room" in err and not list(tmp_path.iterdir())

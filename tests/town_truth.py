@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pdal_stages.synthetic.districts import filled_site
-from pdal_stages.synthetic.solids import Footprint, Site
-from pdal_stages.synthetic.town import SPAN, TownOptions
+from pdal_stages.synthetic.districts import Footprint, Site, filled_site
+from pdal_stages.synthetic.town import ORIGIN, SPAN
 from pdal_stages.synthetic.townplan import block_at, plan_town
 
 
@@ -53,29 +52,19 @@ class TrueObjects(NamedTuple):
     decks: NDArray  # (n, 4, 2): corners
 
 
-def true_objects(options: TownOptions) -> TrueObjects:
-    """The things of a town.
-
-    Parameters
-    ----------
-    options : TownOptions
-
-    Returns
-    -------
-    TrueObjects
-        In the town's coordinates (meters).
-    """
-    plan, half = plan_town(int(options.seed)), options.size / 2
+def true_objects(size: float, seed: int) -> TrueObjects:
+    """Return the objects of a town of `size` meters, in its coordinates (meters)."""
+    plan, half = plan_town(seed), size / 2
     square = np.array([(p * half, q * half) for p in (-1, 1) for q in (-1, 1)]) @ plan.turn
     low, high = square.min(axis=0) - SPAN, square.max(axis=0) + SPAN
     (i0, j0, _), (i1, j1, _) = block_at(*low, plan), block_at(*high, plan)
 
     def placed(site: Site, ab: list[tuple[float, float]]) -> NDArray:
         uv = np.array(ab, float).reshape(-1, 2) + np.array([site.u0, site.v0])
-        return uv @ plan.turn.T + half + options.origin[:2]
+        return uv @ plan.turn.T + half + ORIGIN[:2]
 
     def inside(places: NDArray) -> bool:
-        away = np.abs(places - options.origin[:2] - half)
+        away = np.abs(places - ORIGIN[:2] - half)
         return bool((away <= half).all(axis=1).any())
 
     houses, trees, cables, decks = [], [], [], []
@@ -84,7 +73,7 @@ def true_objects(options: TownOptions) -> TrueObjects:
         for kind, *what in site.built:
             if kind == "house":
                 base, overhang, eave, top, cuts = what
-                z = options.origin[2]
+                z = ORIGIN[2]
                 roof, walls = (
                     placed(site, _corners(base, p, q))
                     for p, q in ((overhang / 2, overhang), (0, 0))
@@ -100,7 +89,7 @@ def true_objects(options: TownOptions) -> TrueObjects:
             elif kind == "cable":
                 ends = placed(site, [what[0][:2], what[1][:2]])
                 if inside(ends):
-                    z = np.array([[what[0][2]], [what[1][2]]]) + options.origin[2]
+                    z = np.array([[what[0][2]], [what[1][2]]]) + ORIGIN[2]
                     cables.append(np.hstack([ends, z]))
             elif kind == "deck":
                 corners = placed(site, _corners(*what))

@@ -27,8 +27,7 @@ from pdal_stages import cli
 from pdal_stages.base.vector import points_inside
 from pdal_stages.pipeline.spatial_reference import reference_of_file
 from pdal_stages.reports.vector_files import Layer, write_layers
-from pdal_stages.review.review_files import review_files
-from pdal_stages.review.review_output import review_layers
+from pdal_stages.review.review_files import review_files, review_layers
 
 ROUNDS, PATCHES = 3, 5
 

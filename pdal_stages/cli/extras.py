@@ -94,7 +94,7 @@ def _objects(options: argparse.Namespace) -> None:
 
 def _review(options: argparse.Namespace) -> None:
     """List the places to check."""
-    from ..review.review_output import lines, write_review
+    from ..review.review_files import lines, write_review
 
     html = re.sub(r"\.\w+$", ".html", options.output) if options.html is None else options.html
     settings = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}

@@ -19,9 +19,8 @@ SURE = "sure"
 CHECK = "check"
 #: Why an object is to be checked.
 REASONS = (
-    "no ground near", "small", "narrow", "vehicle", "container", "low", "rough roof",
-    "unsure points", "no facade", "few points", "thin crown", "wide crown", "pole", "short",
-    "not straight",
+    "no ground near", "small", "narrow", "low", "rough roof", "unsure points", "no facade",
+    "few points", "thin crown", "wide crown", "short", "not straight",
 )  # fmt: skip
 
 
@@ -37,37 +36,21 @@ class CheckRules:
     rough_from_area: float = 30.0  #: smaller roofs hold too few cells for planes
     facade_to_area: float = 50.0  #: larger buildings may hide their walls from the laser
     min_facade: float = 1.5  #: height between points of a cell at the edge that shows a wall
-    max_box_area: float = 45.0  #: larger objects are no vehicles or containers
     min_tree_points: int = 10
     min_crown_ratio: float = 0.12  #: crown diameter / height
     max_crown_ratio: float = 1.6  #: crown diameter / height
-    max_pole_height: float = 15.0  #: lamps are no higher
-    max_pole_ratio: float = 0.35  #: width / height of a pole with its arm
-    crown_depth: float = 0.8  #: points of a cell of a crown lie this far above each other
-    min_crown_share: float = 0.36  #: cells that deep: an arm returns one echo, a crown several
     min_span: float = 8.0
     min_straightness: float = 0.9  #: distance between a span's ends / its length
     min_deck_area: float = 20.0
     min_deck_height: float = 0.5
 
 
-@dataclass(frozen=True)
-class BoxShape:
-    """Ranges of a box's sides in meters, as cells show them: up to two cells wider than it is."""
-
-    width: tuple[float, float]
-    length: tuple[float, float]
-    height: tuple[float, float]
-    min_ratio: float  #: length / width
-    max_slope: float  #: of the top, degrees
-
-
 RULES = CheckRules()
-#: Boxes that are often taken for buildings, by reason.
-BOXES = {
-    "vehicle": BoxShape((1.5, 3.2), (3.5, 7.0), (0.0, 2.4), 1.5, 25.0),
-    "container": BoxShape((2.0, 3.7), (5.5, 13.5), (2.2, 3.8), 1.9, 6.0),
-}
+#: Width of the pieces of wires whose means form a span's line, meters.
+PIECE = 2.0
+#: Wires that spread no wider than this across their direction lie side by side, meters: a line of
+#: masts carries its conductors within a few meters.
+MAX_SPREAD = 4.0
 
 
 class ObjectCells(NamedTuple):
@@ -118,7 +101,6 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
     planes, slope, planar = roof_planes(raster, size)
     facade = np.mean(np.nan_to_num(cells.z[edge] - cells.low[edge]) >= RULES.min_facade)
     ridge = float(np.percentile(above, 98))
-    box = _box_like(cells, ridge, slope, size) if area < RULES.max_box_area else ""
     return cells.describe(
         {
             "area": area,
@@ -133,27 +115,11 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
             "no ground near": math.isnan(ground),
             "small": area < RULES.min_building_area,
             "narrow": not scipy.ndimage.binary_erosion(inside, square).any(),
-            box: bool(box),
             "low": ridge < RULES.min_building_height,
             "rough roof": planar < RULES.min_planar_share and area >= RULES.rough_from_area,
             "no facade": facade == 0 and area < RULES.facade_to_area,
         },
     )
-
-
-def _box_like(cells: ObjectCells, height: float, slope: float, size: float) -> str:
-    """Return which of `BOXES` an object may be; empty where it is like none of them."""
-    turns = np.radians(np.arange(0.0, 90.0, 3.0))[:, None]
-    u = cells.column * np.cos(turns) + cells.row * np.sin(turns)
-    v = cells.row * np.cos(turns) - cells.column * np.sin(turns)
-    sides = np.array([np.ptp(u, axis=1) + 1.0, np.ptp(v, axis=1) + 1.0]) * size
-    width, length = sorted(sides[:, np.argmin(np.round(sides.prod(axis=0), 6))].tolist())
-    for name, box in BOXES.items():
-        ranges = (box.width, width), (box.length, length), (box.height, height)
-        fits = all(low <= value <= high for (low, high), value in ranges)
-        if fits and length >= box.min_ratio * width and slope <= box.max_slope:
-            return name
-    return ""
 
 
 def measure_tree(
@@ -165,8 +131,6 @@ def measure_tree(
     above = cells.z - cells.ground
     highest = int(np.argmax(np.where(np.isnan(above), -np.inf, above)))
     height, diameter = float(above[highest]), 2.0 * math.sqrt(area / math.pi)
-    crown_share = np.mean(np.nan_to_num(cells.z - cells.low) > RULES.crown_depth)
-    slim = height <= RULES.max_pole_height and diameter < RULES.max_pole_ratio * height
     return cells.describe(
         {
             "x": (top_column + 0.5) * size,
@@ -181,7 +145,6 @@ def measure_tree(
             "few points": cells.points.sum() < RULES.min_tree_points,
             "thin crown": diameter < RULES.min_crown_ratio * height,
             "wide crown": diameter > RULES.max_crown_ratio * height,
-            "pole": slim and bool(crown_share < RULES.min_crown_share),
         },
     )
 
@@ -209,19 +172,19 @@ def measure_span(cells: ObjectCells, size: float) -> dict[str, Any]:
 
 
 def wire_path(cells: ObjectCells, size: float) -> NDArray[np.float64]:
-    """Return a line along wires (n, 3), meters: means of pieces of 2 m along their direction."""
+    """Return a line along wires (n, 3), meters: means of pieces of `PIECE` along their direction."""
     x, y = (cells.column + 0.5) * size, (cells.row + 0.5) * size
     u, v = x - x.min(), y - y.min()
     du, dv = u - u.mean(), v - v.mean()
     angle = 0.5 * math.atan2(2.0 * float(du @ dv), float(du @ du - dv @ dv))
     c, s = math.cos(angle), math.sin(angle)
     along, across = u * c + v * s, v * c - u * s
-    _, piece = np.unique(np.floor((along - along.min()) / 2.0), return_inverse=True)
+    _, piece = np.unique(np.floor((along - along.min()) / PIECE), return_inverse=True)
     count = np.bincount(piece)
     if len(count) == 1:  # a wire of one piece
         ends = [np.argmin(along), np.argmax(along)]
         return np.column_stack([x, y, cells.z])[ends]
-    if np.ptp(across) < 4.0:  # wires side by side: one straight line between them
+    if np.ptp(across) < MAX_SPREAD:  # wires side by side: one straight line between them
         across = np.full(len(across), across.mean())
     u, v, z = (np.bincount(piece, weights=values) / count for values in (along, across, cells.z))
     u[[0, -1]] = along.min(), along.max()  # from one end to the other

@@ -18,6 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.units import horizontal_part
 from ..base.vector import reading, vector
 
 #: Limits of the size classes of buildings, m2.
@@ -222,7 +223,12 @@ class VectorObjects:
             if what == "trees":
                 columns = {str(n).lower(): v for n, v in zip(about["fields"], values, strict=True)}
                 title = next((n for n in HEIGHT_NAMES if n in columns), "")
-                heights = _numbers(path, title, columns.get(title, exists * np.nan))[exists]
+                column = columns.get(title, exists * np.nan)
+                try:  # of texts empty ones, and None, are not known
+                    heights = np.array([v or np.nan for v in column.tolist()], float)[exists]
+                except ValueError as error:
+                    what = f"the column '{title}' must hold heights of trees, in meters"
+                    raise StageError(what, where=path, found=str(error)) from None
         if not shapes:
             raise StageError(
                 "the file holds neither buildings nor trees",
@@ -251,19 +257,6 @@ class VectorObjects:
         return replace(self, shapes=shapes, heights=heights)
 
 
-def _numbers(path: str, name: str, values: Any) -> NDArray[np.float64]:
-    """Return a column of heights as numbers, NaN where empty; texts of numbers are accepted."""
-    try:
-        return np.array([math.nan if v in (None, "") else float(v) for v in values.tolist()])
-    except (TypeError, ValueError) as error:
-        raise StageError(
-            f"the column '{name}' must hold heights of trees, in meters",
-            where=path,
-            found=str(error),
-            cure="Make it a number, or name it otherwise if it is something else",
-        ) from None
-
-
 def compare_objects(
     detected: str, reference: str, area: str | None = None
 ) -> tuple[dict[str, Any], list[str]]:
@@ -286,7 +279,7 @@ def compare_objects(
     both = VectorObjects.read(detected), VectorObjects.read(reference)
     for layer in both[0].crs.keys() & both[1].crs.keys():
         a, b = (objects.crs[layer] for objects in both)
-        if a and b and a != b and _horizontal_name(a) != _horizontal_name(b):
+        if a and b and len({vector("pyproj").CRS(horizontal_part(crs)) for crs in (a, b)}) > 1:
             target = a if a.startswith("EPSG") else "EPSG:CODE"
             raise StageError(
                 "the reference has another reference system",
@@ -332,12 +325,6 @@ def _warnings(detected: VectorObjects, reference: VectorObjects) -> list[str]:
             f"Name a column {HEIGHT_NAMES[0]} (or {', '.join(HEIGHT_NAMES[1:])})"
         )
     return out
-
-
-def _horizontal_name(crs: str) -> str:
-    """Return the name of the horizontal part of a compound system; other systems as they are."""
-    compound = crs.startswith(("COMPD_CS", "COMPOUNDCRS")) and crs.count('"') > 3
-    return crs.split('"')[3] if compound else crs
 
 
 def table(figures: dict[str, Any]) -> str:

@@ -25,14 +25,18 @@ LOWEST_CROWN = 1.5
 TOP_SHARE = 0.8
 #: Height of a crown's edge / height of its top; lower cells are undergrowth.
 CROWN_SHARE = 0.3
+#: Pits: cells lower than this share of the fourth highest of their eight neighbors. Where a pulse
+#: passes through a crown, at least half of the cells around hold its canopy.
+PIT_SHARE = 0.5
+#: Distance at which the Gaussian is cut off, standard deviations: 96 % of its weight lie within.
+GAUSS_REACH = 2.5
 _RING = np.array([[True, True, True], [True, False, True], [True, True, True]])
 
 
 def canopy(high: NDArray, ground: NDArray) -> NDArray[np.float64]:
     """Return the canopy height model, meters above the ground, with pits filled.
 
-    Cells that lie more than half below the fourth highest of their eight neighbors are raised to
-    it.
+    Cells lower than `PIT_SHARE` of the fourth highest of their eight neighbors are raised to it.
 
     Parameters
     ----------
@@ -43,12 +47,12 @@ def canopy(high: NDArray, ground: NDArray) -> NDArray[np.float64]:
     """
     height = np.maximum(np.nan_to_num(high - ground), 0.0)
     fourth = scipy.ndimage.rank_filter(height, -4, footprint=_RING, mode="constant")
-    return np.where(height < 0.5 * fourth, fourth, height)
+    return np.where(height < PIT_SHARE * fourth, fourth, height)
 
 
 def smooth(height: NDArray, sigma: float) -> NDArray:
     """Return heights averaged by a Gaussian of `sigma` cells; no canopy lies beyond the array."""
-    radius = int(np.ceil(2.5 * sigma))
+    radius = int(np.ceil(GAUSS_REACH * sigma))
     out = scipy.ndimage.gaussian_filter(height, sigma, mode="constant", radius=radius)
     return np.where(height > 0.0, out, 0.0)
 

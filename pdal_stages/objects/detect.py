@@ -10,6 +10,7 @@ with as much around them, give exactly the objects of the whole area.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,14 +63,13 @@ def find_objects(
         Records of all points of the area, by :meth:`Cells.from_points`; objects may be cut a meter
         or two from its edge.
     settings : ObjectSettings, optional
+        Its `cell` is that of the records.
     block : int
         Side of the blocks of work, in cells; even. It changes nothing but memory.
     progress : bool, optional
         Whether to show progress on stderr.
     """
-    settings = settings or ObjectSettings(cell=cells.size)
-    if settings.cell != cells.size:
-        raise ValueError(f"cells of {cells.size} m, settings for {settings.cell} m")
+    settings = replace(settings or ObjectSettings(), cell=cells.size)
     kinds_of_block: dict[tuple[int, int], list[Kind]] = {}
     for kind in _DETECTORS:
         column, row, _ = split_keys(cells.of_kind(kind).key)

@@ -21,6 +21,10 @@ class RoofRules:
     max_plane_distance: float = 0.2  #: of vegetation from that plane
     max_thickness: float = 0.5  #: between points of a cell: a roof is a surface, a crown is not
     max_slope: float = 2.0  #: rise per meter: 63 degrees
+    # What the roof's rise across a cell adds to these, as a point lies anywhere in its cell
+    scatter_in_cell: float = 0.09  #: times the rise squared; a uniform place has a variance of 1/12
+    thickness_in_cell: float = 1.5  #: times the rise; along the diagonal of a cell it is 1.41
+    offset_in_cell: float = 0.4  #: times the rise; from the middle to the edge of a cell it is 0.5
     # Holes without returns (`fill_holes`)
     level_tolerance: float = 1.0  #: of a hole's rim around its median height
     min_level_share: float = 0.65  #: cells of the rim within that tolerance
@@ -129,11 +133,11 @@ def extend_roofs(
         empty = np.where(np.isnan(high), leaves, np.nan)
         east, north, above, scatter = planes(high, empty, size, 1.0)
         steepness = east**2 + north**2
-        rise = size * np.sqrt(steepness)  # the highest point of a cell lies anywhere in it
-        added = scatter <= RULES.max_scatter**2 + 0.09 * rise**2
+        rise = size * np.sqrt(steepness)
+        added = scatter <= RULES.max_scatter**2 + RULES.scatter_in_cell * rise**2
         added &= steepness <= RULES.max_slope**2
-        added &= thickness <= RULES.max_thickness + 1.5 * rise
-        added &= np.abs(above) - 0.4 * rise <= RULES.max_plane_distance
+        added &= thickness <= RULES.max_thickness + RULES.thickness_in_cell * rise
+        added &= np.abs(above) - RULES.offset_in_cell * rise <= RULES.max_plane_distance
         if not added.any():
             break
         high = np.where(added, leaves, high)

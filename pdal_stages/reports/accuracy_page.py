@@ -112,28 +112,16 @@ def write_accuracy_report(
     return write_whole(path, page.encode())
 
 
-def _checked(place: Place) -> tuple[npt.NDArray[np.float64], npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return coordinates (n, 3), reference and prediction (n,), or raise StageError."""
-    points = np.asarray(place.xyz, dtype=np.float64)
-    where = "accuracy report"
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise StageError("'xyz' must be n x 3", where=where, found=f"shape {points.shape}")
-    if not len(points):
-        raise StageError("there is nothing to draw", where=where, found="0 points")
-    if bad := int((~np.isfinite(points).all(axis=1)).sum()):
-        what = f"{bad:,} of {len(points):,} points have coordinates that are not finite"
-        raise StageError(what, where=where)
-    true, labels = as_codes(place.reference, "reference"), as_codes(place.predicted, "prediction")
-    refuse_other_lengths(true, {"prediction": labels, "list of coordinates": points})
-    return points, true, labels
-
-
 def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
     """Return maps of reference, prediction and errors for the template.
 
     There are none where the points lie at one place or in a line.
     """
-    points, true, labels = _checked(place)
+    points = np.asarray(place.xyz, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise StageError("'xyz' must be n x 3 finite coordinates", found=f"shape {points.shape}")
+    true, labels = as_codes(place.reference, "reference"), as_codes(place.predicted, "prediction")
+    refuse_other_lengths(true, {"prediction": labels, "list of coordinates": points})
     target_of = np.arange(1 << 16)
     target_of[list(a.merged)] = list(a.merged.values())
     compared = np.isin(target_of[true], a.classes) & ~np.isin(true, list(a.left_out))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import class_color
-from ..base.errors import DependencyError, StageError
+from ..base.errors import StageError
 from ..base.units import Units
 from ..base.vector import vector
 from ..objects.attributes import CHECK
@@ -126,14 +126,8 @@ def object_frames(
     StageError
         Where arrays do not fit each other, no point has a class of any kind, or none is ground.
     """
-    try:
-        import geopandas
-    except ImportError as error:
-        raise DependencyError(
-            "GeoDataFrames need geopandas",
-            found=str(error),
-            cure="pip install geopandas; find_objects and object_layers do without it",
-        ) from None
+    import geopandas
+
     (x, y, z), codes = _checked(xyz, classification, reliability)
     settings = settings or ObjectSettings()
     cells = Cells.from_points(

@@ -17,21 +17,15 @@ from ..base.files import check_writable, whole_files
 from ..base.units import horizontal_part
 from ..base.vector import is_odd, vector
 
-
-class Format(NamedTuple):
-    """A format of vector files."""
-
-    driver: str  #: GDAL's name
-    many_layers: bool  #: whether one file holds all layers
-
-
-#: Formats by the ending of a file's name.
-FORMATS = {
-    ".gpkg": Format("GPKG", True),
-    ".geojson": Format("GeoJSON", False),
-    ".fgb": Format("FlatGeobuf", False),
-    ".shp": Format("ESRI Shapefile", False),
+#: GDAL's drivers by the ending of a file's name.
+DRIVERS = {
+    ".gpkg": "GPKG",
+    ".geojson": "GeoJSON",
+    ".fgb": "FlatGeobuf",
+    ".shp": "ESRI Shapefile",
 }
+#: The driver whose files hold all layers; of others each layer is a file.
+MANY_LAYERS = "GPKG"
 
 
 class Layer(NamedTuple):
@@ -44,11 +38,11 @@ class Layer(NamedTuple):
 
 def check_target(path: str | Path, layers: Sequence[str]) -> None:
     """Raise StageError for a file that cannot be written with these layers."""
-    if Path(path).suffix.lower() not in FORMATS:
+    if Path(path).suffix.lower() not in DRIVERS:
         raise StageError(
             "the output must be a vector file",
             found=str(path),
-            cure=f"Give a name that ends in {', '.join(FORMATS)}",
+            cure=f"Give a name that ends in {', '.join(DRIVERS)}",
         )
     if is_odd(str(path)):
         what = "vector files are written to names in UTF-8, without '!' and ';'"
@@ -62,8 +56,7 @@ def check_target(path: str | Path, layers: Sequence[str]) -> None:
 def target_files(path: str | Path, layers: Sequence[str]) -> list[Path]:
     """Return the files to write: one of all layers, or one of each, named after it."""
     target = Path(path)
-    file_format = FORMATS.get(target.suffix.lower())
-    if file_format is None or file_format.many_layers:
+    if DRIVERS.get(target.suffix.lower(), MANY_LAYERS) == MANY_LAYERS:
         return [target]
     return [target.with_name(f"{target.stem}_{name}{target.suffix}") for name in layers]
 
@@ -88,8 +81,8 @@ def write_layers(
         Styles for QGIS (see :func:`qml`) by layer.
     """
     check_target(path, list(layers))
-    driver, many_layers = FORMATS[Path(path).suffix.lower()]
-    files = target_files(path, list(layers))
+    driver, files = DRIVERS[Path(path).suffix.lower()], target_files(path, list(layers))
+    many_layers = driver == MANY_LAYERS
     style_files = [] if many_layers else [file.with_suffix(".qml") for file in files]
     with whole_files(*files, *style_files, what="objects") as parts:
         for number, (name, layer) in enumerate(layers.items()):
@@ -104,7 +97,7 @@ def write_layers(
 def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
     """Write a layer and count its features, since GDAL ignores some failed writes."""
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
-    layer_name = name if driver == "GPKG" else None
+    layer_name = name if driver == MANY_LAYERS else None
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
@@ -176,24 +169,15 @@ def qml(kind: str, rules: Sequence[tuple[str, str, str]], **options: Any) -> str
 
 def _write_styles(path: Path, styles: Mapping[str, str]) -> None:
     """Write the table of styles that QGIS looks for in a GeoPackage."""
-    count = len(styles)
-    texts = {
-        "f_table_catalog": [""] * count,
-        "f_table_schema": [""] * count,
-        "f_table_name": [*styles],
-        "f_geometry_column": ["geom"] * count,
-        "styleName": [*styles],
-        "styleQML": [*styles.values()],
-        "styleSLD": [""] * count,
-        "useAsDefault": None,
-        "description": [""] * count,
-        "owner": [""] * count,
-        "ui": [""] * count,
-        "update_time": ["2020-01-01T00:00:00.000Z"] * count,  # QGIS sorts by it: none is no style
-    }
-    columns = [
-        np.ones(count, bool) if values is None else np.array(values, object)
-        for values in texts.values()
+    names = "f_table_catalog f_table_schema f_table_name f_geometry_column styleName styleQML "
+    names += "styleSLD useAsDefault description owner ui update_time"
+    rows = [  # QGIS sorts by the last column, and ignores styles without a time
+        ("", "", name, "geom", name, qml, "", True, "", "", "", "2020-01-01T00:00:00.000Z")
+        for name, qml in styles.items()
     ]
-    options = {"layer": "layer_styles", "driver": "GPKG", "FID": "id"}
-    vector("pyogrio").raw.write(path, None, columns, list(texts), **options)
+    columns = [
+        np.array(values, bool if values[0] is True else object)
+        for values in zip(*rows, strict=True)
+    ]
+    options = {"layer": "layer_styles", "driver": MANY_LAYERS, "FID": "id"}
+    vector("pyogrio").raw.write(path, None, columns, names.split(), **options)

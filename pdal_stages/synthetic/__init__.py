@@ -1,5 +1,5 @@
 """A generated town under a simulated flight, with true classes (an extra)."""
 
-from .town import Town, TownOptions, make_town, write_town
+from .town import Town, make_town, write_town
 
-__all__ = ["Town", "TownOptions", "make_town", "write_town"]
+__all__ = ["Town", "make_town", "write_town"]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import StageError
+import numpy as np
+
 from ..base.files import write_json
 from ..classifier.model_file import STANDARD
 from ..stages.preprocessing import PREPARATION
@@ -33,37 +32,35 @@ def run_demo(
     ``town.model``, ``classified.laz``, ``accuracy.json``, ``accuracy.html``, ``classified.png``,
     ``standard.laz`` (by the model that comes with the package) and the three pipelines.
     """
-    import numpy as np
-
     from ..pipeline.run import Pipeline
     from ..reports.pictures import triptych, write_png
     from . import make_town, write_town
 
-    folder = Path(folder)
+    folder, started = Path(folder), time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
-    if not folder.is_dir():
-        raise StageError("the demo's folder cannot be made", found=str(folder))
-    with _step(
-        f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight"
-    ):
-        town = make_town(size, density, seed)
-        write_town(town, str(folder / "town.laz"))
+
+    def tell(text: str) -> None:
+        """Print the next step of the demo, and the time since its start."""
+        print(f"{time.monotonic() - started:6.1f} s  {text}", file=sys.stderr, flush=True)
+
+    tell(f"a town of {size:g} x {size:g} m at {density:g} points/m2 under a simulated flight")
+    town = make_town(size, density, seed)
+    write_town(town, folder / "town.laz")
     stages = pipelines(folder, float(np.floor((town.x.min() + town.x.max()) / 2)), seed)
     for name, listed in stages.items():
         write_json(folder / f"{name}.json", listed, indent=4)
-    with _step("training on the western half"):
-        Pipeline(stages["train"]).execute(arrays=False)
-    with _step("classifying the eastern half; how right that is"):
-        job = Pipeline(stages["classify"])
-        job.execute()
-    with _step("the same with the model that comes with the package, trained on real surveys"):
-        Pipeline(stages["standard"]).execute(arrays=False)
-    with _step("drawing the picture"):
-        (points,) = job.arrays
-        shown = points[np.isin(points["Reference"], [*map(int, CLASSES)])]
-        columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
-        write_png(folder / "classified.png", triptych(*columns))
-    print("points; a picture of heights, classes and errors; a page of the accuracy:")
+    tell("training on the western half")
+    Pipeline(stages["train"]).execute(arrays=False)
+    tell("classifying the eastern half; how right that is")
+    job = Pipeline(stages["classify"])
+    job.execute()
+    tell("the same with the model that comes with the package, trained on real surveys")
+    Pipeline(stages["standard"]).execute(arrays=False)
+    (points,) = job.arrays
+    shown = points[np.isin(points["Reference"], [*map(int, CLASSES)])]
+    columns = (shown[name] for name in ("X", "Y", "Z", "Classification", "Reference"))
+    write_png(folder / "classified.png", triptych(*columns))
+    tell("done: points; a picture of heights, classes and errors; a page of the accuracy:")
     for file in ("classified.laz", "classified.png", "accuracy.html"):
         print(f"  {folder / file}")
 
@@ -71,53 +68,39 @@ def run_demo(
 def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str, Any]]]:
     """Return the pipelines ``train``, ``classify``, ``standard`` of a town, divided at an X."""
     town = {"type": "readers.las", "filename": str(folder / "town.laz")}
-    model, las = (
-        str(folder / "town.model"),
-        {"type": "writers.las", "forward": "all", "extra_dims": "all"},
-    )
-    train = [
-        town,
-        {"type": "filters.range", "limits": f"X[:{middle})"},
-        *PREPARATION,
-        {
-            "type": "writers.classifiermodel",
-            "filename": model,
-            "classes": CLASSES,
-            "count": 5000,
-            "seed": seed,
-        },
-    ]
+    las = {"type": "writers.las", "forward": "all", "extra_dims": "all"}
+    model = str(folder / "town.model")
+    training = {"filename": model, "classes": CLASSES, "count": 5000, "seed": seed}
     eastern = [
         town,
         {"type": "filters.range", "limits": f"X[{middle}:]"},
         {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
         *PREPARATION,
     ]
-    classify = [
-        *eastern,
-        {"type": "filters.modelclassifier", "model": model, "margin": True},
-        {
-            "type": "filters.accuracy",
-            "classes": [int(code) for code in CLASSES],
-            "json": str(folder / "accuracy.json"),
-            "html": str(folder / "accuracy.html"),
-            "model": model,
-        },
-        {**las, "filename": str(folder / "classified.laz")},
-    ]
-    standard = [
-        *eastern,
-        {"type": "filters.modelclassifier", "model": STANDARD},
-        {"type": "filters.accuracy", "classes": [2, 5, 6], "merge": {"5": [4]}},
-        {**las, "filename": str(folder / "standard.laz")},
-    ]
-    return {"train": train, "classify": classify, "standard": standard}
-
-
-@contextlib.contextmanager
-def _step(text: str) -> Iterator[None]:
-    """Print a step of the demo, and the time it took."""
-    started = time.monotonic()
-    print(f"{text} ...", file=sys.stderr, flush=True)
-    yield
-    print(f"  done in {time.monotonic() - started:.1f} s", file=sys.stderr, flush=True)
+    accuracy = {
+        "type": "filters.accuracy",
+        "classes": [int(code) for code in CLASSES],
+        "json": str(folder / "accuracy.json"),
+        "html": str(folder / "accuracy.html"),
+        "model": model,
+    }
+    return {
+        "train": [
+            town,
+            {"type": "filters.range", "limits": f"X[:{middle})"},
+            *PREPARATION,
+            {"type": "writers.classifiermodel", **training},
+        ],
+        "classify": [
+            *eastern,
+            {"type": "filters.modelclassifier", "model": model, "margin": True},
+            accuracy,
+            {**las, "filename": str(folder / "classified.laz")},
+        ],
+        "standard": [
+            *eastern,
+            {"type": "filters.modelclassifier", "model": STANDARD},
+            {"type": "filters.accuracy", "classes": [2, 5, 6], "merge": {"5": [4]}},
+            {**las, "filename": str(folder / "standard.laz")},
+        ],
+    }

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import device, njit
-from .solids import VEGETATION
+from .districts import VEGETATION
 from .townplan import GRASS, LAWN, REFLECTANCE, SOIL, WATER, Plan, ground, patches
 
 # Columns of a solid after its bounding box (lowest u, v, z, highest u, v, z).
