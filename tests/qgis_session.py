@@ -1,4 +1,4 @@
-"""Run by QGIS's own Python, for what `qgis_process` cannot do: styles, parameters. Prints one JSON object.
+"""Run by QGIS's own Python, for what `qgis_process` cannot do: styles, parameters; prints JSON.
 
 python3 qgis_session.py FOLDER_OF_THE_PLUGIN styles|parameters ARGUMENT...
 """
@@ -43,7 +43,7 @@ def start(folder):
 
 
 def styles(objects, terrain, heights, classes):
-    """What results look like on the map."""
+    """Return the renderers of results on the map, and the color of buildings."""
     from qgis.core import QgsRasterLayer
 
     from pdal_stages import results
@@ -61,7 +61,9 @@ def styles(objects, terrain, heights, classes):
     for layer in results.vector_layers(objects):
         layers[layer.name()] = layer.renderer().type()
         QgsProject.instance().addMapLayer(layer)
-    colors = {one.value(): one.color().getRgb()[:3] for one in results.categories(forms["classes"])}
+    colors = {
+        each.value(): each.color().getRgb()[:3] for each in results.categories(forms["classes"])
+    }
     return {"layers": layers, "building": colors[6]}
 
 
@@ -72,13 +74,13 @@ def parameters(name):
     return {
         "can": [ok, why],
         "parameters": {
-            one.name(): [
-                one.description(),
-                bool(one.flags() & one.FlagAdvanced),
-                str(one.defaultValue()),
-                one.help(),
+            each.name(): [
+                each.description(),
+                bool(each.flags() & each.FlagAdvanced),
+                str(each.defaultValue()),
+                each.help(),
             ]
-            for one in algorithm.parameterDefinitions()
+            for each in algorithm.parameterDefinitions()
         },
     }
 

@@ -22,7 +22,10 @@ ROOMS = (
     "reports", "review", "stages", "synthetic",
 )  # fmt: skip
 
-MODULES = sorted(path for room in ROOMS for path in (ROOT / "pdal_stages" / room).rglob("*.py"))
+MODULES = [
+    *sorted(path for room in ROOMS for path in (ROOT / "pdal_stages" / room).rglob("*.py")),
+    *sorted((ROOT / "qgis" / "pdal_stages").glob("*.py")),
+]
 
 MOST_LINES = 60
 MOST_PARAMETERS = 8

@@ -64,17 +64,17 @@ class _Showing(Algorithm):
         return {}
 
     def add_raster(self, key, label, help, optional=True, default=True):
-        made = QgsProcessingParameterRasterDestination(
+        parameter = QgsProcessingParameterRasterDestination(
             key, label, optional=optional, createByDefault=default
         )
-        made.setHelp(help)
-        self.addParameter(made)
+        parameter.setHelp(help)
+        self.addParameter(parameter)
 
     def add_cell(self, label):
         kind = QgsProcessingParameterNumber.Double
-        made = QgsProcessingParameterNumber("RESOLUTION", label, kind, 1.0, minValue=0.01)
-        made.setHelp("Side of a raster's cells in the unit of the coordinates")
-        self.addParameter(made)
+        parameter = QgsProcessingParameterNumber("RESOLUTION", label, kind, 1.0, minValue=0.01)
+        parameter.setHelp("Side of a raster's cells in the unit of the coordinates")
+        self.addParameter(parameter)
 
     def style(self, context, path, act):
         """Return a style for a raster that QGIS will show."""
@@ -109,11 +109,12 @@ class ClassifyFile(_Classifying):
 
     key, title = "classify", "Classify a point cloud"
     about = (
-        "Gives each point of a raw airborne laser scan a class: ground, vegetation, building and more, with the model that "
-        "comes with pdal-stages or one of your own. Coordinates and return numbers are read; all other dimensions, the "
-        "header and the reference system stay as they are."
+        "Gives each point of a raw airborne laser scan a class: ground, vegetation, building and "
+        "more, with the model that comes with pdal-stages or one of your own. Coordinates and "
+        "return numbers are read; all other dimensions, the header and the reference system stay "
+        "as they are."
     )
-    own = ("model", "objects", "report", "per", "resume", "metadata")
+    handled = ("model", "objects", "report", "per", "resume", "metadata")
 
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Point cloud", "A LAS, LAZ or COPC file, or any that PDAL reads")
@@ -152,20 +153,21 @@ class ClassifySurvey(_Classifying):
 
     key, title = "classifysurvey", "Classify many point clouds"
     about = (
-        "Classifies files and folders in tiles without seams, within a bound for memory: as many files come out as go in. "
-        "What an earlier run in the same folder finished can be kept, so a canceled run goes on where it stopped."
+        "Classifies files and folders in tiles without seams, within a bound for memory: as many "
+        "files come out as go in. What an earlier run in the same folder finished can be kept, so "
+        "a canceled run goes on where it stopped."
     )
     listed = ("memory", "resume", *_Classifying.listed)
-    own = ("model", "objects", "report", "metadata")
+    handled = ("model", "objects", "report", "metadata")
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
         self.add_model()
         self.add_declared()
-        made = QgsProcessingParameterFolderDestination(
+        parameter = QgsProcessingParameterFolderDestination(
             "OUTPUT", "Folder of classified point clouds"
         )
-        self.addParameter(made)
+        self.addParameter(parameter)
         self.add_destination(
             "REPORT", "Report", self.help_of("report"), _PAGES, optional=True, createByDefault=False
         )
@@ -200,8 +202,8 @@ class Heights(_Showing):
 
     key, title, stage = "heights", "Heights above ground", "filters.hag_morphological"
     about = (
-        "Finds the ground of a point cloud, classified or not, and writes the height of each point above it as the "
-        "dimension HeightAboveGround. Classes stay as they are."
+        "Finds the ground of a point cloud, classified or not, and writes the height of each point "
+        "above it as the dimension HeightAboveGround. Classes stay as they are."
     )
     command = "pipeline"
     listed = ("cell", "slope", "window", "threshold", "ground")
@@ -240,23 +242,25 @@ class TerrainModels(_Showing):
 
     key, title = "terrainmodels", "Terrain and surface model"
     about = (
-        "Makes rasters of a point cloud: the terrain as a surface through the ground points (a triangulation, so buildings "
-        "are bridged), the surface as the highest point of each cell, and how far that is above the terrain."
+        "Makes rasters of a point cloud: the terrain as a surface through the ground points (a "
+        "triangulation, so buildings are bridged), the surface as the highest point of each cell, "
+        "and how far that is above the terrain."
     )
     command, stage = "pipeline", "filters.hag_morphological"
     GROUND = ("Found by the filter", "Class 2 of the point cloud")
     listed = ("slope", "window", "threshold")
-    own = ("ground", "openings", "terrain_slope", "where")
+    handled = ("ground", "openings", "terrain_slope", "where")
 
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Point cloud")
-        made = QgsProcessingParameterEnum(
+        parameter = QgsProcessingParameterEnum(
             "GROUND_FROM", "Ground", list(self.GROUND), defaultValue=0
         )
-        made.setHelp(
-            "Which points the terrain goes through: those that the filter below finds, or those classified as ground"
+        parameter.setHelp(
+            "Which points the terrain goes through: those that the filter below finds, or those "
+            "classified as ground"
         )
-        self.addParameter(made)
+        self.addParameter(parameter)
         self.add_cell("Cell of the rasters")
         self.add_declared()
         self.add_raster("TERRAIN", "Terrain model", "Through the ground points")
@@ -313,11 +317,12 @@ class Train(Algorithm):
 
     key, title, command = "train", "Train a model", "train"
     about = (
-        "Trains a model on labeled point clouds, from nothing or on top of a model that knows much already: then few "
-        "labels are enough. It is scored on points that it has not seen; the score is in the log."
+        "Trains a model on labeled point clouds, from nothing or on top of a model that knows much "
+        "already: then few labels are enough. It is scored on points that it has not seen; the "
+        "score is in the log."
     )
     listed = ("base", "classes", "count")
-    own = ("model",)
+    handled = ("model",)
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
@@ -336,11 +341,12 @@ class Accuracy(Algorithm):
 
     key, title, command = "accuracy", "Accuracy of a classified point cloud", "accuracy"
     about = (
-        "Compares the classes of a point cloud with true ones: of another file with the same points, or of another "
-        "dimension. The report (tables, confusion matrix, maps of errors) is under Processing > Results Viewer."
+        "Compares the classes of a point cloud with true ones: of another file with the same "
+        "points, or of another dimension. The report (tables, confusion matrix, maps of errors) is "
+        "under Processing > Results Viewer."
     )
     listed = ("dimension", "reference_dimension")
-    own = ("reference", "json", "html", "objects", "area")
+    handled = ("reference", "json", "html", "objects", "area")
 
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Classified point cloud")
@@ -389,12 +395,13 @@ class Objects(_Showing):
 
     key, title, command = "objects", "Buildings, trees, wires and bridges as vectors", "objects"
     about = (
-        "Groups the points of classified point clouds into objects and writes them as layers: buildings with straight "
-        "outlines, heights and roofs, trees and crowns, wires, bridge decks, each with a verdict: sure, or to be checked "
-        "and why. Objects across the borders of files are whole."
+        "Groups the points of classified point clouds into objects and writes them as layers: "
+        "buildings with straight outlines, heights and roofs, trees and crowns, wires, bridge "
+        "decks, each with a verdict: sure, or to be checked and why. Objects across the borders of "
+        "files are whole."
     )
     listed = ("outlines", "cell")
-    own = ("metadata",)
+    handled = ("metadata",)
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
@@ -427,11 +434,12 @@ class Review(_Showing):
         "review",
     )
     about = (
-        "Lists where a person should look in classified point clouds, worst first, as patches with the number of errors "
-        "expected in each, and as a page. What is right or was corrected can be learned from: see Corrections."
+        "Lists where a person should look in classified point clouds, worst first, as patches with "
+        "the number of errors expected in each, and as a page. What is right or was corrected can "
+        "be learned from: see Corrections."
     )
     listed = ("share",)
-    own = ("html", "json")
+    handled = ("html", "json")
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
@@ -458,11 +466,11 @@ class Corrections(_Showing):
 
     key, title, command = "corrections", "Corrections: mark what was looked at", "corrections"
     about = (
-        "Marks the points whose classes a person has corrected, or looked at and found right, in the dimension Checked: "
-        "training then learns from these points alone."
+        "Marks the points whose classes a person has corrected, or looked at and found right, in "
+        "the dimension Checked: training then learns from these points alone."
     )
     listed = ("around",)
-    own = ("before", "after", "out", "area")
+    handled = ("before", "after", "out", "area")
 
     def initAlgorithm(self, configuration=None):
         self.add_file("BEFORE", "Point cloud as it was classified", self.help_of("before"))

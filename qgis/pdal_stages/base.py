@@ -51,8 +51,8 @@ class Algorithm(Named):
     about = command = ""
     stage = ""
     listed = ()
-    #: Names of arguments that the algorithm has parameters of its own for.
-    own = ()
+    #: Names of arguments for which the algorithm adds parameters itself.
+    handled = ()
 
     def __init__(self, forms):
         super().__init__()
@@ -86,27 +86,26 @@ class Algorithm(Named):
         return True, ""
 
     # ---- parameters
-    # ------------------------------------------------------------------------------------
 
     def checkParameterValues(self, parameters, context):
-        """Refuse what QGIS passes over: unknown names, rasters of other formats, text for an optional number."""
-        known = {one.name(): one for one in self.parameterDefinitions()}
+        """Refuse what QGIS accepts: unknown names, other formats of rasters, texts as numbers."""
+        known = {each.name(): each for each in self.parameterDefinitions()}
         for key, value in parameters.items():
-            one = known.get(key)
-            if one is None:
+            parameter = known.get(key)
+            if parameter is None:
                 near = difflib.get_close_matches(key.upper(), known, 1)
                 cure = f"Did you mean {near[0]}?" if near else f"There are {', '.join(known)}."
                 return False, f"There is no parameter {key}. {cure}"
-            if isinstance(one, QgsProcessingParameterRasterDestination) and value:
-                ok, why = self.provider().isSupportedOutputValue(value, one, context)
+            if isinstance(parameter, QgsProcessingParameterRasterDestination) and value:
+                ok, why = self.provider().isSupportedOutputValue(value, parameter, context)
                 if not ok:
                     return False, f"{key}: {why}. Give a name that ends in .tif."
             if (
-                isinstance(one, QgsProcessingParameterNumber)
+                isinstance(parameter, QgsProcessingParameterNumber)
                 and isinstance(value, str)
                 and value.strip()
             ):
-                whole = one.dataType() == QgsProcessingParameterNumber.Integer
+                whole = parameter.dataType() == QgsProcessingParameterNumber.Integer
                 try:
                     int(value) if whole else float(value)
                 except ValueError:
@@ -119,12 +118,14 @@ class Algorithm(Named):
             declared = self.forms["stages"][self.stage]["options"]
         else:
             declared = self.forms["commands"][self.command]["arguments"]
-        by_name = {one["name"]: one for one in declared}
-        rest = [name for name in by_name if name not in (*self.listed, *self.own, *form.LEFT_OUT)]
+        by_name = {each["name"]: each for each in declared}
+        rest = [
+            name for name in by_name if name not in (*self.listed, *self.handled, *form.LEFT_OUT)
+        ]
         for name in (*(name for name in self.listed if name in by_name), *rest):
-            self.add_one(by_name[name], name.upper(), advanced=name not in self.listed)
+            self.add_argument(by_name[name], name.upper(), advanced=name not in self.listed)
 
-    def add_one(self, declared, key, advanced=False, label=""):
+    def add_argument(self, declared, key, advanced=False, label=""):
         self.declared[key] = declared
         self.addParameter(form.parameter(declared, key, label, advanced))
 
@@ -146,17 +147,17 @@ class Algorithm(Named):
     def help_of(self, name):
         """Return the command's help text for one of its arguments."""
         arguments = self.forms["commands"][self.command]["arguments"]
-        return next((one["help"] for one in arguments if one["name"] == name), "")
+        return next((each["help"] for each in arguments if each["name"] == name), "")
 
     def add_file(self, key, label, help="", files=CLOUDS, optional=False):
-        made = QgsProcessingParameterFile(key, label, fileFilter=files, optional=optional)
-        made.setHelp(help)
-        self.addParameter(made)
+        parameter = QgsProcessingParameterFile(key, label, fileFilter=files, optional=optional)
+        parameter.setHelp(help)
+        self.addParameter(parameter)
 
     def add_destination(self, key, label, help="", files=LAZ, **how):
-        made = QgsProcessingParameterFileDestination(key, label, files, **how)
-        made.setHelp(help)
-        self.addParameter(made)
+        parameter = QgsProcessingParameterFileDestination(key, label, files, **how)
+        parameter.setHelp(help)
+        self.addParameter(parameter)
 
     def destination(self, parameters, key, context):
         """Return the chosen file, in a folder that exists; empty where none was chosen."""
@@ -164,12 +165,12 @@ class Algorithm(Named):
         return written(path) if path else ""
 
     def add_inputs(self, help=""):
-        """Files, a folder, or both."""
-        made = QgsProcessingParameterMultipleLayers(
+        """Add parameters for files and a folder."""
+        parameter = QgsProcessingParameterMultipleLayers(
             "INPUTS", "Point clouds", QgsProcessing.TypeFile, optional=True
         )
-        made.setHelp(help)
-        self.addParameter(made)
+        parameter.setHelp(help)
+        self.addParameter(parameter)
         folder = QgsProcessingParameterFile(
             "FOLDER",
             "Folder of point clouds",
@@ -180,19 +181,18 @@ class Algorithm(Named):
         self.addParameter(folder)
 
     def inputs(self, parameters, context):
-        """Names of files and the folder."""
-        files = [one for one in self.parameterAsFileList(parameters, "INPUTS", context) if one]
+        """Return the names of the chosen files and folder."""
+        files = [name for name in self.parameterAsFileList(parameters, "INPUTS", context) if name]
         folder = self.parameterAsFile(parameters, "FOLDER", context)
-        found = [*files, *([folder] if folder else [])]
-        if not found:
+        names = [*files, *([folder] if folder else [])]
+        if not names:
             raise QgsProcessingException("No point cloud was given: add files, or name a folder.")
-        return found
+        return names
 
     # ---- running
-    # ---------------------------------------------------------------------------------------
 
     def execute(self, arguments, feedback, text=None, quiet=False):
-        """Run the program; QGIS's exception with its message where it fails."""
+        """Run the program; raise QGIS's exception with its message where it fails."""
         try:
             return running.run(self.provider().program(), arguments, feedback, text, quiet)
         except (running.Failed, environment.Missing) as error:

@@ -14,9 +14,10 @@ class CheckInstallation(Named):
 
     def shortHelpString(self):
         return (
-            "<p>Looks for the program pdal-stages and lets it tell what is there on this machine (PDAL, its Python, cores, "
-            "memory, compiled kernels, extras), with the cure for what is not.</p>"
-            "<p>Which program is used: Settings &gt; Options &gt; Processing &gt; Providers &gt; pdal-stages.</p>"
+            "<p>Looks for the program pdal-stages and lets it tell what is there on this machine "
+            "(PDAL, its Python, cores, memory, compiled kernels, extras), with the cure for what "
+            "is not.</p><p>Which program is used: Settings &gt; Options &gt; Processing &gt; "
+            "Providers &gt; pdal-stages.</p>"
         )
 
     def initAlgorithm(self, configuration=None):

@@ -12,15 +12,17 @@ from pathlib import Path
 FORMAT = 1
 OLDEST = "0.2.0"
 INSTALL = (
-    "Install pdal-stages into an environment of its own (conda create -n pdal-stages -c conda-forge python-pdal; pip "
-    "install 'pdal-stages[vector]' in it), then name its program: Settings > Options > Processing > Providers > pdal-stages"
+    "Install pdal-stages into an environment of its own (conda create -n pdal-stages -c "
+    "conda-forge python-pdal; pip install 'pdal-stages[vector]' in it), then name its program: "
+    "Settings > Options > Processing > Providers > pdal-stages"
 )
 _WINDOWS = sys.platform == "win32"
 _NAME = "pdal-stages.exe" if _WINDOWS else "pdal-stages"
 #: Variables that QGIS sets for its own Python, GDAL and PROJ, which another environment must not
 #: see.
 _OF_QGIS = (
-    "PYTHONHOME", "PYTHONPATH", "PYTHONEXECUTABLE", "VIRTUAL_ENV", "GDAL_DATA", "GDAL_DRIVER_PATH", "PROJ_LIB", "PROJ_DATA",
+    "PYTHONHOME", "PYTHONPATH", "PYTHONEXECUTABLE", "VIRTUAL_ENV", "GDAL_DATA",
+    "GDAL_DRIVER_PATH", "PROJ_LIB", "PROJ_DATA",
 )  # fmt: skip
 
 #: Folders of conda's kind in the user's own.
@@ -50,17 +52,17 @@ def find(setting=""):
     named = (setting or os.environ.get("PDAL_STAGES_PROGRAM", "")).strip()
     if named:
         path = Path(named).expanduser()
-        for one in (path, path / _folder() / _NAME, path / _NAME):
-            if one.is_file() and os.access(one, os.X_OK):
-                return str(one)
+        for file in (path, path / _folder() / _NAME, path / _NAME):
+            if file.is_file() and os.access(file, os.X_OK):
+                return str(file)
         raise Missing(f"There is no program pdal-stages at {named}. {INSTALL}.")
-    found = shutil.which("pdal-stages")
-    if found:
-        return found
+    on_path = shutil.which("pdal-stages")
+    if on_path:
+        return on_path
     for folder in environments():
-        one = Path(folder, _folder(), _NAME)
-        if one.is_file() and os.access(one, os.X_OK):
-            return str(one)
+        file = Path(folder, _folder(), _NAME)
+        if file.is_file() and os.access(file, os.X_OK):
+            return str(file)
     raise Missing(
         f"The program pdal-stages was not found on PATH or in an environment of conda. {INSTALL}."
     )
@@ -71,7 +73,7 @@ def _folder():
 
 
 def environments():
-    """Folders of environments that may hold it, the likeliest first."""
+    """Return folders of environments that may hold the program, the likeliest first."""
     home = Path.home()
     known = home / ".conda" / "environments.txt"
     listed = known.read_text(errors="replace").splitlines() if known.is_file() else []
@@ -107,7 +109,7 @@ def variables(program):
 
 
 def without_window():
-    """Arguments of subprocess that keep Windows from opening a console."""
+    """Return arguments of subprocess that keep Windows from opening a console."""
     return (
         {"creationflags": subprocess.CREATE_NO_WINDOW | subprocess.CREATE_NEW_PROCESS_GROUP}
         if _WINDOWS
@@ -129,9 +131,10 @@ def ask(program, *arguments, timeout=120):
     except (OSError, subprocess.TimeoutExpired) as error:
         raise Missing(f"{program} cannot be run: {error}. {INSTALL}.") from None
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        reason = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
         raise Missing(
-            f"{program} {' '.join(arguments)} failed: {''.join(said)} (it must be {OLDEST} or newer). {INSTALL}."
+            f"{program} {' '.join(arguments)} failed: {''.join(reason)} (it must be {OLDEST} or "
+            f"newer). {INSTALL}."
         )
     return done.stdout.decode("utf-8", errors="replace")
 
@@ -173,10 +176,13 @@ def checked(text, program):
         answer = json.loads(text)
         if answer["format"] == FORMAT:
             return answer
-        said = f"the form {answer['format']} of its commands is not known here: update the plugin or pdal-stages"
+        reason = (
+            f"the form {answer['format']} of its commands is not known here: update the plugin or "
+            "pdal-stages"
+        )
     except (ValueError, KeyError, TypeError):
-        said = "what it says about its commands cannot be read"
-    raise Missing(f"{program}: {said}.")
+        reason = "what it says about its commands cannot be read"
+    raise Missing(f"{program}: {reason}.")
 
 
 def shipped():

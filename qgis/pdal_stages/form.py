@@ -1,4 +1,4 @@
-"""Parameters of a dialog, made of what the program says about an argument of a command or an option of a stage."""
+"""Parameters of a dialog, from the declarations of commands' arguments and stages' options."""
 
 import re
 
@@ -10,7 +10,7 @@ from qgis.core import (
     QgsProcessingParameterString,
 )
 
-#: One of several: blanks in it stand between quotes.
+#: One of several values; blanks within a value stand between quotes.
 _WORDS = re.compile(r'(?:"[^"]*"|[^\s"])+')
 #: Settings of a terminal, of a batch system, or that a dialog has its own widgets for.
 LEFT_OUT = (
@@ -25,7 +25,7 @@ LEFT_OUT = (
 
 
 def label_of(declared):
-    """``reference_dimension`` -> ``Reference dimension``; of a checkbox what it does."""
+    """Return a label: ``Reference dimension`` for its name; for a checkbox what it does."""
     if declared["kind"] == "boolean":
         return re.split(r" \(|; |: ", declared["help"])[0]
     text = declared["name"].replace("_", " ")
@@ -44,17 +44,17 @@ def parameter(declared, key, label="", advanced=False):
     default, kind = declared["default"], declared["kind"]
     optional = not declared["required"]
     if declared["choices"]:
-        choices = [str(one) for one in declared["choices"]]
+        choices = [str(choice) for choice in declared["choices"]]
         index = (
             choices.index(str(default)) if default is not None and str(default) in choices else None
         )
-        made = QgsProcessingParameterEnum(
+        widget = QgsProcessingParameterEnum(
             key, label, choices, defaultValue=index, optional=optional
         )
     elif kind == "boolean":
-        made = QgsProcessingParameterBoolean(key, label, defaultValue=bool(default))
+        widget = QgsProcessingParameterBoolean(key, label, defaultValue=bool(default))
     elif kind in ("number", "integer"):
-        made = QgsProcessingParameterNumber(
+        widget = QgsProcessingParameterNumber(
             key,
             label,
             type=QgsProcessingParameterNumber.Integer
@@ -64,16 +64,16 @@ def parameter(declared, key, label="", advanced=False):
             optional=optional,
         )
         if declared.get("minimum") is not None:
-            made.setMinimum(declared["minimum"])
+            widget.setMinimum(declared["minimum"])
         if declared.get("maximum") is not None:
-            made.setMaximum(declared["maximum"])
+            widget.setMaximum(declared["maximum"])
     else:
         text = "" if default is None else str(default)
-        made = QgsProcessingParameterString(key, label, defaultValue=text, optional=optional)
-    made.setHelp(declared["help"])
+        widget = QgsProcessingParameterString(key, label, defaultValue=text, optional=optional)
+    widget.setHelp(declared["help"])
     if advanced:
-        made.setFlags(made.flags() | QgsProcessingParameterDefinition.FlagAdvanced)
-    return made
+        widget.setFlags(widget.flags() | QgsProcessingParameterDefinition.FlagAdvanced)
+    return widget
 
 
 def value_of(algorithm, declared, key, parameters, context):
@@ -106,6 +106,6 @@ def words(algorithm, declared, key, parameters, context):
     if declared["kind"] == "boolean":
         return [declared["flag"] if value else declared["off"] or declared["flag"]]
     several = (
-        [one.replace('"', "") for one in _WORDS.findall(value)] if declared["many"] else [value]
+        [word.replace('"', "") for word in _WORDS.findall(value)] if declared["many"] else [value]
     )
-    return [f"{declared['flag']}={one}" for one in several]
+    return [f"{declared['flag']}={each}" for each in several]

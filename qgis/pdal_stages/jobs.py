@@ -1,4 +1,4 @@
-"""The pipelines that are no command of the program. No QGIS here."""
+"""Pipelines for what no command of the program does. No QGIS here."""
 
 #: What is within one of several ranges stays, so two negated ones would leave all.
 NOT_NOISE = {
@@ -22,12 +22,12 @@ def reader(source):
 
 
 def plain_classes(source):
-    """Return the filter that takes the flags of point formats 0 to 5 off the classes, as PDAL before 2.6 reads them."""
+    """Return the filter that takes flags of formats 0 to 5 off the classes (PDAL before 2.6)."""
     try:
         with open(source, "rb") as file:
             head = file.read(105)
     except OSError:
-        return []  # told by whoever reads it
+        return []  # the reader reports it
     if head[:4] != b"LASF" or len(head) < 105 or head[104] & 63 > 5:  # the point format
         return []
     return [{"type": "filters.python", "module": "classes", "function": "plain", "source": _PLAIN}]
@@ -56,7 +56,7 @@ def raster(target, side, dimension, what):
 
 
 def class_map(cloud, target, side):
-    """Classes from above."""
+    """Return a pipeline that draws the classes from above."""
     writes = {
         **raster(target, side, "Classification", "max"),
         "data_type": "uint8_t",

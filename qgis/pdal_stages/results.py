@@ -1,4 +1,4 @@
-"""Outputs on the map, with styles. In the main thread only."""
+"""Show outputs on the map, with styles. In the main thread only."""
 
 import os
 
@@ -26,10 +26,10 @@ def shows_point_clouds():
 
 
 def categories(classes):
-    """Classes as they are colored in all of pdal-stages' pictures."""
+    """Return categories of classes with the colors of all pictures of pdal-stages."""
     return [
-        QgsPointCloudCategory(int(code), QColor(*one["color"]), one["name"])
-        for code, one in classes.items()
+        QgsPointCloudCategory(int(code), QColor(*described["color"]), described["name"])
+        for code, described in classes.items()
     ]
 
 
@@ -65,14 +65,14 @@ class Style(QgsProcessingLayerPostProcessorInterface):
     #: Processing holds no reference.
     _kept = []
 
-    def __init__(self, act):
+    def __init__(self, apply_style):
         super().__init__()
-        self._act = act
+        self._apply_style = apply_style
         Style._kept[:] = [*Style._kept[-20:], self]
 
     def postProcessLayer(self, layer, context, feedback):
         try:
-            self._act(layer)
+            self._apply_style(layer)
             layer.triggerRepaint()
         except Exception as error:  # a style is no reason to lose a result
             feedback.pushWarning(f"The style could not be set: {error}")
@@ -83,7 +83,7 @@ def hillshade(layer):
 
 
 def heights(layer):
-    """Heights above ground, from 0 to where nearly all are below."""
+    """Style heights above ground, from 0 to the 99th percentile."""
     provider = layer.dataProvider()
     renderer = QgsSingleBandPseudoColorRenderer(provider, 1)
     most = provider.cumulativeCut(1, 0.0, 0.99)[1]
@@ -98,18 +98,18 @@ def heights(layer):
 def classes_of(classes):
     """Return a style for a raster of class codes, with the classes that occur."""
 
-    def act(layer):
+    def apply_style(layer):
         provider = layer.dataProvider()
         there = {
-            int(one.value) for one in QgsPalettedRasterRenderer.classDataFromRaster(provider, 1)
+            int(entry.value) for entry in QgsPalettedRasterRenderer.classDataFromRaster(provider, 1)
         }
         shown = [
             QgsPalettedRasterRenderer.Class(
-                int(code), QColor(*one["color"]), f"{code} {one['name']}"
+                int(code), QColor(*described["color"]), f"{code} {described['name']}"
             )
-            for code, one in classes.items()
+            for code, described in classes.items()
             if int(code) in there
         ]
         layer.setRenderer(QgsPalettedRasterRenderer(provider, 1, shown))
 
-    return act
+    return apply_style

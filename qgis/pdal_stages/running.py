@@ -23,14 +23,13 @@ class Failed(Exception):
 
 
 def run(program, arguments, feedback, text=None, quiet=False):
-    """Run it to its end; what it printed on standard output.
+    """Run the program to its end and return what it printed on standard output.
 
     Parameters
     ----------
     program : str
     arguments : list of str
-    feedback
-        A QgsProcessingFeedback.
+    feedback : QgsProcessingFeedback
     text : str, optional
         For standard input.
     quiet : bool
@@ -42,80 +41,86 @@ def run(program, arguments, feedback, text=None, quiet=False):
         If it ends with an error, or was canceled.
     """
     feedback.pushCommandInfo(" ".join(_quoted(word) for word in ["pdal-stages", *arguments]))
-    own = {} if _WINDOWS else {"start_new_session": True}
-    try:
-        process = subprocess.Popen(
-            [program, *arguments],
-            env=environment.variables(program),
-            stdin=subprocess.PIPE if text is not None else subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            **own,
-            **environment.without_window(),
-        )
-    except OSError as error:
-        raise Failed(f"{program} cannot be run: {error}. {environment.INSTALL}.") from None
+    process = _start(program, arguments, text is not None)
     lines = queue.Queue()
     readers = [
-        threading.Thread(target=_read, args=(stream, of, lines), daemon=True)
-        for stream, of in ((process.stdout, "out"), (process.stderr, "err"))
+        threading.Thread(target=_read, args=(stream, name, lines), daemon=True)
+        for stream, name in ((process.stdout, "out"), (process.stderr, "err"))
     ]
-    for one in readers:
-        one.start()
+    for reader in readers:
+        reader.start()
     if text is not None:
         threading.Thread(target=_write, args=(process.stdin, text), daemon=True).start()
-    printed, said, open_streams, canceled = [], [], len(readers), None
+    printed, messages, open_streams, canceled = [], [], len(readers), None
     while open_streams:
         if feedback.isCanceled():
             if canceled is None:
                 canceled = time.monotonic()
-                feedback.pushInfo("Canceling: the run cleans up ...")
                 _interrupt(process)
+                feedback.pushInfo("Canceling: the run cleans up ...")
             elif time.monotonic() - canceled >= PATIENCE:
                 _kill(process)
         try:
-            of, line = lines.get(timeout=0.1)
+            name, line = lines.get(timeout=0.1)
         except queue.Empty:
             continue
         if line is None:
             open_streams -= 1
-        elif of == "out":
+        elif name == "out":
             printed.append(line)
             if not quiet:
                 feedback.pushInfo(line)
         else:
-            _tell(line, said, feedback)
+            _tell(line, messages, feedback)
     code = process.wait()
-    process.stdout.close()
-    process.stderr.close()
+    for stream in (process.stdout, process.stderr):
+        stream.close()
     if canceled or feedback.isCanceled():
         raise Failed(
-            "Canceled; no output was written. A hidden folder that may be left is removed by the next run there."
+            "Canceled; no output was written. A hidden folder that may be left is removed by the "
+            "next run there."
         )
     if code:
-        raise Failed(said[-1] if said else f"pdal-stages ended with exit code {code}.")
+        raise Failed(messages[-1] if messages else f"pdal-stages ended with exit code {code}.")
     return "\n".join(printed)
 
 
-def _tell(line, said, feedback):
+def _start(program, arguments, with_input):
+    """Start the program in a session of its own, so that its workers end with it."""
+    session = {} if _WINDOWS else {"start_new_session": True}
+    try:
+        return subprocess.Popen(
+            [program, *arguments],
+            env=environment.variables(program),
+            stdin=subprocess.PIPE if with_input else subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            **session,
+            **environment.without_window(),
+        )
+    except OSError as error:
+        raise Failed(f"{program} cannot be run: {error}. {environment.INSTALL}.") from None
+
+
+def _tell(line, messages, feedback):
     progress = _PROGRESS.match(line)
     if progress:
         feedback.setProgressText(progress["label"])
         feedback.setProgress(float(progress["percent"]))
         return
-    said.append(line.removeprefix("pdal-stages: "))
+    messages.append(line.removeprefix("pdal-stages: "))
     if line.startswith("pdal-stages: "):
         feedback.pushWarning(line)
     else:
         feedback.pushInfo(line)
 
 
-def _read(stream, of, lines):
+def _read(stream, name, lines):
     for raw in iter(stream.readline, b""):
         line = raw.decode("utf-8", errors="replace").rstrip()
         if line:
-            lines.put((of, line))
-    lines.put((of, None))
+            lines.put((name, line))
+    lines.put((name, None))
 
 
 def _write(stream, text):
