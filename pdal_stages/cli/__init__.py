@@ -103,15 +103,11 @@ def _explain(error: Exception) -> StageError:
         name = f"{error.filename}: " if error.filename is not None else ""
         return StageError("the system refused", found=f"{name}{error.strerror or error}")
     if isinstance(error, ImportError):
-        reason = str(error).strip() or repr(error)
-        return StageError(
-            "a Python package cannot be imported",
-            found=f"{sys.executable}: {reason.splitlines()[0]}",
-            cure="Install pdal-stages with its packages into one environment, e.g. with conda; "
-            "packages built for "
-            "another NumPy or Python must be installed again",
+        reason = f"{sys.executable}: {(str(error).strip() or repr(error)).splitlines()[0]}"
+        cure = (
+            "Install pdal-stages with its packages into one environment, e.g. with conda; packages "
+            "built for another NumPy or Python must be installed again"
         )
-    return StageError(
-        f"internal error: {type(error).__name__}: {error}",
-        cure="Run with --debug and report what it prints",
-    )
+        return StageError("a Python package cannot be imported", found=reason, cure=cure)
+    what = f"internal error: {type(error).__name__}: {error}"
+    return StageError(what, cure="Run with --debug and report what it prints")

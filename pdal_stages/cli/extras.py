@@ -30,26 +30,11 @@ def add_commands(parser: Parser) -> None:
     add("output", help=_VECTOR_FILE)
     add("--html", metavar="FILE", help="Web page to write (default: beside the vector file)")
     add("--json", metavar="FILE", help="Write figures to a JSON file")
-    add(
-        "--share",
-        type=float,
-        default=0.95,
-        metavar="SHARE",
-        help="Share of expected errors to cover (0.95)",
-    )
-    add(
-        "--cell",
-        type=float,
-        default=0.0,
-        metavar="METERS",
-        help="Side of the cells (default: by density)",
-    )
+    add("--share", type=float, default=0.95, help="Share of expected errors to cover (0.95)")
+    cell = "Side of the cells (default: by density)"
+    add("--cell", type=float, default=0.0, metavar="METERS", help=cell)
     add("--workers", type=int, default=1, metavar="N", help=_WORKERS)
-    add(
-        "--model",
-        default="standard",
-        help="Model for files without Reliability (default: standard)",
-    )
+    add("--model", default="standard", help="Model for files without Reliability (standard)")
 
     what = "Mark points that a person corrected or confirmed, to train on"
     add = parser.command("corrections", _corrections, what)
@@ -58,26 +43,13 @@ def add_commands(parser: Parser) -> None:
     add("--out", required=True, metavar="FILE", help="File to write: new classes, and Checked")
     area = "Polygons in which all points were checked; of review's file, those with 'done' 1"
     add("--area", action="append", default=[], metavar="FILE", help=area)
-    add(
-        "--around",
-        type=float,
-        default=1.0,
-        metavar="METERS",
-        help="Radius checked around changes (1)",
-    )
-    _add_demo(parser)
+    radius = "Radius checked around changes (1)"
+    add("--around", type=float, default=1.0, metavar="METERS", help=radius)
 
-
-def _add_demo(parser: Parser) -> None:
-    add = parser.command(
-        "demo", _demo, "Make a town, train on one half, classify the other", progress=True
-    )
-    add(
-        "folder",
-        nargs="?",
-        default="pdal-stages-demo",
-        help="Folder for the results (pdal-stages-demo)",
-    )
+    what = "Make a town, train on one half, classify the other"
+    add = parser.command("demo", _demo, what, progress=True)
+    folder = "Folder for the results (pdal-stages-demo)"
+    add("folder", nargs="?", default="pdal-stages-demo", help=folder)
     add("--size", type=float, default=200.0, help="Side of the town in meters (200)")
     add("--density", type=float, default=7.0, help="Points per square meter (7)")
     add("--seed", type=int, default=1, help="Another number gives another town (1)")
@@ -107,13 +79,10 @@ def _corrections(options: argparse.Namespace) -> None:
     """Mark corrected points."""
     from ..review.corrections import write_corrections
 
-    results = write_corrections(
-        options.before, options.out, options.after or "", options.area, options.around
-    )
-    print("\n".join(results))
-    print(
-        f"written to {options.out}; next: pdal-stages train --base MODEL {options.out} --model NEW"
-    )
+    files = options.before, options.out, options.after or ""
+    print("\n".join(write_corrections(*files, options.area, options.around)))
+    train = f"pdal-stages train --base MODEL {options.out} --model NEW"
+    print(f"written to {options.out}; next: {train}")
 
 
 def _demo(options: argparse.Namespace) -> None:

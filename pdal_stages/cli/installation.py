@@ -30,48 +30,39 @@ def add_commands(parser: Parser) -> None:
     add("stage", help="One of ours or PDAL's, e.g. filters.hag_minima")
     add("--showjson", action="store_true", help="As JSON Schema")
 
-    add = parser.command(
-        "commands", partial(_commands, parser), "List commands with their arguments"
-    )
+    what = "List commands with their arguments"
+    add = parser.command("commands", partial(_commands, parser), what)
     details = "As JSON, with stages, models and classes, for programs that build dialogs"
     add("--showjson", action="store_true", help=details)
 
     parser.command("doctor", _doctor, "Check what is installed, and say how to get what is missing")
 
-    parser.command(
-        "plugin", _plugin, "Build our stages into PDAL itself, for all programs that use it"
-    )
+    what = "Build our stages into PDAL itself, for all programs that use it"
+    parser.command("plugin", _plugin, what)
     command = parser.commands["plugin"]
-    what = command.add_mutually_exclusive_group(required=True)
-    what.add_argument("--install", action="store_true", help="Compile them, beside filters.python")
-    what.add_argument("--check", action="store_true", help="Say what is there and what is missing")
-    what.add_argument("--uninstall", action="store_true", help="Remove them")
+    step = command.add_mutually_exclusive_group(required=True)
+    step.add_argument("--install", action="store_true", help="Compile them, beside filters.python")
+    step.add_argument("--check", action="store_true", help="Say what is there and what is missing")
+    step.add_argument("--uninstall", action="store_true", help="Remove them")
     folder = "Another folder; PDAL_DRIVER_PATH must name it and the folder of filters.python"
     command.add_argument("--folder", type=Path, metavar="DIR", help=folder)
 
-    add = parser.command(
-        "warmup", _warmup, "Compile the kernels now, so that later runs do not wait"
-    )
-    add(
-        "--all",
-        action="store_true",
-        help="Also the kernels of kopt, ropt, copt and shape distributions",
-    )
+    what = "Compile the kernels now, so that later runs do not wait"
+    add = parser.command("warmup", _warmup, what)
+    every = "Also the kernels of kopt, ropt, copt and shape distributions"
+    add("--all", action="store_true", help=every)
 
 
 def _drivers(options: argparse.Namespace) -> None:
-    from ..pipeline.pdal import ask_program
+    from ..pipeline.pdal import ask_program, drivers
     from ..stages.registry import stage_types
 
     ours = {name: stage.summary for name, stage in stage_types().items()}
     if options.showjson:
-        listed = [
-            {"name": n, "description": text, "link": "", "extensions": []}
-            for n, text in ours.items()
-        ]
+        more = {"link": "", "extensions": []}
+        listed = [{"name": name, "description": text, **more} for name, text in ours.items()]
         if not options.ours:  # with our plugin, PDAL lists ours as well
-            theirs = json.loads(ask_program("--drivers", "--showjson"))
-            listed += [entry for entry in theirs if entry["name"] not in ours]
+            listed += [driver for driver in drivers() if driver["name"] not in ours]
         print(json.dumps(listed, indent=2))
         return
     width = max(map(len, ours)) + 2
@@ -84,7 +75,7 @@ def _drivers(options: argparse.Namespace) -> None:
 
 def _options(options: argparse.Namespace) -> None:
     """Print the options of one of our stages or of PDAL's, in PDAL's form."""
-    from ..pipeline.pdal import ask_program
+    from ..pipeline.pdal import ask_program, drivers
     from ..stages.registry import stage_type, stage_types
 
     name = options.stage
@@ -93,14 +84,9 @@ def _options(options: argparse.Namespace) -> None:
         with contextlib.suppress(DependencyError, PipelineError):
             answer = ask_program("--options", name, *(["--showjson"] if options.showjson else []))
         if not answer.strip() or "Unable to create" in answer or "not found" in answer:
-            theirs = [
-                driver["name"] for driver in json.loads(ask_program("--drivers", "--showjson"))
-            ]
-            raise PipelineError(
-                f"there is no stage '{name}', neither of ours nor of PDAL's",
-                cure=f"{suggest(name, [*stage_types(), *theirs])}List them with: pdal-stages "
-                "drivers",
-            )
+            near = suggest(name, [*stage_types(), *(driver["name"] for driver in drivers())])
+            what = f"there is no stage '{name}', neither of ours nor of PDAL's"
+            raise PipelineError(what, cure=f"{near}List them with: pdal-stages drivers")
         print(answer, end="")
         return
     stage = stage_type(name)
@@ -114,10 +100,8 @@ def _options(options: argparse.Namespace) -> None:
         text, default = option.help, option.shown_default
         if option.choices:
             text += f" (one of: {', '.join(map(str, option.choices))})"
-        print(
-            f"  {option.name}"
-            + ("  (required)" if option.required else f" [{default}]" * bool(default))
-        )
+        mark = "  (required)" if option.required else f" [{default}]" * bool(default)
+        print(f"  {option.name}{mark}")
         print(textwrap.indent(textwrap.fill(text, 74), " " * 6) + "\n")
     if text := stage.describe_choices():
         print(text)
@@ -145,41 +129,26 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
     from ..classifier.model_file import shipped
     from ..stages.registry import stage_types
 
-    answer = {
+    def describe_command(parser: argparse.ArgumentParser) -> dict[str, Any]:
+        shown = (a for a in parser._actions if a.help != argparse.SUPPRESS and a.dest != "help")
+        return {"help": parser.description, "arguments": [_argument(action) for action in shown]}
+
+    def describe_option(option: Any) -> dict[str, Any]:
+        shown = option.typed_default if isinstance(option.default, tuple) else option.default
+        return asdict(option) | {"default": shown}
+
+    content = {
         "format": _FORMAT,
         "version": __version__,
         "models": list(shipped()),
-        "classes": {
-            str(code): {"name": name, "color": class_color(code)} for code, name in NAMES.items()
-        },
-        "commands": {
-            name: {
-                "help": parser.description,
-                "arguments": [
-                    _argument(action)
-                    for action in parser._actions
-                    if action.help != argparse.SUPPRESS and action.dest != "help"
-                ],
-            }
-            for name, parser in commands.items()
-        },
+        "classes": {str(c): {"name": name, "color": class_color(c)} for c, name in NAMES.items()},
+        "commands": {name: describe_command(parser) for name, parser in commands.items()},
         "stages": {
-            name: {
-                "help": stage.summary,
-                "options": [
-                    asdict(option)
-                    | {
-                        "default": option.typed_default
-                        if isinstance(option.default, tuple)
-                        else option.default
-                    }
-                    for option in stage.all_options()
-                ],
-            }
+            name: {"help": stage.summary, "options": [*map(describe_option, stage.all_options())]}
             for name, stage in stage_types().items()
         },
     }
-    return json.dumps(answer, indent=1)
+    return json.dumps(content, indent=1)
 
 
 def _argument(action: argparse.Action) -> dict[str, Any]:
@@ -188,12 +157,11 @@ def _argument(action: argparse.Action) -> dict[str, Any]:
     value_type: Any = action.type or of_choices
     kind = "boolean" if switch else _TYPES.get(value_type, "string")
     default = bool(action.default) if switch else action.default
+    flags = action.option_strings
     return {
         "name": action.dest,
-        "flag": max(action.option_strings, key=len, default="")
-        if not switch
-        else action.option_strings[0],
-        "off": next((flag for flag in action.option_strings if flag.startswith("--no-")), ""),
+        "flag": flags[0] if switch else max(flags, key=len, default=""),
+        "off": next((flag for flag in flags if flag.startswith("--no-")), ""),
         "kind": kind,
         "help": (action.help or "").replace("%%", "%"),
         "default": default if isinstance(default, bool | int | float | str) else None,

@@ -16,15 +16,8 @@ from .tiled_runs import add_tile_sizes, tiling_options
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
 _TRAINING_OPTIONS = (
-    "recipe",
-    "base",
-    "passes",
-    "classes",
-    "neighborhoods",
-    "feature_set",
-    "count",
-    "trees",
-)
+    "recipe", "base", "passes", "classes", "neighborhoods", "feature_set", "count", "trees",
+)  # fmt: skip
 
 
 def add_commands(parser: Parser) -> None:
@@ -37,47 +30,27 @@ def add_commands(parser: Parser) -> None:
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     add("--model", required=True, help="Model file to write")
     add_stage_options(add, "writers.classifiermodel", *_TRAINING_OPTIONS)
-    surveys = (
-        "Files that belong to one survey, e.g. north=north/*.laz; any other file counts as a survey"
-    )
+    surveys = "Files of one survey, north=north/*.laz; any other file counts as a survey by itself"
     add("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
-
     add_tile_sizes(parser.commands["train"])
+
     what = "Fit a model to a survey without labels"
     add = parser.command("adapt", _adapt, what, progress=True)
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     add("--model", required=True, help="Model file to write, for classify --model")
-    add(
-        "--teacher",
-        default="standard",
-        metavar="MODEL",
-        help="Model to learn from (default: standard)",
-    )
-    add(
-        "--sure",
-        type=float,
-        default=0.7,
-        metavar="SHARE",
-        help="Least Reliability to learn from (0.7)",
-    )
+    add("--teacher", default="standard", metavar="MODEL", help="Model to learn from (standard)")
+    sure = "Least Reliability to learn from (0.7)"
+    add("--sure", type=float, default=0.7, metavar="SHARE", help=sure)
     add_tile_sizes(parser.commands["adapt"])
 
     what = "Compare classes with a reference, points or objects"
     add = parser.command("accuracy", _accuracy, what, overrides=True, progress=True)
     add("inputs", nargs="+", metavar="input", help=INPUTS)
-    add(
-        "--reference",
-        action="append",
-        metavar="FILE",
-        help="True classes: the same points in their order",
-    )
+    reference = "True classes: the same points in their order"
+    add("--reference", action="append", metavar="FILE", help=reference)
     add("--model", help="Classify labeled files with this model and score it")
-    add(
-        "--dimension",
-        default="Classification",
-        metavar="NAME",
-        help="Dimension to score (Classification)",
-    )
+    dimension = "Dimension to score (Classification)"
+    add("--dimension", default="Classification", metavar="NAME", help=dimension)
     add("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
     add("--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)")
     add("--area", metavar="FILE", help="With --objects: count only objects inside these polygons")
@@ -148,18 +121,10 @@ def _accuracy(options: argparse.Namespace) -> None:
     if options.reference and options.model:
         raise StageError("--reference and --model exclude each other", found=options.model)
     other = "Classification" if options.reference or options.model else "Reference"
+    dimensions = options.dimension, options.reference_dimension or other
     outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
-    print_messages(
-        *compare_files(
-            options.inputs,
-            options.reference or (),
-            options.dimension,
-            options.reference_dimension or other,
-            options.overrides,
-            options.model or "",
-            **outputs,
-        )
-    )
+    settings = *dimensions, options.overrides, options.model or ""
+    print_messages(*compare_files(options.inputs, options.reference or (), *settings, **outputs))
 
 
 def _compare_objects(options: argparse.Namespace) -> None:

@@ -153,9 +153,8 @@ class Parser(argparse.ArgumentParser):
         parser.set_defaults(run=run, takes_overrides=overrides)
         parser.rare = [*rare, *(("progress",) if progress else ())]
         if progress:
-            parser.add_argument(
-                "--progress", action=argparse.BooleanOptionalAction, help="Show progress"
-            )
+            both_ways = argparse.BooleanOptionalAction
+            parser.add_argument("--progress", action=both_ways, help="Show progress")
         return parser.add_argument
 
 
