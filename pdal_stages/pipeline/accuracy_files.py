@@ -28,8 +28,7 @@ from .runtime import points_of_views
 #: What to do where the true classes are not known.
 WHAT_IS_TRUE = (
     "Say where the true classes are: --reference FILE, of the same points, or "
-    "--reference-dimension NAME, which "
-    "filters.ferry may have kept before classifying"
+    "--reference-dimension NAME, which filters.ferry may have kept before classifying"
 )
 
 
@@ -71,11 +70,8 @@ def compare_files(
             else:
                 points, judged, true = _paired(source, reference, dimension, reference_dimension)
             arrays = {name: values for name, values in points.arrays.items() if name in kept}
-            arrays |= {
-                "Withheld": points.flag("Withheld"),
-                "Classification": judged,
-                "Reference": true,
-            }
+            arrays |= {"Classification": judged, "Reference": true}
+            arrays["Withheld"] = points.flag("Withheld")
             parts.append((Path(source).name, stage.points(arrays, wkt=points.wkt)))
             bar.update(1)
     if not any(points.count for _, points in parts):
@@ -90,6 +86,8 @@ def compare_files(
     return report.messages
 
 
+#: Points of two files that are farther apart are not the same; formats round coordinates.
+_FAR_APART_M = 0.01
 #: Dimension that keeps the files' own classes while a model assigns new ones.
 _TRUTH = "TrueClass"
 
@@ -129,19 +127,13 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
     for source, (place, stem) in zip(sources, _places_and_names(sources), strict=True):
         inside = [key for key in by_name if key[0] == place and key[1] in stem]
         if not inside:
-            raise StageError(
-                "a file has no reference with its name",
-                found=source,
-                cure="Name the references like the files they belong to, not "
-                + ", ".join([os.path.join(*key) for key in by_name][:5]),
-            )
+            names = ", ".join([os.path.join(*key) for key in by_name][:5])
+            cure = f"Name the references like the files they belong to, not {names}"
+            raise StageError("a file has no reference with its name", found=source, cure=cure)
         reference = by_name[max(inside, key=lambda key: len(key[1]))]
-        if reference in pairs:
-            raise StageError(
-                "two files have the same reference",
-                found=f"{pairs[reference]} and {source}: {reference}",
-            )
-        pairs[reference] = source
+        if (other := pairs.setdefault(reference, source)) is not source:
+            both = f"{other} and {source}: {reference}"
+            raise StageError("two files have the same reference", found=both)
     return [(source, reference) for reference, source in pairs.items()]
 
 
@@ -162,30 +154,24 @@ def _read(
 def _codes(points: Points, name: str, source: str) -> NDArray[np.uint8]:
     """Return a dimension of class codes."""
     if name not in points.arrays:
-        raise DimensionError(
-            f"the dimension '{name}' is missing",
-            where=source,
-            found=", ".join(points.arrays),
-            cure=f"{suggest(name, points.arrays)}{WHAT_IS_TRUE}",
-        )
+        what, names = f"the dimension '{name}' is missing", ", ".join(points.arrays)
+        cure = f"{suggest(name, points.arrays)}{WHAT_IS_TRUE}"
+        raise DimensionError(what, where=source, found=names, cure=cure)
     return points.codes_of(name)
 
 
 def _refuse_other_points(judged: Points, true: Points, source: str, reference: str) -> None:
-    named = [name for name in ("X", "Y", "Z") if name in judged.arrays and name in true.arrays]
-    if judged.count != true.count:
-        difference = f"{judged.count:,} points in {source}, {true.count:,} in {reference}"
-    else:
-        apart = [np.count_nonzero(np.abs(judged.arrays[n] - true.arrays[n]) > 0.01) for n in named]
-        difference = (
-            f"{max(apart, default=0):,} points of {source} and {reference} lie apart"
-            if any(apart)
-            else ""
-        )
-    if difference:
-        raise StageError(
-            "the two files do not hold the same points in the same order",
-            found=difference,
-            cure="Compare files of the same points, or keep the labels with filters.ferry while "
-            "classifying",
-        )
+    """Refuse a reference that holds other points, or the same in another order."""
+    difference = f"{judged.count:,} points in {source}, {true.count:,} in {reference}"
+    if judged.count == true.count:
+        axes = [axis for axis in ("X", "Y", "Z") if axis in judged.arrays and axis in true.arrays]
+        away = [abs(judged.arrays[axis] - true.arrays[axis]) > _FAR_APART_M for axis in axes]
+        number = max(map(np.count_nonzero, away), default=0)
+        if not number:
+            return
+        difference = f"{number:,} points of {source} and {reference} lie apart"
+    what = "the two files do not hold the same points in the same order"
+    cure = (
+        "Compare files of the same points, or keep the labels with filters.ferry while classifying"
+    )
+    raise StageError(what, found=difference, cure=cure)
