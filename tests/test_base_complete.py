@@ -47,15 +47,3 @@ def test_cut_files_are_refused(tmp_path, pdal_program, name):
         path.write_bytes(content[:length])
         with pytest.raises(StageError, match="could not be written completely"):
             check_complete(path, name, writer, COUNT)
-
-
-def test_other_formats_are_held_against_disk_and_limits(tmp_path, monkeypatch):
-    path = tmp_path / "x.tif"
-    path.write_bytes(b"x" * 100)
-    writer = {"type": "writers.gdal", "filename": "x.tif"}
-    check_complete(path, path, writer)
-    for name, value in (("_largest_file", lambda: 100), ("disk_is_full", lambda path: True)):
-        with monkeypatch.context() as patch:
-            patch.setattr(f"pdal_stages.base.las_check.{name}", value)
-            with pytest.raises(StageError, match="Make room"):
-                check_complete(path, path, writer)

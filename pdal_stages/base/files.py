@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import glob
 import json
 import os
 import re
@@ -114,8 +113,6 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         refuse(f"the name of the {{}} file is longer than {_LONGEST_NAME} bytes")
     if not real.parent.is_dir():
         refuse("the folder of the {} file does not exist", "Create it first", str(real.parent))
-    if real.is_symlink():
-        refuse("the {} file is a link that leads to itself")
     if real.is_dir():
         refuse("the {} file names a folder", "Give a file name")
     if not os.access(real.parent, os.W_OK):
@@ -217,23 +214,14 @@ class Output:
 def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]) -> None:
     """Refuse outputs that cannot be written, are inputs, are one file or replace another kind.
 
-    Symbolic and hard links are recognized. The other parts of a shapefile, and all files in the
-    folder of an EPT source, are read with it.
+    Symbolic and hard links are recognized.
 
     Raises
     ------
     StageError
         Naming the output.
     """
-    named = list(map(Path, inputs))
-    parts = [
-        part
-        for p in named
-        if p.suffix.lower() == ".shp"
-        for part in p.parent.glob(f"{glob.escape(p.stem)}.*")
-    ]
-    read = {identity: os.fspath(path) for path in [*named, *parts] if (identity := _identity(path))}
-    octrees = [Path(os.path.realpath(path)).parent for path in named if path.name == "ept.json"]
+    read = {identity: os.fspath(path) for path in inputs if (identity := _identity(path))}
     names = [Path(os.path.realpath(path)) for path in read.values()]
     seen: dict[tuple[int, int] | Path, Output] = {}
     for output in outputs:
@@ -242,8 +230,6 @@ def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]
             continue
         real, identity = Path(os.path.realpath(output.path)), _identity(output.path)
         hit = (identity and read.get(identity)) or _numbered(real, names)
-        if hit is None and identity and any(map(real.is_relative_to, octrees)):
-            hit = real
         if hit is not None:
             raise StageError(
                 f"the {output.what} file is one of the inputs",

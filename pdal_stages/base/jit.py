@@ -12,12 +12,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import sys
 import threading
 from collections.abc import Callable
 from functools import lru_cache, partial, update_wrapper
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from .errors import DependencyError
 from .files import exposed_folder
@@ -118,30 +117,8 @@ def _numba() -> Any:
         ) from None
     import numba.core.event
 
-    absent = _NoLinearAlgebra(threading.get_ident())
-    sys.meta_path.insert(0, absent)
-    try:
-        with contextlib.suppress(ImportError):  # of a numba that is built otherwise
-            import numba.np.arraymath
-    finally:
-        sys.meta_path.remove(absent)
     _tell_compiling(numba.core.event)
     return numba
-
-
-class _NoLinearAlgebra(NamedTuple):
-    """A finder by which one thread does not find SciPy's linear algebra.
-
-    numba loads it to see whether it is there, a tenth of a small job, and asks that for
-    ``np.correlate`` alone.
-    """
-
-    thread: int
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
-        """Raise ImportError for SciPy's linear algebra in the thread; leave the rest to others."""
-        if name == "scipy.linalg" and threading.get_ident() == self.thread:
-            raise ImportError(name)
 
 
 def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:

@@ -44,8 +44,6 @@ _HEADER_BYTES = (227, 227, 227, 235, 375, 375)
 _MOST_CHUNKS = 200_000
 #: Most points of a chunk, since lazrs allocates memory for all of them; 50,000 are usual.
 _LARGEST_CHUNK = 2**24
-#: Points that are decoded at a time.
-_DECODED = 50_000
 
 #: A problem, and the value that shows it.
 Problem = tuple[str, str]
@@ -146,7 +144,7 @@ def check_complete(
     """Refuse a file that was not written completely.
 
     LAS and LAZ files are checked against their headers and the number of points; for other
-    formats, only whether disk and limits left room.
+    formats, only whether the disk has room left.
 
     Parameters
     ----------
@@ -170,14 +168,14 @@ def check_complete(
         size = path.stat().st_size
         with open(path, "rb+") as file:
             os.fsync(file.fileno())  # some file systems report a full disk only here
-        whole = _is_whole(path, count) if las else not disk_is_full(path) and size < _largest_file()
+        whole = _is_whole(path, count) if las else not disk_is_full(path)
     except OSError as error:
         raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
     if not whole:
         raise StageError(
             "the output file could not be written completely",
             found=f"{name}: {size:,} bytes were written",
-            cure="Make room on the disk (or raise the limit on file sizes)",
+            cure="Make room on the disk",
         )
 
 
@@ -189,16 +187,6 @@ def _is_whole(path: Path, count: int | None) -> bool:
         return False
     header = read_header(path)
     return header is not None and count in (None, header.count)
-
-
-def _largest_file() -> float:
-    """Return the limit on the size of this process's files, in bytes."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return math.inf
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-    return math.inf if limit == resource.RLIM_INFINITY else limit
 
 
 def _end_of_points(header: LasHeader, size: int) -> int:
@@ -274,8 +262,8 @@ def _chunk_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | No
     Layout: "LAZ specification 1.4", chunk table.
     """
     coding = laszip_record(file, header)
-    if header.count and coding.startswith(POINTWISE):
-        return _stream_problem(file, header, coding)
+    if header.count and coding.startswith(POINTWISE):  # only decoding all points would tell
+        return None
     file.seek(header.offset)
     place = file.read(8)
     if place == b"\xff" * 8:  # a stream that could not be rewound has it at its end
@@ -326,23 +314,6 @@ def _table_problem(
     if held < header.count or (exact and held > header.count):
         value = f"{header.count:,} counted, {held:,} held"
         return "its header counts a different number of points than it holds", value
-    return None
-
-
-def _stream_problem(file: BinaryIO, header: LasHeader, coding: bytes) -> Problem | None:
-    """Return a problem of points that are compressed one by one: only decoding them tells."""
-    import lazrs
-
-    file.seek(header.offset)
-    left, buffer = header.count, bytearray(_DECODED * header.point_bytes)
-    try:
-        stream = lazrs.LasZipDecompressor(file, coding)
-        while left:
-            number = min(left, _DECODED)
-            stream.decompress_many(memoryview(buffer)[: number * header.point_bytes])
-            left -= number
-    except (lazrs.LazrsError, OSError) as error:
-        return "it is cut short, or its points cannot be decoded", str(error)
     return None
 
 

@@ -180,7 +180,7 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
     centered = geodetic.keyword == "GEOCCS" or (
         system is not None and system.name.lower() == "cartesian"
     )
-    zone = utm_code(*place, root.name) if place is not None and not centered else None
+    zone = utm_code(*place) if place is not None and not centered else None
     code = f"EPSG:{zone or 'CODE'}"
     what = "the UTM zone of the points; or use the national grid of the area"
     if not zone:
@@ -216,21 +216,11 @@ def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float
         )
 
 
-def utm_code(longitude: float, latitude: float, name: str = "") -> int | None:
-    """Return the EPSG code of the UTM zone of a place in degrees; None where there is no zone.
-
-    On ETRS89 or NAD83 where `name`, a reference's, says so, else on WGS 84.
-    """
+def utm_code(longitude: float, latitude: float) -> int | None:
+    """Return the EPSG code of the UTM zone (WGS 84) of a place in degrees; None without a zone."""
     if not (-180.0 <= longitude <= 180.0 and -80.0 <= latitude <= 84.0):
         return None
-    zone = min(60, int((longitude + 180.0) // 6.0) + 1)
-    if 56.0 <= latitude < 64.0 and 3.0 <= longitude < 12.0:
-        zone = 32  # southern Norway
-    if "ETRS" in name.upper() and 28 <= zone <= 38:
-        return 25800 + zone
-    if "NAD83" in name.upper().replace(" ", "") and 1 <= zone <= 23 and latitude > 0:
-        return 26900 + zone
-    return (32600 if latitude >= 0 else 32700) + zone
+    return (32600 if latitude >= 0 else 32700) + min(60, int((longitude + 180.0) // 6.0) + 1)
 
 
 @dataclass

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import ctypes
-import glob
 import multiprocessing
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -28,13 +26,15 @@ def vector(name: str) -> Any:
     return optional_import(name, "vector", "work with vector data")
 
 
-def is_odd(path: str) -> bool:
-    """Return whether pyogrio misreads a path.
+def refuse_odd_name(path: str) -> None:
+    """Refuse a path that pyogrio misreads.
 
     It takes the part before '!' for an archive, that after ';' for parameters, and reads UTF-8
     only.
     """
-    return "://" not in path and bool(re.search("[!\ud800-\udfff]|;[^/]*$", os.path.abspath(path)))
+    if "://" not in path and re.search("[!\ud800-\udfff]|;[^/]*$", os.path.abspath(path)):
+        what = "vector files have names in UTF-8, without '!' and ';'"
+        raise StageError(what, found=ascii(os.path.abspath(path)), cure="Give another")
 
 
 @contextmanager
@@ -43,24 +43,16 @@ def reading(
     what: str = "the vector file cannot be read",
     cure: str = "Check it with ogrinfo -al; ogr2ogr -makevalid new.gpkg FILE often repairs it",
 ) -> Iterator[str]:
-    """Yield a name by which pyogrio finds a file; errors of GDAL and GEOS become StageError."""
-    with TemporaryDirectory() if is_odd(path) else nullcontext("") as links:
-        try:
-            yield _linked(Path(path).absolute(), Path(links)) if links else path
-        except (StageError, MemoryError):
-            raise
-        except Exception as error:  # each package has its own
-            raise StageError(
-                what, where=path, found=f"{type(error).__name__}: {error}", cure=cure
-            ) from error
-
-
-def _linked(file: Path, folder: Path) -> str:
-    """Return a link with a plain name to a file, beside links to files that belong to it."""
-    plain = re.sub("[!;\ud800-\udfff]", "_", file.stem)
-    for part in file.parent.glob(f"{glob.escape(file.stem)}.*"):
-        (folder / (plain + part.name.removeprefix(file.stem))).symlink_to(part)
-    return str(folder / (plain + file.suffix))
+    """Yield the path of a vector file to read; errors of GDAL and GEOS become StageError."""
+    refuse_odd_name(path)
+    try:
+        yield path
+    except (StageError, MemoryError):
+        raise
+    except Exception as error:  # each package has its own
+        raise StageError(
+            what, where=path, found=f"{type(error).__name__}: {error}", cure=cure
+        ) from error
 
 
 def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:

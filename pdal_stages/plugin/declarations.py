@@ -26,7 +26,8 @@ def header() -> str:
     options, stages = [], []
     for number, kind in enumerate(stage_types().values()):
         name = f"OPTIONS_{number}"
-        options.append(f"const Option {name}[] = {{{_options(kind)}}};")
+        lines = [f"    {{ {', '.join(fields)} }}," for fields in _fields(kind)]
+        options += [f"const Option {name}[] = {{", *lines, "};"]
         texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")
         gathers = str(bool(kind.instead_of_tiles)).lower()
         shown = ", ".join(map(json.dumps, texts))
@@ -45,12 +46,6 @@ def digest(kind: type[Stage]) -> str:
     gathers = bool(kind.instead_of_tiles)
     held = f"{kind.type} {gathers} {[fields[:-1] for fields in _fields(kind)]}"
     return hashlib.sha256(held.encode()).hexdigest()[:16]
-
-
-def _options(kind: type[Stage]) -> str:
-    """Return the options of a stage as C++ text."""
-    lines = [f"    {{ {', '.join(fields)} }}," for fields in _fields(kind)]
-    return "\n".join(["", *lines, ""])
 
 
 def _fields(kind: type[Stage]) -> Iterator[list[str]]:

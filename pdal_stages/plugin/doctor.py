@@ -30,6 +30,8 @@ _EXTRAS = {
 }
 #: Bytes of free memory that a job needs besides the cloud; less is reported.
 _LITTLE_MEMORY = 2 * 2**30
+_PACKAGE = Path(__file__).resolve().parents[1]
+#: Of ``filters.python``.
 _SCRIPT = """
 def stage(ins, outs):
     import sys
@@ -55,10 +57,10 @@ class Finding:
 
     def __str__(self) -> str:
         """Return the line, with the cure below it."""
-        mark = "ok" if not self.cure else "MISSING" if self.needed else "no"
-        return f"{mark:8}{self.what}: {self.result}" + (
-            f"\n        -> {self.cure}" if self.cure else ""
-        )
+        if not self.cure:
+            return f"ok      {self.what}: {self.result}"
+        mark = "MISSING" if self.needed else "no"
+        return f"{mark:8}{self.what}: {self.result}\n        -> {self.cure}"
 
 
 def examine() -> Iterator[Finding]:
@@ -73,9 +75,7 @@ def examine() -> Iterator[Finding]:
 
 def _package() -> Iterator[Finding]:
     python = f"Python {sys.version.split()[0]} of {sys.prefix}"
-    yield Finding(
-        "pdal_stages", f"{__version__} in {Path(__file__).resolve().parents[1]}, {python}"
-    )
+    yield Finding("pdal_stages", f"{__version__} in {_PACKAGE}, {python}")
     try:
         loaded_model(STANDARD)
         yield Finding("shipped model", STANDARD)
@@ -107,30 +107,21 @@ def _run_program(stages: list) -> None:
 
 def _python_of(what: str, run: Callable[[list], object]) -> Finding:
     """Return which Python PDAL runs, and whether it has our package."""
-    point = {
-        "type": "readers.faux",
-        "mode": "constant",
-        "count": 1,
-        "bounds": "([1, 2], [1, 2], [1, 2])",
-    }
+    bounds = "([1, 2], [1, 2], [1, 2])"
+    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": bounds}
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer")
-        run(
-            [
-                point,
-                runtime.python_filter("pdal_stages_doctor", _SCRIPT, {"answer": str(answer)}, {}),
-            ]
-        )
+        name = "pdal_stages_doctor"
+        run([point, runtime.python_filter(name, _SCRIPT, {"answer": str(answer)}, {})])
         if not answer.is_file():
             cure = "Install pdal-plugins again, for this PDAL and this Python"
             return Finding(what, "the script did not run", cure)
         prefix, package = answer.read_text().splitlines()[:2]
-    python, here = f"Python of {prefix}", Path(__file__).resolve().parents[1]
+    python = f"Python of {prefix}"
     if not os.path.isabs(package):
-        return Finding(
-            what, f"{python}; {package}", f"{prefix}/bin/python -m pip install pdal-stages"
-        )
-    if Path(package).resolve().parent != here:
+        cure = f"{prefix}/bin/python -m pip install pdal-stages"
+        return Finding(what, f"{python}; {package}", cure)
+    if Path(package).resolve().parent != _PACKAGE:
         other = f"{python}, which has another pdal_stages: {package}"
         return Finding(what, other, "Keep one of them, or one version")
     return Finding(what, python)
@@ -138,12 +129,9 @@ def _python_of(what: str, run: Callable[[list], object]) -> Finding:
 
 def _plugin() -> Iterator[Finding]:
     good, bad = install.check()
-    if bad:
-        cure = "pdal-stages plugin --install; pdal-stages itself does not need it"
-        what = "native stages (pdal pipeline knows our names)"
-        yield Finding(what, bad[-1].split(". ")[0], cure, needed=False)
-    else:
-        yield Finding("native stages", good[-1])
+    what = "native stages (pdal pipeline knows our names)"
+    cure = "pdal-stages plugin --install; pdal-stages itself does not need it" if bad else ""
+    yield Finding(what, bad[-1].split(". ")[0] if bad else good[-1], cure, needed=False)
 
 
 def _machine() -> Iterator[Finding]:
@@ -152,10 +140,9 @@ def _machine() -> Iterator[Finding]:
     cure = "" if free >= _LITTLE_MEMORY else "Work in tiles (--tile), or close other programs"
     yield Finding("free memory", f"{free / 2**30:.1f} GB", cure, needed=False)
     count = count_cached_kernels()
-    cure = (
-        "" if count else "pdal-stages warmup, once; otherwise the first job waits for the compiler"
-    )
-    yield Finding("compiled kernels", str(count) if count else "none yet", cure, needed=False)
+    cure = "pdal-stages warmup, once; otherwise the first job waits for the compiler"
+    cure = "" if count else cure
+    yield Finding("compiled kernels", f"{count or 'none yet'}", cure, needed=False)
 
 
 def _extras() -> Iterator[Finding]:

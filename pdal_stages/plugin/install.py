@@ -40,11 +40,13 @@ def libraries() -> list[str]:
 
 def usual_folder() -> Path:
     """Return the folder in PDAL's path with the plugin, else that of ``filters.python``."""
-    named = [
-        Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part
-    ]
-    there = (path for path in named if any((path / name).is_file() for name in libraries()))
+    there = (path for path in _driver_path() if any((path / n).is_file() for n in libraries()))
     return next(there, None) or plugin_folder()
+
+
+def _driver_path() -> list[Path]:
+    """Return the folders that PDAL_DRIVER_PATH names."""
+    return [Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part]
 
 
 def install(folder: Path | None = None) -> list[Path]:
@@ -70,15 +72,8 @@ def install(folder: Path | None = None) -> list[Path]:
         Path(work, "declarations.hpp").write_text(declarations.header())
         link = ["-shared", f"-L{installed.library}", "-lpdalcpp", f"-Wl,-rpath,{installed.library}"]
         link += [] if sys.platform == "darwin" else ["-Wl,-Bsymbolic", "-s"]
-        flags = [
-            "-std=c++17",
-            "-O1",
-            "-fPIC",
-            "-fvisibility=hidden",
-            "-w",
-            f"-I{work}",
-            f"-I{installed.headers}",
-        ]
+        flags = ["-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-w"]
+        flags += [f"-I{work}", f"-I{installed.headers}"]
         _run([*cxx, *flags, str(SOURCE), *link, "-o", str(library)])
         files = [target / name for name in libraries()]
         for path in files:
@@ -91,42 +86,29 @@ def uninstall(folder: Path | None = None) -> list[Path]:
     target = folder or usual_folder()
     gone = [target / name for name in libraries() if (target / name).is_file()]
     for path in gone:
-        try:
-            path.unlink()
-        except OSError as error:
-            raise StageError(
-                "a file cannot be removed", found=f"{path}: {error.strerror}"
-            ) from None
+        path.unlink()
     return gone
 
 
 def check(folder: Path | None = None) -> tuple[list[str], list[str]]:
-    """Return lines on what is installed, and on what is missing with its cure.
+    """Return a line on the plugin that is installed, or lines on what is missing with its cure.
 
     An outdated plugin is reported when it runs.
     """
-    good: list[str] = []
-    bad: list[str] = []
-    looks = (
-        lambda: f"compiler: {shutil.which(compiler()[0])}",
-        lambda: "PDAL {2}: {0}, headers {1}".format(*pdal()),
-        lambda: f"filters.python: {plugin_folder()}",
-    )
-    for look in looks:
+    missing = []
+    for look in (compiler, pdal, plugin_folder):
         try:
-            good.append(look())
+            look()
         except DependencyError as error:
-            bad.append(str(error))
+            missing.append(str(error))
     with contextlib.suppress(DependencyError):
         folder = folder or usual_folder()
         lacking = [name for name in libraries() if not (folder / name).is_file()]
         if not lacking:
-            return [*good, f"plugin: {len(libraries())} stages in {folder}"], []
-        bad.append(
-            f"the plugin is not in {folder} (missing {', '.join(lacking[:3])}). pdal-stages "
-            "plugin --install"
-        )
-    return good, bad
+            return [f"plugin: {len(libraries())} stages in {folder}"], []
+        what = f"the plugin is not in {folder} (missing {', '.join(lacking[:3])})"
+        missing.append(f"{what}. pdal-stages plugin --install")
+    return [], missing
 
 
 class Pdal(NamedTuple):
@@ -177,11 +159,8 @@ def pdal() -> Pdal:
 
 def plugin_folder() -> Path:
     """Return the folder of ``filters.python``, where PDAL finds our plugin, too."""
-    named = [
-        Path(part) for part in os.environ.get("PDAL_DRIVER_PATH", "").split(os.pathsep) if part
-    ]
     usual = [Path(sysconfig.get_path(key)) / "pdal" for key in ("platlib", "purelib")]
-    tried = list(dict.fromkeys([*named, *usual, Path(sys.prefix) / "lib"]))
+    tried = list(dict.fromkeys([*_driver_path(), *usual, Path(sys.prefix) / "lib"]))
     for folder in tried:
         if (folder / _PYTHON_FILTER).is_file():
             return folder

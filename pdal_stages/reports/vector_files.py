@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.files import check_writable, whole_files
 from ..base.units import horizontal_part
-from ..base.vector import is_odd, vector
+from ..base.vector import refuse_odd_name, vector
 
 #: GDAL's drivers by the ending of a file's name.
 DRIVERS = {
@@ -44,9 +43,7 @@ def check_target(path: str | Path, layers: Sequence[str]) -> None:
             found=str(path),
             cure=f"Give a name that ends in {', '.join(DRIVERS)}",
         )
-    if is_odd(str(path)):
-        what = "vector files are written to names in UTF-8, without '!' and ';'"
-        raise StageError(what, found=ascii(os.path.abspath(path)), cure="Give another")
+    refuse_odd_name(str(path))
     vector("pyogrio")
     vector("shapely")
     for name in target_files(path, layers):
