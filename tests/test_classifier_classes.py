@@ -103,7 +103,6 @@ def test_binary():
         ({"max_samples": float("nan")}, "max_samples"),
         ({"max_samples": 1.5}, "max_samples"),
         ({"max_features": "all"}, "max_features"),
-        ({"max_features": 0.0}, "max_features"),
         ({"threads": -1}, "threads"),
         ({"dimensions": [3]}, "dimensions"),
     ],

@@ -6,10 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier import auto_context
-from pdal_stages.classifier.auto_context import PassRun, WeightedPass
 from pdal_stages.classifier.context_features import OWN, WHOLE, Context, count_shares, rows_needed
-from pdal_stages.classifier.interface import Block, PredictRequest
 
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
@@ -59,41 +56,6 @@ def test_equals_the_reference(seed, n, kind):
     assert np.array_equal(
         context.cell_means(xyz, shares, 2).columns(rows), reference(xyz, shares, rows, context)
     )
-
-
-class FirstPass:
-    """A first pass that yields probabilities in blocks in any order."""
-
-    features = context = None
-
-    def __init__(self, blocks):
-        self.blocks = blocks
-
-    def predict(self, request):
-        return iter(self.blocks)
-
-
-@settings(max_examples=10, deadline=None)
-@given(st.integers(0, 10**6), st.sampled_from(["even", "corners", "far"]), st.integers(1, 300))
-def test_band_by_band_is_the_same(seed, kind, size):
-    xyz, shares = cloud(seed, 300, kind)
-    random = np.random.default_rng(seed)
-    context = Context(("own", "box0.5", "columnvotes2", "column4"))
-    wanted = None if seed % 3 == 0 else np.flatnonzero(random.random(300) < 0.3)
-    coming = rows_needed(xyz, wanted, context)
-    order = random.permutation(300 if coming is None else coming)
-    blocks = [Block(part, shares[part] / WHOLE) for part in np.array_split(order, 5)]
-    request = PredictRequest(xyz, {}, wanted, 2)
-    got, seen = np.full((300, 12), np.nan, np.float32), np.zeros(300, int)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto_context, "BAND", size)
-        run = PassRun([WeightedPass(FirstPass(blocks), (2, 5, 6))], request, context)
-        for rows, columns in run.blocks():
-            seen[rows] += 1
-            got[rows] = columns
-    rows = np.arange(300) if wanted is None else wanted
-    assert (seen[rows] == 1).all() and seen.sum() == len(rows)
-    assert np.array_equal(got[rows], reference(xyz, shares, rows, context))
 
 
 @settings(max_examples=8, deadline=None)

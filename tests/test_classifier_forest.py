@@ -214,9 +214,3 @@ def test_growing_does_not_depend_on_threads_and_counts_weights():
     assert np.array_equal(one[1], other[1]) and one[1].sum() == pytest.approx(1)
     assert one[0].leaf_counts.sum() == 7 * round(0.5 * weight.sum())
     assert (one[0].predict_proba(x).argmax(axis=1) == y).mean() > 0.8
-
-
-@pytest.mark.parametrize("asked", ["auto", "sqrt", 700, 0.1])
-def test_any_number_of_features_may_be_tried(asked):
-    x, y = data(60)
-    grow_forest(x, y, np.ones(60, np.int64), 1, Growth(0, max_features=asked))

@@ -10,7 +10,6 @@ from test_classifier_training import SMALL, scene
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import auto_context, model_file, train_forest
-from pdal_stages.classifier.interface import Block
 from pdal_stages.classifier.training_options import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 
@@ -179,33 +178,6 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
     with pytest.raises(ModelError):
         model_file.write(tmp_path / "m", manifest, [one.arrays() for one in two.passes])
         load_model(tmp_path / "m")
-
-
-def test_a_pass_may_come_from_elsewhere(two, other):
-    """The first pass may be any classifier of clouds: here one that hands over all points at once, like a network."""
-    from pdal_stages.classifier.auto_context import WeightedPass, classify
-
-    first = two.passes[0]
-
-    class Whole:
-        plan = first.plan
-        features = context = None
-
-        def predict(self, request):
-            p = np.zeros((len(request.xyz), 3))
-            for block in classify([WeightedPass(first, (2, 5, 6))], request):
-                p[block.rows] = block.probabilities
-            rows = np.arange(len(p)) if request.rows is None else request.rows
-            request.report.figures["batches"] = 1
-            yield Block(rows, p[rows])
-
-    xyz, _, dimensions = other
-    model = type(two)((Whole(), two.passes[1]), two.classes, two.info)
-    same(everything(two, xyz, dimensions), everything(model, xyz, dimensions))
-    inner = (np.abs(xyz[:, :2] - 30) < 8).all(axis=1)
-    part = everything(model, xyz, dimensions, inner)
-    same(everything(two, xyz, dimensions), part, inner, inner)
-    assert part.report.figures["batches"] == 1
 
 
 def test_options():

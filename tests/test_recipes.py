@@ -155,19 +155,6 @@ def test_he2017_trains_and_classifies():
     assert model.info["training"]["max_depth"] == "sqrt"
 
 
-def test_a_given_curvature_threshold_is_used_and_stored():
-    rng = np.random.default_rng(4)
-    xyz = np.concatenate(
-        [rng.uniform(0, 20, (3000, 3)) * [1, 1, 0.001], rng.uniform(0, 20, (2000, 3))]
-    )
-    labels = np.repeat([2, 5], [3000, 2000])
-    options = TrainingOptions.from_recipe(
-        "he2017", count=100, trees=5, folds=0, copt_threshold=0.05
-    )
-    model = train(TrainingCloud(xyz, labels), options, progress=False)
-    assert model.passes[0].features.copt_threshold == 0.05
-
-
 def test_a_mistyped_recipe_gets_the_whole_name(capsys):
     with pytest.raises(SystemExit):
         main(["train", "a.laz", "--model", "b.model", "--recipe", "weinman2018"])

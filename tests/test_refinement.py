@@ -226,7 +226,7 @@ def test_what_cannot_be_built_on(base):
     once = on_top(base)
     twice = on_top(once)
     assert len(twice.passes) == 4
-    with pytest.raises(OptionError, match="a base may have 3 passes"):
+    with pytest.raises(OptionError, match="up to 3 forests"):
         TrainingOptions(base=twice)
 
 

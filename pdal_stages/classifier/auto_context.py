@@ -86,9 +86,9 @@ class WeightedPass(NamedTuple):
 
 def classify(passes: Sequence[WeightedPass], request: PredictRequest) -> Iterator[Block]:
     """Yield the weighted probabilities of the last pass for all points wanted, block by block."""
-    last = passes[-1]
-    if len(passes) == 1 and last.classifier.features is None:
-        yield from _predict(last, request)
+    first = passes[0].classifier
+    if first.features is None:  # it reads the points themselves, and is the only pass
+        yield from first.predict(request)
         return
     for rows, probabilities in PassRun(passes, request).blocks():
         yield Block(rows, probabilities)
@@ -106,20 +106,13 @@ def sample_context(
     return out
 
 
-def _predict(first: WeightedPass, request: PredictRequest) -> Iterator[Block]:
-    """Yield the weighted probabilities of a first pass that reads points instead of features."""
-    for block in first.classifier.predict(request):
-        yield block._replace(probabilities=weigh(block.probabilities, first.factors))
-
-
 class PassRun:
     """Auto-context passes at work on one cloud, band by band.
 
     Parameters
     ----------
     passes : sequence of WeightedPass
-        The first may read points instead of features; all others read the context of the one
-        before.
+        Each but the first reads the context of the one before.
     request : PredictRequest
     context : Context, optional
         With it the run gives the columns of this context, after the last pass, instead of
@@ -159,14 +152,10 @@ class PassRun:
         if not self._request.count:
             return
         bands = self._strips.bands()
-        first = 0
-        if self._features[0] is None:
-            self._fill_first_shares()
-            first = 1
         #: by band: features that a later step reads as well -> their blocks
         held: dict[int, dict[CloudFeatures, list[FeatureBlock]]] = {}
         for lead in range(len(bands) + self._last + 1):
-            for step in range(first, self._last + 1):
+            for step in range(self._last + 1):
                 number = lead - step
                 if not 0 <= number < len(bands):
                     continue
@@ -178,16 +167,6 @@ class PassRun:
                         self._request.progress.update(len(rows))
                     yield rows, result
             held.pop(lead - self._last, None)
-
-    def _fill_first_shares(self) -> None:
-        """Let a first pass that reads points instead of features classify the whole cloud."""
-        mask = self._wanted[0]
-        rows = None if mask is None else np.flatnonzero(mask)
-        for block in _predict(
-            self._passes[0], replace(self._request, rows=rows, progress=None, grid=None)
-        ):
-            places = self._strips.places(block.rows)
-            self._shares[0][places] = count_shares(block.probabilities)
 
     def _work(
         self, step: int, band: Band, held: dict[CloudFeatures, list[FeatureBlock]]

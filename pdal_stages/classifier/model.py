@@ -1,4 +1,4 @@
-"""A trained model: what it needs, what it knows, its file, loading it, and applying it to a cloud."""
+"""A trained model: what it needs and knows, its file, and applying it to a cloud."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Model:
 
     @property
     def preparation(self) -> list[dict[str, Any]]:
-        """Stages that computed the training's dimensions; empty where the file cannot carry them."""
+        """Stages that computed the training's dimensions; empty where none can be stored."""
         return self.info["preparation"]
 
     @property
@@ -113,14 +113,13 @@ class Model:
 
     @property
     def gives_variance(self) -> bool:
-        """True for a network alone, which sees each point in several batches."""
-        return len(self.passes) == 1 and self.passes[0].features is None
+        """True for a network, which sees each point in several batches."""
+        return self.passes[0].features is None
 
     @property
     def algorithm_versions(self) -> dict[str, int]:
         """Versions in the present release of the algorithms that compute what the model reads."""
-        reads_features = any(each.features is not None for each in self.passes)
-        features = {"filters.multiscalefeatures": ALGORITHM_VERSION} if reads_features else {}
+        features = {} if self.gives_variance else {"filters.multiscalefeatures": ALGORITHM_VERSION}
         return preprocessing().algorithm_versions(self.preparation) | features
 
     def record_preprocessing(self, preparation: Sequence[Mapping[str, Any]]) -> None:
@@ -304,8 +303,8 @@ class Model:
     @property
     def _cell(self) -> float:
         """Side in meters of the cells that points are sorted by: those of the features."""
-        features = (each.features for each in self.passes if each.features is not None)
-        return next((each.plan.cell for each in features), 1.0)
+        first = self.passes[0].features
+        return 1.0 if first is None else first.plan.cell
 
     def _request(
         self,
@@ -413,20 +412,28 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
     """Return the model of a manifest and arrays; ModelError where they contradict each other."""
     classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
     codes = [code for code, _ in classes]
-    if sorted(set(codes)) != codes:
-        raise ModelError("the model's classes must be ascending, each once", found=codes[:10])
     check_side(manifest["voxel"])
-    priors = manifest.get("priors")
-    if priors is not None and len(priors["factors"]) != len(classes):
-        raise ModelError(
-            "the manifest's priors must have one factor per class", found=len(priors["factors"])
-        )
-    passes, before = [], codes
-    for number, entry in enumerate(manifest["passes"]):
-        own_codes = entry.get("codes") or codes
-        passes.append(_make_pass(entry, number, arrays[number], own_codes, before))
-        before = own_codes
-    if before != codes:
+    passes: list[Any] = []
+    before: list[int] = []
+    for number, (entry, of_pass) in enumerate(zip(manifest["passes"], arrays, strict=True)):
+        here, own = f"pass {number + 1}", entry.get("codes") or codes
+        if sorted(set(own)) != own:
+            raise ModelError("a model's classes must ascend, each once", found=own[:10])
+        for key, length in (("factors", len(own)), ("importances", len(entry["feature_names"]))):
+            if entry.get(key) is not None and len(entry[key]) != length:
+                raise ModelError(f"{here} must have {length} {key}", found=len(entry[key]))
+        if bool(number) != bool(entry["context"]) or (number and passes[0].features is None):
+            raise ModelError(
+                "every pass but the first must read context, and a network is the only one",
+                found=here,
+            )
+        classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, of_pass, own)
+        if number and classifier.classes_before(own) != before:
+            raise ModelError("a pass reads other classes than the one before gives", found=here)
+        passes.append(classifier)
+        before = own
+    priors = manifest.get("priors") or {"factors": codes}
+    if before != codes or len(priors["factors"]) != len(codes):
         raise ModelError("the last pass has other classes than the model", found=before[:10])
     info = {k: value for k, value in manifest.items() if k not in ("format", "version", "arrays")}
     scores = ("importances", "codes", "factors")
@@ -434,29 +441,3 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
         {key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]
     ]
     return Model(tuple(passes), classes, info)
-
-
-def _make_pass(
-    entry: Mapping[str, Any],
-    number: int,
-    arrays: Mapping[str, npt.NDArray[Any]],
-    codes: list[int],
-    codes_before: list[int],
-) -> Any:
-    """Return the classifier of a pass, the `number`-th from 0, whose classes are `codes`."""
-    here = f"pass {number + 1}"
-    if sorted(set(codes)) != codes or len(entry.get("factors") or codes) != len(codes):
-        raise ModelError(
-            "a pass's classes must ascend, each once, with one factor each", found=codes[:10]
-        )
-    if (number > 0) != bool(entry["context"]):
-        raise ModelError("every pass but the first must read context", found=here)
-    classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, arrays, codes)
-    if number and classifier.classes_before(codes) != codes_before:
-        raise ModelError("a pass reads other classes than the one before gives", found=here)
-    importances = entry["importances"]
-    if importances is not None and len(importances) != len(entry["feature_names"]):
-        raise ModelError(
-            "the manifest's importances must have one value per feature", found=len(importances)
-        )
-    return classifier

@@ -131,8 +131,6 @@ class ForestTraining:
         options, plan = self.options, feature_plan(self.options)
         used = [self.clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
         bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
-        if options.copt_threshold is not None:
-            threshold = options.copt_threshold
         return Features(plan, bins, threshold, options.seed)
 
     def _growth(self) -> Growth:

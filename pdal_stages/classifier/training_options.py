@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
-
 from ..base import checks
 from ..base.asprs import NOISE
 from ..base.checks import Settings, setting
@@ -67,29 +65,6 @@ def _check_folds(what: str, value: Any) -> int:
 
 def _check_voxel(what: str, value: Any) -> float:
     return check_side(checks.number(what, value, 0, LARGEST, unit="m"))
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 1)
-
-
-def _check_max_features(what: str, value: Any) -> Any:
-    is_share = isinstance(value, float | np.floating) and 0.0 < value <= 1.0
-    is_word = isinstance(value, str) and value in ("auto", "sqrt", "log2")
-    if not (is_share or is_word or _is_count(value)):
-        raise OptionError(
-            f"{what} must be auto, sqrt, log2, a number of features, or a share up to 1.0",
-            found=repr(value),
-        )
-    return value
-
-
-def _check_max_depth(what: str, value: Any) -> Any:
-    if not (_is_count(value) or (isinstance(value, str) and value == "sqrt")):
-        raise OptionError(
-            f"{what} must be a whole number of at least 1, or sqrt", found=repr(value)
-        )
-    return value
 
 
 @dataclass(frozen=True)
@@ -157,12 +132,11 @@ class TrainingOptions(Settings):
         may_be_empty=True,
         check=_check_tree_numbers,
     )
-    max_depth: str | int | None = setting(
+    max_depth: str | None = setting(
         None,
-        "word",
-        "Maximum depth of a tree: a number, or sqrt for the root of the number of features; "
-        "default: no limit",
-        check=_check_max_depth,
+        "string",
+        "Maximum depth of a tree: sqrt for the root of the number of features; default: no limit",
+        choices=("sqrt",),
     )
     vote: str = setting(
         "mean",
@@ -178,13 +152,6 @@ class TrainingOptions(Settings):
         "what scaling to [0, 1] changes for trees",
         choices=("none", "percentiles"),
     )
-    copt_threshold: float | None = setting(
-        None,
-        "number",
-        "Curvature from which on copt treats a point as scattered; default: by 2-means over the "
-        "training clouds",
-        *(0, 1),
-    )
     min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", 1, 10**6)
     max_samples: float | None = setting(
         None,
@@ -195,12 +162,12 @@ class TrainingOptions(Settings):
         *(0, 1),
         exclusive=True,
     )
-    max_features: str | int | float = setting(
+    max_features: str = setting(
         "auto",
-        "word",
-        "Features tried at each split: auto (a tenth, at least the square root), sqrt, log2, a "
-        "number or a share",
-        check=_check_max_features,
+        "string",
+        "Features tried at each split: a tenth of them, at least the square root (auto), or that "
+        "root (sqrt)",
+        choices=("auto", "sqrt"),
     )
     prior_weight: float = setting(
         0.2,
@@ -338,10 +305,10 @@ class TrainingOptions(Settings):
                 found=type(self.base).__name__,
                 cure="Load it with load_model",
             )
-        if len(passes) > MOST_PASSES:
+        if len(passes) > MOST_PASSES or self.base.gives_variance:
             raise OptionError(
-                f"a base may have {MOST_PASSES} passes",
-                found=len(passes),
+                f"a base must be up to {MOST_PASSES} forests",
+                found=", ".join(each.name for each in passes),
                 cure="Start from the model that it was built on, with all labels together",
             )
         if (
