@@ -79,43 +79,6 @@ def test_copc_is_written(cloud, tmp_path):
             ps.run_pipeline([read])
 
 
-@pytest.mark.parametrize("point_format", [1, 6])
-def test_flags_are_dimensions_of_their_own(tmp_path, write_las, wide_model, point_format):
-    needs(2, 6, 0)
-    arrays = scene()
-    rng = np.random.default_rng(8)
-    for name in ("Synthetic", "KeyPoint", "Withheld"):
-        arrays[name] = rng.integers(0, 2, len(arrays["X"])).astype(np.uint8)
-    source = write_las(tmp_path / "in.las", arrays, point_format=point_format, scale=0.01)
-    out = tmp_path / "out.las"
-    classify = {
-        "type": "filters.modelclassifier",
-        "model": str(wide_model),
-        "where": "Synthetic == 1 && Withheld == 0",
-    }
-    writer = {
-        "type": "writers.las",
-        "filename": str(out),
-        "forward": "all",
-        "minor_version": 4,
-        "dataformat_id": 6,
-    }
-    run = ps.run_pipeline(
-        [str(source), {"type": "filters.assign", "value": "Classification = 1"}, classify, writer]
-    )
-    array = run.arrays[0]
-    chosen = (array["Synthetic"] == 1) & (array["Withheld"] == 0)
-    assert (array["Classification"][~chosen] == 1).all()
-    assert set(np.unique(array["Classification"][chosen])) == {2, 64}
-    after = laspy.read(out)
-    for name, laspys in (
-        ("Synthetic", "synthetic"),
-        ("KeyPoint", "key_point"),
-        ("Withheld", "withheld"),
-    ):
-        assert np.array_equal(np.asarray(after[laspys]), arrays[name]), name
-
-
 def test_pdals_expressions_after_a_stage_of_ours(cloud):
     value = ["Classification = 1", "Classification = 9 WHERE HeightAboveGround > 3"]
     array = ps.run_pipeline([str(cloud), HAG, {"type": "filters.assign", "value": value}]).arrays[0]

@@ -112,11 +112,7 @@ def test_door_3_filters_python_by_hand(cloud, pdal_module):
 
 def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     """Those with tags stay apart: the same values, of dimensions that a later stage forgets too."""
-    heights = {
-        "type": "filters.hag_morphological",
-        "ground": True,
-        "terrain_slope": True,
-    }
+    heights = {"type": "filters.hag_morphological", "ground": True, "terrain_slope": True}
     classifier = {"type": "filters.modelclassifier", "model": str(model)}
     ours = [{"type": "filters.detachednoise"}, heights, classifier, {"type": "filters.bridges"}]
     stages = [str(cloud), *ours, {"type": "filters.wires"}]

@@ -43,12 +43,7 @@ def test_none_is_forgotten():
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "classify",
-        "classify-with-rejection",
-        "classify-on-smrf-ground",
-        "classify-regularized",
-    ],
+    ["classify", "classify-with-rejection", "classify-on-smrf-ground", "classify-regularized"],
 )
 def test_classify(ready_town, ready_models, tmp_path, name):
     out = tmp_path / "o.laz"

@@ -1,4 +1,4 @@
-"""The command ``classify``: its flags, the request they are parsed into, and its two ways to run."""
+"""The command ``classify``: its flags, the request they become, and its two ways to run."""
 
 from __future__ import annotations
 
