@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pdal_stages.features import compute_features
 from pdal_stages.features.adaptive import curvature_threshold, radii_of
 from pdal_stages.features.engine import FeatureEngine
-from pdal_stages.features.kdtree import build_tree
 from pdal_stages.features.moments import RADIUS, SX, SZ, SZZ, N
+from pdal_stages.features.nearest_neighbors import build_tree
 from pdal_stages.features.plan import FeaturePlan
 from pdal_stages.features.point_grid import build_grid
 

@@ -10,7 +10,7 @@ from test_features_adaptive import CLOUDS, some, town
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features import FeatureEngine, FeaturePlan, compute_features
-from pdal_stages.features.eigen import eigen3
+from pdal_stages.features.moments import eigen3
 from pdal_stages.features.registry import SURFACE_FEATURES
 
 TOKENS = "k3,k20"

@@ -13,10 +13,11 @@ from pdal_stages.base.errors import OptionError
 from pdal_stages.features import compute_features
 from pdal_stages.features.engine import FeatureEngine
 from pdal_stages.features.plan import FeaturePlan
-from pdal_stages.features.shape_bins import METRICS, ShapeBins
 from pdal_stages.features.shape_distributions import (
+    METRIC_NAMES,
     PULLS,
     ROOM,
+    ShapeBins,
     draw,
     make_work,
     point_seeds,
@@ -53,7 +54,7 @@ def pulls(members, repeats=400, seed=0):
     angle = np.arccos(np.clip(-np.sign(a3) * np.sqrt(abs(a3)), -1, 1))
     return dict(
         zip(
-            METRICS,
+            METRIC_NAMES,
             (angle, np.sqrt(d1), np.sqrt(d2), (d3 / 4) ** 0.25, np.cbrt(d4 / 6)),
             strict=True,
         )
@@ -201,7 +202,7 @@ def test_counts_are_the_oracle_s(shape):
     assert np.array_equal(np.round(counts * PULLS).sum(axis=1), [PULLS] * 5)
     center = members.mean(axis=0)
     metrics = [oracle.shape_metrics(*members[pull], center) for pull in at.T]
-    for m, name in enumerate(METRICS):
+    for m, name in enumerate(METRIC_NAMES):
         expected = np.array([metric[name] for metric in metrics])
         # Values within rounding of a threshold may fall to either side.
         near = (abs(expected[:, None] - rows[m]) < 1e-3).any(axis=1).sum()
@@ -277,7 +278,7 @@ def test_thresholds_survive_json(fitted):
     assert 0 <= a3[0] < a3[-1] <= math.pi
 
 
-GOOD = {name: list(np.linspace(0.1, 3.0, 9)) for name in METRICS}
+GOOD = {name: list(np.linspace(0.1, 3.0, 9)) for name in METRIC_NAMES}
 
 
 @pytest.mark.parametrize(

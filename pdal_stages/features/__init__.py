@@ -3,10 +3,9 @@
 Importing this package is light; numba and the kernels are loaded when an engine is made.
 """
 
-from .engine import FeatureEngine, compute_features, warmup
-from .feature_table import FeatureTable
+from .engine import FeatureEngine, FeatureTable, compute_features, warmup
 from .plan import FeaturePlan
-from .shape_bins import ShapeBins
+from .shape_distributions import ShapeBins
 
 __all__ = [
     "FeatureEngine",

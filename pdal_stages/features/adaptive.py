@@ -23,7 +23,6 @@ import numpy as np
 
 from ..base.jit import device, njit
 from ..base.threads import map_blocks
-from .kdtree import build_tree
 from .moments import COINCIDENT, LEAST_MEMBERS, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
 from .nearest_neighbors import (
     CROWD,
@@ -32,6 +31,7 @@ from .nearest_neighbors import (
     MORE,
     ROOM,
     Wanted,
+    build_tree,
     gather_near,
     make_groups,
     make_near,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,15 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.errors import DimensionError, OptionError, StageError
+from ..base.errors import DimensionError, OptionError, StageError, suggest
 from ..base.progress import Progress
 from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
-from .feature_table import FeatureTable
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .point_grid import CellGrid, build_grid, check_xyz
-from .shape_bins import ShapeBins
-from .shape_distributions import SAMPLES, Fitted, smallest_hashes
+from .shape_distributions import SAMPLES, Fitted, ShapeBins, smallest_hashes
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveNeighborhoods
@@ -41,6 +40,52 @@ Given = Mapping[str, npt.ArrayLike] | Callable[[np.ndarray], Mapping[str, np.nda
 
 #: Counts of a block: by kind, then by neighborhood.
 Tally = dict[str, dict[str, int]]
+
+
+@dataclass
+class FeatureTable:
+    """Features of queries: an array with names, which NumPy and scikit-learn take as it is.
+
+    pandas, too: ``pandas.DataFrame(table, columns=list(table))``.
+    """
+
+    values: np.ndarray  #: (m, F) float32
+    names: tuple[str, ...]  #: of the columns
+    #: As given or fitted, both; hand them to another call to get comparable features.
+    bins: ShapeBins | None = None
+    copt_threshold: float | None = None
+    report: Report = field(default_factory=Report)  #: see :class:`FeatureEngine`
+
+    def __len__(self) -> int:
+        """Return the number of queries."""
+        return len(self.values)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of queries and features."""
+        return self.values.shape
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        """Return the values, for NumPy."""
+        return np.array(self.values, dtype) if copy else np.asarray(self.values, dtype)
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names, as a data frame does."""
+        return iter(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a feature of that name."""
+        return name in self.names
+
+    def __getitem__(self, name: str | list[str]) -> np.ndarray:
+        """Return the column of a name, a view; or those of several names, (m, names)."""
+        if isinstance(name, list):
+            return np.stack([self[each] for each in name], axis=1)
+        if name not in self.names:
+            raise KeyError(
+                f"no feature '{name}' in this table. {suggest(name, self.names)}".strip()
+            )
+        return self.values[:, self.names.index(name)]
 
 
 class FeatureEngine:

@@ -7,6 +7,12 @@ it. Points with equal coordinates are interchangeable.
 Eight queries that lie together share the candidates within a reach, guessed from the queries
 before; each sorts those within its own. In the plane the squared distance is uniformly
 distributed, so a counting sort by it fills its bins evenly.
+
+They are found in a balanced k-d tree, whose cost does not depend on how points lie: facades, strays
+and copies. Every node halves its points along the longest side of their bounding box. Only a
+permutation (4 bytes a point) and the nodes' boxes (about 6 bytes a point) are stored. A box is
+skipped only if the distance computed to it is larger than the reach, and computed distances are
+monotone in the coordinates: which points are gathered never depends on rounding.
 """
 
 from __future__ import annotations
@@ -15,8 +21,222 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.jit import device
-from .kdtree import STACK, bounding_box, enough2, gather, halve
+from ..base.jit import device, njit
+from ..base.threads import map_blocks
+
+#: A leaf holds at most this many points.
+LEAF = 24
+
+#: Room for a depth-first traversal.
+STACK = 80
+
+
+class KdTree(NamedTuple):
+    """A cloud and the tree over it, as kernels take it."""
+
+    x: np.ndarray  # (n,) float64, the cloud itself
+    y: np.ndarray
+    z: np.ndarray
+    perm: np.ndarray  # (n,) uint32: positions in the cloud, leaf by leaf
+    # (nodes, 6): xmin, ymin, zmin, xmax, ymax, zmax; node i has the children 2i + 1 and 2i + 2
+    boxes: np.ndarray
+    depth: int  # levels below the root; all leaves lie on the last
+
+
+def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray, threads: int | None = None) -> KdTree:
+    """Return the tree over a cloud of 1 to 2**32 - 1 points with finite coordinates (n,) each."""
+    x, y, z = (np.ascontiguousarray(v, dtype=np.float64) for v in (x, y, z))
+    n = len(x)
+    if not 1 <= n < 2**32:
+        raise ValueError(f"a tree needs 1 to 2**32 - 1 points, not {n}")
+    depth = (n // LEAF).bit_length()
+    tree = KdTree(
+        x, y, z, np.arange(n, dtype=np.uint32), np.empty((2 ** (depth + 1) - 1, 6)), depth
+    )
+    keys = np.empty(n)
+    upper = min(depth, 2)  # levels made one node after the other; the subtrees below them at once
+    tasks = [(0, 0, n)]
+    for _ in range(upper):
+        halves = []
+        for node, lo, hi in tasks:
+            build_nodes(tree, keys, node, lo, hi, 1, False)
+            middle = (lo + hi) // 2
+            halves += [(2 * node + 1, lo, middle), (2 * node + 2, middle, hi)]
+        tasks = halves
+    for _ in map_blocks(
+        lambda task: build_nodes(tree, keys, *task, depth - upper, True), tasks, threads
+    ):
+        pass
+    return tree
+
+
+@njit
+def build_nodes(tree, keys, node, lo, hi, depth, whole):
+    """Make a node of the points perm[lo:hi] and, if `whole`, the `depth` levels below it."""
+    x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
+    stack = np.empty((STACK, 4), np.int64)
+    top = push(stack, 0, node, lo, hi, depth)
+    while top > 0:
+        top -= 1
+        node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        box = bounding_box(x, y, z, perm, lo, hi)
+        for i in range(6):
+            boxes[node, i] = box[i]
+        if depth == 0:
+            continue
+        middle = halve(x, y, z, perm, keys, lo, hi, box)
+        if not whole:
+            return
+        top = push(stack, top, 2 * node + 2, middle, hi, depth - 1)
+        top = push(stack, top, 2 * node + 1, lo, middle, depth - 1)
+
+
+@device(forceinline=True)
+def push(stack, top, node, lo, hi, depth):
+    """Put a node of the points perm[lo:hi] on a stack; return the size of the stack."""
+    stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = node, lo, hi, depth
+    return top + 1
+
+
+@device
+def bounding_box(x, y, z, perm, lo, hi):
+    """Return the box xmin, ymin, zmin, xmax, ymax, zmax of the points perm[lo:hi]."""
+    x0 = y0 = z0 = np.inf
+    x1 = y1 = z1 = -np.inf
+    for i in range(lo, hi):
+        p = perm[i]
+        x0, x1 = min(x0, x[p]), max(x1, x[p])
+        y0, y1 = min(y0, y[p]), max(y1, y[p])
+        z0, z1 = min(z0, z[p]), max(z1, z[p])
+    return x0, y0, z0, x1, y1, z1
+
+
+@device
+def halve(x, y, z, perm, keys, lo, hi, box):
+    """Reorder perm[lo:hi] so that its halves lie on either side of the box; return the middle."""
+    dx, dy, dz = box[3] - box[0], box[4] - box[1], box[5] - box[2]
+    along = x if dx >= dy and dx >= dz else (y if dy >= dz else z)
+    for i in range(lo, hi):
+        keys[i] = along[perm[i]]
+    middle = (lo + hi) // 2
+    select_nth(keys, perm, lo, hi, middle)
+    return middle
+
+
+@device
+def select_nth(keys, perm, lo, hi, nth):
+    """Reorder keys[lo:hi], and perm with it, so that `nth` holds what sorting would put there.
+
+    Hoare's partition stops at equal keys, so many equal ones still halve.
+    """
+    hi -= 1
+    while hi > lo:
+        a, b, c = keys[lo + (hi - lo) // 4], keys[(lo + hi) // 2], keys[hi - (hi - lo) // 4]
+        pivot = max(min(a, b), min(max(a, b), c))
+        i, j = lo, hi
+        while i <= j:
+            while keys[i] < pivot:
+                i += 1
+            while keys[j] > pivot:
+                j -= 1
+            if i <= j:
+                keys[i], keys[j] = keys[j], keys[i]
+                perm[i], perm[j] = perm[j], perm[i]
+                i += 1
+                j -= 1
+        if nth <= j:
+            hi = j
+        elif nth >= i:
+            lo = i
+        else:
+            return
+
+
+@device(forceinline=True)
+def _gap(lo, hi, low, high):
+    """Return the distance along one axis between the intervals lo..hi and low..high."""
+    a, b = lo - high, low - hi
+    gap = a if a > b else b
+    return gap if gap > 0.0 else 0.0
+
+
+@device(forceinline=True)
+def gap2(box, boxes, n):
+    """Return the squared distance between a box and that of node n."""
+    dx = _gap(box[0], box[3], boxes[n, 0], boxes[n, 3])
+    dy = _gap(box[1], box[4], boxes[n, 1], boxes[n, 4])
+    dz = _gap(box[2], box[5], boxes[n, 2], boxes[n, 5])
+    return dx * dx + dy * dy + dz * dz
+
+
+@device
+def enough2(tree, box, need):
+    """Return a squared distance from the point `box` within which `need` points lie, or all."""
+    boxes = tree.boxes
+    node, count = 0, len(tree.perm)
+    for _ in range(tree.depth):
+        if count // 2 < need:
+            break
+        left = gap2(box, boxes, 2 * node + 1) <= gap2(box, boxes, 2 * node + 2)
+        node, count = (2 * node + 1, count // 2) if left else (2 * node + 2, count - count // 2)
+    dx = max(boxes[node, 3] - box[0], box[0] - boxes[node, 0])
+    dy = max(boxes[node, 4] - box[1], box[1] - boxes[node, 1])
+    dz = max(boxes[node, 5] - box[2], box[2] - boxes[node, 2])
+    return dx * dx + dy * dy + dz * dz
+
+
+@device
+def gather(tree, box, reach2, copies, limit, candidates):
+    """Collect the points within sqrt(`reach2`) of `box`; return their number, or -1 above `limit`.
+
+    `candidates` has room for them: arrays x, y, z, at (positions in the cloud) and a stack.
+
+    Of points that all coincide at most about `copies` are taken, a leaf's worth more where they
+    share leaves with others.
+    """
+    x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
+    x0, y0, z0, x1, y1, z1 = box
+    cx, cy, cz, ci, stack = (
+        candidates.x,
+        candidates.y,
+        candidates.z,
+        candidates.at,
+        candidates.stack,
+    )
+    # Unsigned: what may be negative is looked up with a detour.
+    count, step = np.uint64(0), np.uint64(1)
+    top = push(stack, 0, 0, 0, len(perm), tree.depth)
+    while top > 0:
+        top -= 1
+        node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        n = np.uint64(node)
+        if gap2(box, boxes, n) > reach2:
+            continue
+        same = (
+            boxes[n, 0] == boxes[n, 3] and boxes[n, 1] == boxes[n, 4] and boxes[n, 2] == boxes[n, 5]
+        )
+        if same and hi - lo > copies:
+            hi = lo + copies
+            depth = 0
+        if depth == 0:
+            if np.int64(count) + (hi - lo) > limit:
+                return -1
+            for i in range(lo, hi):
+                p = np.uint64(perm[np.uint64(i)])
+                a, b, c = x[p], y[p], z[p]
+                dx, dy, dz = _gap(x0, x1, a, a), _gap(y0, y1, b, b), _gap(z0, z1, c, c)
+                cx[count] = a
+                cy[count] = b
+                cz[count] = c
+                ci[count] = np.uint32(p)
+                # Written always, kept if near: no branch to mispredict.
+                count += step if dx * dx + dy * dy + dz * dz <= reach2 else np.uint64(0)
+            continue
+        middle = (lo + hi) // 2
+        top = push(stack, top, 2 * node + 2, middle, hi, depth - 1)
+        top = push(stack, top, 2 * node + 1, lo, middle, depth - 1)
+    return np.int64(count)
+
 
 #: Queries that share one set of candidates.
 GROUP = 8

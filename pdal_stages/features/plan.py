@@ -13,7 +13,6 @@ import numpy as np
 from ..base import checks
 from ..base.errors import OptionError, suggest
 from . import return_features
-from .feature_words import expand_words, features_of, parse_feature_set
 from .neighborhoods import (
     AROUND,
     BY_RADIUS,
@@ -22,7 +21,13 @@ from .neighborhoods import (
     parse_neighborhoods,
     preset_dimensions,
 )
-from .registry import GROUPS, SURFACE_FEATURES
+from .registry import (
+    GROUPS,
+    SURFACE_FEATURES,
+    expand_words,
+    features_of,
+    parse_feature_set,
+)
 
 #: Groups that bring a preset's own dimensions (HeightAboveGround, Z) along.
 WITH_DIMENSIONS = ("all", "geometric")

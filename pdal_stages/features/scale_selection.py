@@ -13,8 +13,25 @@ import math
 import numpy as np
 
 from ..base.jit import FAST, device
-from .eigen import eigen3, eigenentropy, log_fast
-from .moments import COINCIDENT, HIGH, LOW, MOMENTS, SX, SXX, SXY, SXZ, SY, SYY, SYZ, SZ, SZZ, N
+from .moments import (
+    COINCIDENT,
+    HIGH,
+    LOW,
+    MOMENTS,
+    SX,
+    SXX,
+    SXY,
+    SXZ,
+    SY,
+    SYY,
+    SYZ,
+    SZ,
+    SZZ,
+    N,
+    eigen3,
+    eigenentropy,
+    log_fast,
+)
 
 #: Estimated entropies are off by less than half of this.
 MARGIN = 2e-6
