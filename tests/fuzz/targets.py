@@ -1,7 +1,7 @@
 """What the fuzz tests call: readers of ours, given any bytes, and what must hold of them.
 
-Each takes bytes and returns in a word how it ended, or raises; only :class:`StageError` is caught here, so anything else
-that comes out is a finding.
+Each takes bytes and returns in a word how it ended, or raises; only :class:`StageError` is caught
+here, so anything else that comes out is a finding.
 """
 
 from __future__ import annotations
@@ -73,11 +73,11 @@ def target(seeds: Callable[[], list[bytes]]):
 def folder() -> Path:
     """A folder in memory, until the process ends."""
     memory = Path("/dev/shm")
-    made = Path(
+    path = Path(
         tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None)
     )
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
-    return made
+    atexit.register(shutil.rmtree, path, ignore_errors=True)
+    return path
 
 
 def put(name: str, data: bytes) -> Path:
@@ -92,10 +92,12 @@ def put(name: str, data: bytes) -> Path:
 def _pipelines() -> list[bytes]:
     ready = sorted((TESTS.parent / "pipelines").glob("*.json"))
     return [path.read_bytes() for path in ready] + [
-        b'["a.las",{"type":"filters.hag_minima","tag":"a","cell":20,"where":"Z > 3 && !(Classification == 7)"},"b.laz"]',
+        b'["a.las",{"type":"filters.hag_minima","tag":"a","cell":20,"where":"Z > 3 && '
+        b'!(Classification == 7)"},"b.laz"]',
         b'\xef\xbb\xbf// c\r\n{"pipeline":[{"type":"readers.las","filename":"*.las","tag":"r"},'
         b'{"type":"filters.multiscalefeatures","inputs":["r"],"neighborhoods":["c1","kopt(10,50)","copt"],'
-        b'"feature_set":"all","seed":3},/* x */{"type":"writers.las","filename":"o#.las","extra_dims":"all",'
+        b'"feature_set":"all","seed":3},/* x '
+        b'*/{"type":"writers.las","filename":"o#.las","extra_dims":"all",'
         b'"minor_version":4,"dataformat_id":6,"forward":"all"}]}',
         b'[{"type":"writers.classifiermodel","filename":"m.model","classes":{"2":"Ground","3,4,5":"5 Vegetation",'
         b'"6":6},"strategy":"binary","target":2,"trees":10,"dimensions":["Intensity"]}]',
@@ -104,7 +106,8 @@ def _pipelines() -> list[bytes]:
 
 @target(_pipelines)
 def pipeline(data: bytes) -> str:
-    """Parse, override, expand: what PDAL gets is JSON, with no stage of ours left and none of PDAL's lost."""
+    """Parse, override, expand: what PDAL gets is JSON, with no stage of ours left and none of
+    PDAL's lost."""
     source = parse_pipeline(decode(data, "fuzz.json"), "fuzz.json")
     assert len(source.lines) == len(source.stages) and all(line >= 1 for line in source.lines)
     overrides, _ = parse_overrides(
@@ -135,9 +138,9 @@ def _clouds() -> list[bytes]:
             header = laspy.LasHeader(point_format=form, version="1.4" if form > 5 else "1.2")
             header.scales = np.full(3, 0.01)
             header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "wkt", b"x" * 40))
-            made = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(30, header=header))
-            made.x, made.y = np.arange(30.0), np.arange(30.0)
-            made.write(folder() / f"seed.{suffix}")
+            las_data = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(30, header=header))
+            las_data.x, las_data.y = np.arange(30.0), np.arange(30.0)
+            las_data.write(folder() / f"seed.{suffix}")
             out.append((folder() / f"seed.{suffix}").read_bytes())
     return [*out, (TESTS / "data" / "town.copc.laz").read_bytes()[:20_000]]
 
@@ -149,10 +152,10 @@ def cloud(data: bytes) -> str:
     las_check.check_readable(path)
     las.projection(path)
     extra_dimensions(path)
-    found = inputs.las_extent(str(path))
+    extent = inputs.las_extent(str(path))
     assert (
         sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"]
-        == found.count
+        == extent.count
     )
     las.supersede_copc(path)
     return "read"
@@ -173,9 +176,9 @@ def ept(data: bytes) -> str:
     path = put("ept.json", data)
     path.with_name("ept-hierarchy").mkdir(exist_ok=True)
     (path.with_name("ept-hierarchy") / "0-0-0-0.json").write_text('{"0-0-0-0": 0}')
-    found = inputs.read_extent(inputs.InputSource(str(path), {"type": "readers.ept"}, "ept"))
-    assert found.count >= 0 and np.isfinite(found.box).all()
-    TileGrid(10.0).covering(found.box)
+    extent = inputs.read_extent(inputs.InputSource(str(path), {"type": "readers.ept"}, "ept"))
+    assert extent.count >= 0 and np.isfinite(extent.box).all()
+    TileGrid(10.0).covering(extent.box)
     return "read"
 
 
@@ -203,15 +206,15 @@ def _notes() -> list[bytes]:
 @target(_notes)
 def store(data: bytes) -> str:
     """Notes of a run: whatever is there, a note is an object or nothing."""
-    found = []
+    notes = []
     with Store(folder()) as keeping:
         for name in _NOTES:
             Path(keeping.path(name, ".json")).write_bytes(data)
-            found.append(keeping.note(name))
-            assert isinstance(found[-1], dict)
-        if found[0].get("outputs"):
+            notes.append(keeping.note(name))
+            assert isinstance(notes[-1], dict)
+        if notes[0].get("outputs"):
             assert keeping.finished("a", "f") is None  # whose file is not there
-    return "read" if any(found) else "refused"
+    return "read" if any(notes) else "refused"
 
 
 _SOURCE = inputs.InputSource("/a.las", {"type": "readers.las"}, "las")
@@ -265,7 +268,8 @@ def good_model() -> dict[str, bytes]:
 
 
 def packed(members: dict[str, bytes], manifest: bytes | None = None) -> bytes:
-    """A zip of members; with another manifest, where given, whose checksums are put right as an attacker would."""
+    """A zip of members; with another manifest, where given, whose checksums are put right as an
+    attacker would."""
     if manifest is not None:
         with contextlib.suppress(Exception):  # whatever else was made of it goes in as it is
             head = json.loads(manifest)
@@ -284,7 +288,8 @@ def packed(members: dict[str, bytes], manifest: bytes | None = None) -> bytes:
 def _model_file(data: bytes) -> bytes:
     """The first byte says which part of a good file the others replace.
 
-    0: the whole file; 1: the manifest; 2: the manifest, with checksums put right; from 3 on: the values of one array.
+    0: the whole file; 1: the manifest; 2: the manifest, with checksums put right; from 3 on: the
+    values of one array.
     """
     if not data or data[0] == 0:
         return data[1:]
@@ -314,15 +319,17 @@ def model(data: bytes) -> str:
     manifest, arrays = model_file.read(
         put("fuzz.model", _model_file(data)), lambda name: classifier_of(name).rules
     )
-    made = assemble(manifest, arrays)
-    assert str(made) and made.halo_m >= 0
-    made.importances()
-    codes = [code for code, _ in made.classes]
-    for one in made.passes:
+    loaded = assemble(manifest, arrays)
+    assert str(loaded) and loaded.halo_m >= 0
+    loaded.importances()
+    codes = [code for code, _ in loaded.classes]
+    for classifier in loaded.passes:
         values = (
-            np.random.default_rng(1).normal(size=(50, len(one.columns(codes)))).astype(np.float32)
+            np.random.default_rng(1)
+            .normal(size=(50, len(classifier.columns(codes))))
+            .astype(np.float32)
         )
-        shares = one.probabilities(values)
+        shares = classifier.probabilities(values)
         assert (
             shares.shape == (50, len(codes)) and np.isfinite(shares).all() and (shares >= 0).all()
         )
@@ -342,12 +349,12 @@ def _network_model() -> dict[str, bytes]:
 @target(lambda: [_network_model()[model_file.MANIFEST]])
 def network(data: bytes) -> str:
     """The manifest of a model with a network; what is accepted classifies a small cloud."""
-    made: Any = load_model(put("hostile.model", packed(_network_model(), data)))
+    loaded: Any = load_model(put("hostile.model", packed(_network_model(), data)))
     rng = np.random.default_rng(1)
     xyz = np.round(rng.uniform(0, 30, (200, 3)), 2)
-    assert str(made) and made.halo_m >= 0
-    found = made.predict(
+    assert str(loaded) and loaded.halo_m >= 0
+    prediction = loaded.predict(
         xyz, {"Intensity": rng.uniform(0, 100, 200)}, threads=1, probabilities=True
     )
-    assert np.isfinite(found.probabilities).all()
+    assert np.isfinite(prediction.probabilities).all()
     return "loaded"

@@ -35,7 +35,8 @@ def test_findings_stay_fixed(path):
 
 
 def change(data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
-    """One to five random changes: bytes, words, pieces cut out, doubled or taken from another input."""
+    """One to five random changes: bytes, words, pieces cut out, doubled or taken from another
+    input."""
     out = bytearray(data)
     for _ in range(rng.randint(1, 5)):
         at, to = sorted(rng.randrange(len(out) + 1) for _ in range(2))

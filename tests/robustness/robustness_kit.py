@@ -1,7 +1,7 @@
 """Commands as users type them, and the two ways in which they may end: a clear error, or a result.
 
-An error is: exit code 1 (2 for wrong usage), one message on standard error that begins with the program's name, no
-traceback, no file under the final name and none left beside it.
+An error is: exit code 1 (2 for wrong usage), one message on standard error that begins with the
+program's name, no traceback, no file under the final name and none left beside it.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class Command:
 def job(folder: Path, *stages: object, name: str = "job.json") -> Path:
     """Write a pipeline, one stage a line."""
     rows = ",\n".join(
-        "  " + json.dumps(str(one) if isinstance(one, Path) else one) for one in stages
+        "  " + json.dumps(str(stage) if isinstance(stage, Path) else stage) for stage in stages
     )
     (folder / name).write_text("[\n" + rows + "\n]\n", encoding="utf-8")
     return folder / name

@@ -258,7 +258,8 @@ def test_noise_below_ground(command, tmp_path, write_las):
 # ---- spatial references --------------------------------------------------------------------------------------
 
 DEGREES = (
-    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS '
+    '84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
     'UNIT["degree",0.0174532925199433]]'
 )
 METERS = (

@@ -29,7 +29,8 @@ def prepared(*lines: str) -> dict:
 
 
 def without_rights() -> dict:
-    """Options that run a command which the rights of files hold for: a superuser's exemption is dropped."""
+    """Options that run a command which the rights of files hold for: a superuser's exemption is
+    dropped."""
     if os.geteuid() != 0:
         return {}
     import ctypes
@@ -169,7 +170,8 @@ def test_locale_c(command, tmp_path, cloud):
 
 @pytest.mark.parametrize(("name", "ours"), [("SIGTERM", False), ("SIGKILL", True)])
 def test_signals(command, tmp_path, name, ours):
-    """While PDAL works, and while a stage of ours does: the older result stays, and the next run tidies up."""
+    """While PDAL works, and while a stage of ours does: the older result stays, and the next run
+    tidies up."""
     out = tmp_path / "out.las"
     out.write_bytes(b"an older result")
     faux = {

@@ -1,4 +1,5 @@
-"""Extra bytes that PDAL overwrites, drops or refuses, own dimensions that stages make anew, and odd LAS headers."""
+"""Extra bytes that PDAL overwrites, drops or refuses, own dimensions that stages make anew, and odd
+LAS headers."""
 
 from __future__ import annotations
 
@@ -82,19 +83,19 @@ def test_real_values_stay_whatever_extra_bytes_are_called(tmp_path, write_las, p
     values = np.linspace(0.5, 20.5, 50)
     plain = write_las(tmp_path / "plain.las", {**arrays, "Qqq": values}, point_format=point_format)
     (right,) = pdal_env.execute([reader_of(str(plain), "in")]).arrays
-    names = [one["name"] for one in pdal_env.bindings().dimensions]
+    names = [entry["name"] for entry in pdal_env.bindings().dimensions]
     names += [name.lower() for name in names] + ["gps_time", "raw_classification", "nir"]
     assert len(names) > 150
     for name in names:
         path = tmp_path / "named.las"
         path.write_bytes(plain.read_bytes())
         with_titles(path, {"Qqq": name})
-        (found,) = pdal_env.execute([reader_of(str(path), "in")]).arrays
+        (points,) = pdal_env.execute([reader_of(str(path), "in")]).arrays
         for dimension in set(right.dtype.names) - {"Qqq"}:
-            assert np.array_equal(found[dimension], right[dimension]), (name, dimension)
+            assert np.array_equal(points[dimension], right[dimension]), (name, dimension)
         (read_as,) = extra_dimensions(path)
-        among = {one.lower(): one for one in found.dtype.names}
-        assert np.array_equal(found[among[read_as.lower()]], values), name
+        among = {entry.lower(): entry for entry in points.dtype.names}
+        assert np.array_equal(points[among[read_as.lower()]], values), name
 
 
 @pytest.mark.parametrize("title", ["Z", "X", "Intensity", "classification", "GpsTime"])
@@ -127,7 +128,7 @@ def test_every_door_reads_them_under_another_name(command, tmp_path, write_las, 
 
 
 def test_stock_pdal_is_told(tmp_path, write_las, pdal_program):
-    """Which has overwritten the coordinates before a stage of ours sees them."""
+    """PDAL has overwritten the coordinates before a stage of ours sees them."""
     source = write_las(tmp_path / "in.las", {**scene(), "Qqq": np.ones(600)}, point_format=6)
     with_titles(source, {"Qqq": "Z"})
     stages = json.loads(ps.Pipeline([str(source), HAG]).json)["pipeline"]
@@ -181,7 +182,7 @@ def test_nothing_is_dropped(command, tmp_path, write_las, model, version, point_
     right = odd(source, write_las, version, point_format)
     reader = {"type": "readers.las", "filename": str(source), "use_eb_vlr": True}
     command.runs(["pipeline", job(tmp_path, reader, HAG, las(tmp_path / "o.las")), "--validate"])
-    found = []
+    outputs = []
     where = ["--where", "Z > 99"]
     for door, words in {**DOORS, "some": where, "some tiles": [*where, *TILES]}.items():
         target = tmp_path / f"{door}{suffix}"
@@ -189,17 +190,17 @@ def test_nothing_is_dropped(command, tmp_path, write_las, model, version, point_
         assert list(out.point_format.extra_dimension_names)[: len(right)] == list(right)
         for name, those in right.items():
             assert np.allclose(out[name], those, rtol=1e-12), (door, name)
-        found.append(out)
-    is_same(found[0], found[1])
-    is_same(found[2], found[3])
+        outputs.append(out)
+    is_same(outputs[0], outputs[1])
+    is_same(outputs[2], outputs[3])
     # again, from what was written, and resumed
     again = classified(command, tmp_path / f"tiles{suffix}", tmp_path / "again.las", model, *TILES)
-    is_same(again, found[0])
+    is_same(again, outputs[0])
     (tmp_path / "again.las").unlink()
     resumed = ["--resume", *TILES]
     is_same(
         classified(command, tmp_path / f"tiles{suffix}", tmp_path / "again.las", model, *resumed),
-        found[0],
+        outputs[0],
     )
 
 
@@ -229,7 +230,8 @@ def test_several_files_by_a_pattern(command, tmp_path, write_las):
 
 
 def test_a_survey_and_its_corrections(command, tmp_path, write_las, model):
-    """Files with odd extra bytes and without, an output for each file and for each tile; then what a person edits."""
+    """Files with odd extra bytes and without, an output for each file and for each tile; then what
+    a person edits."""
     (tmp_path / "in").mkdir()
     right = odd(tmp_path / "in" / "a.laz", write_las)
     write_las(tmp_path / "in" / "b.laz", scene(seed=2) | {"Mine": np.ones(600)}, point_format=6)
@@ -237,11 +239,11 @@ def test_a_survey_and_its_corrections(command, tmp_path, write_las, model):
     for target, words in ((per_file, []), (per_tile, ["--per", "tile"])):
         command.runs(["classify", tmp_path / "in", f"{target}/", "--model", model, *TILES, *words])
     out = laspy.read(per_file / "a.laz")
-    own = list(out.point_format.extra_dimension_names)[: len(right)]
-    assert own == list(right) and (laspy.read(per_file / "b.laz")["Mine"] == 1).all()
+    extra_names = list(out.point_format.extra_dimension_names)[: len(right)]
+    assert extra_names == list(right) and (laspy.read(per_file / "b.laz")["Mine"] == 1).all()
     parts = [laspy.read(path) for path in per_tile.glob("*.laz")]
     assert sum(map(len, parts)) == 1200
-    for name in own:
+    for name in extra_names:
         merged = np.concatenate([np.asarray(part[name], float) for part in parts])
         expected = np.append(np.asarray(right[name], float), np.zeros(600))
         assert np.allclose(np.sort(merged), np.sort(expected)), name
@@ -256,44 +258,47 @@ def test_a_survey_and_its_corrections(command, tmp_path, write_las, model):
         tmp_path / "edited.laz",
     ]
     command.runs(words)
-    assert set(own) <= set(laspy.read(tmp_path / "kept.laz").point_format.extra_dimension_names)
+    assert set(extra_names) <= set(
+        laspy.read(tmp_path / "kept.laz").point_format.extra_dimension_names
+    )
 
 
 def test_two_of_one_name(command, tmp_path, write_las, model):
-    """PDAL holds one dimension of a name, laspy refuses the file: the second one gets another name."""
+    """PDAL holds one dimension of a name, laspy refuses the file: the second one gets another
+    name."""
     extra = {"Qqq": np.full(600, 1.0), "Rrr": np.full(600, 2.0)}
     source = write_las(tmp_path / "in.las", {**scene(), **extra}, point_format=6)
     with_titles(source, {"Qqq": "Same", "Rrr": "Same"})
-    found = [
+    outputs = [
         classified(command, source, tmp_path / f"{door}.las", model, *words)
         for door, words in DOORS.items()
     ]
-    is_same(*found)
-    assert (found[0]["Same"] == 1).all() and (found[0]["Extra_Same"] == 2).all()
+    is_same(*outputs)
+    assert (outputs[0]["Same"] == 1).all() and (outputs[0]["Extra_Same"] == 2).all()
 
 
 # ---- dimensions of the input that stages make, too ----------------------------------------------
 
 
 def test_a_file_that_was_classified_before(command, tmp_path, write_las):
-    """What is written anew is told, what stages make on the way stays the input's."""
-    own = {name: np.full(600, 77, np.uint8) for name in ("Reliability", "Ground")}
-    own["HeightAboveOpening_5"] = np.full(600, 77.5)
-    source = write_las(tmp_path / "in.las", {**scene(), **own}, point_format=6, wkt=None)
-    found = []
+    """Dimensions that are written anew are reported; what stages make on the way stays."""
+    earlier = {name: np.full(600, 77, np.uint8) for name in ("Reliability", "Ground")}
+    earlier["HeightAboveOpening_5"] = np.full(600, 77.5)
+    source = write_las(tmp_path / "in.las", {**scene(), **earlier}, point_format=6, wkt=None)
+    outputs = []
     for door, words in DOORS.items():
         target = tmp_path / f"{door}.las"
         done = command.runs(["classify", source, target, *words])
         assert done.err.count("dimensions of the input get new values: Reliability.") == 1
-        found.append(laspy.read(target))
-        assert (np.asarray(found[-1]["Ground"]) == 77).all()
-        assert (np.asarray(found[-1]["HeightAboveOpening_5"]) == 77.5).all()
-        assert np.asarray(found[-1]["Reliability"]).max() <= 1
-    is_same(*found)
+        outputs.append(laspy.read(target))
+        assert (np.asarray(outputs[-1]["Ground"]) == 77).all()
+        assert (np.asarray(outputs[-1]["HeightAboveOpening_5"]) == 77.5).all()
+        assert np.asarray(outputs[-1]["Reliability"]).max() <= 1
+    is_same(*outputs)
     again = tmp_path / "again.las"
     done = command.runs(["classify", tmp_path / "whole.las", again])
     assert "get new values: Reliability, HeightAboveGround." in done.err
-    assert np.array_equal(laspy.read(again).classification, found[0].classification)
+    assert np.array_equal(laspy.read(again).classification, outputs[0].classification)
 
 
 # ---- points compressed one by one -----------------------------------------------------------------
@@ -358,13 +363,13 @@ def test_a_broken_reference(command, tmp_path, write_las, model, wkt):
     source = write_las(tmp_path / "in.las", scene(), point_format=6, wkt=wkt)
     right = "--readers.las.override_srs=EPSG:25832"
     for door, words in DOORS.items():
-        asked = ["classify", source, tmp_path / f"{door}.las", "--model", model, *words]
-        done = command(*asked)
+        command_words = ["classify", source, tmp_path / f"{door}.las", "--model", model, *words]
+        done = command(*command_words)
         if done.code:  # newer PDAL may take it as none
             assert "reference in the file cannot be read" in done.err
             assert "--readers.las.override_srs=EPSG:CODE" in done.err
             assert not (tmp_path / f"{door}.las").exists()
-        command.runs([*asked, right])
+        command.runs([*command_words, right])
         assert laspy.read(tmp_path / f"{door}.las").header.parse_crs().to_epsg() == 25832
 
 

@@ -1,4 +1,5 @@
-"""Every file that a command opens for writing is one it was asked for, or lies in a hidden folder of its own.
+"""Every file that a command opens for writing is one it was asked for, or lies in a hidden folder
+of its own.
 
 Watched from outside by strace, so that PDAL's and libraries' own files are seen as well.
 """
@@ -17,7 +18,8 @@ from robustness_kit import HAG, job
 no_strace = shutil.which("strace") is None
 pytestmark = [pytest.mark.pdal, pytest.mark.skipif(no_strace, reason="watches with strace")]
 
-#: Ours: hidden folders, notes of tiled runs and of their pace, compiled kernels, temporary folders; and the system's.
+#: Ours: hidden folders, notes of tiled runs and of their pace, compiled kernels, temporary folders;
+#: and the system's.
 OWN = re.compile(
     r"/\.pdal-stages-partial-|/\.pdal-stages(/|$)|/__pycache__(/|$)|\.nb[ic]|/pdal-stages(/measured\.json)?$"
     r"|^/(tmp|var/tmp)/(pdal-stages-[^/]+|tmp\w+|[a-z0-9_]{8})(/|$)|^/dev/(null|tty|shm/)|^/proc/"
@@ -33,7 +35,7 @@ _NAMED = re.compile(r'(?:\d+<([^>]*)>, )?"((?:[^"\\]|\\.)*)"')
 
 
 def written(folder, *words: object) -> set[str]:
-    """What a command opened for writing, made, renamed or removed beyond what is its own."""
+    """Return what a command opened for writing, made, renamed or removed beyond what is its own."""
     log = folder / "trace.txt"
     calls = "trace=open,openat,creat,rename,renameat,renameat2,link,linkat,symlink,symlinkat,truncate,unlink,unlinkat,mkdir,mkdirat,rmdir"
     strace = [
@@ -53,14 +55,14 @@ def written(folder, *words: object) -> set[str]:
     if not log.exists() or "ptrace" in done.stderr:
         pytest.skip(f"nothing may be traced here: {done.stderr[:200]}")
     assert done.returncode == 0, done.stderr[-2000:]
-    found = set()
+    paths = set()
     for line in log.read_text(errors="replace").splitlines():
         if opened := _OPENED.search(line):
             if {"O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND"} & set(opened[2].split("|")):
-                found.add(opened[1])
+                paths.add(opened[1])
         elif changed := _CHANGED.search(line):
-            found.update(os.path.join(at, name) for at, name in _NAMED.findall(changed[2]))
-    names = {os.path.normpath(os.path.join(folder, name)) for name in found}
+            paths.update(os.path.join(at, name) for at, name in _NAMED.findall(changed[2]))
+    names = {os.path.normpath(os.path.join(folder, name)) for name in paths}
     return {os.path.relpath(name, folder) for name in names if not OWN.search(name)}
 
 

@@ -34,12 +34,15 @@ REFUSED = {
     "half a surrogate pair": (b'["a.las",\n"\\ud800.las"]', ["line 2", "not valid UTF-8"]),
     "NUL in a name": (b'["a\\u0000.las", "b.las"]', ["line 1", "NUL"]),
     "a point cloud": (b"LASF\xff", ["a point cloud, not a pipeline"]),
-    "Latin-1 text": ('["Gr\u00fcn.las"]'.encode("latin-1"), ["not UTF-8", "byte 4 is 0xfc", "Save it as UTF-8"]),
+    "Latin-1 text": ('["Gr\u00fcn.las"]'.encode("latin-1"), ["not UTF-8", "byte 4 is 0xfc", "Save "
+                                                                                            "it as "
+                                                                                            "UTF-8"]),
     "a LAS file as the pipeline": (b"LASF\x00\x00\xff\xfe" + b"\x00" * 300, ["not"]),
     "nested 100,000 deep": (b"[" * 100_000, ["not valid JSON"]),
     "a million opened comments": (b"[" + b"/*" * 1_000_001, ["does not end"]),
     "mistake in a stage that spans lines": (
-        b'// one\n[\n"a.las", {"type": "filters.range",\n"limits": "Z[0:1]"}, /* x\n*/\n\n{"type": "filters.hag_minima",\n"cell": 0}]',
+        b'// one\n[\n"a.las", {"type": "filters.range",\n"limits": "Z[0:1]"}, /* x\n*/\n\n{"type": '
+        b'"filters.hag_minima",\n"cell": 0}]',
         ["job.json, line 7:"]),
 }  # fmt: skip
 
@@ -57,7 +60,8 @@ GOOD = {
     "byte order mark": b'\xef\xbb\xbf["a.las", ' + STAGE + b"]",
     "CRLF line ends": b'[\r\n"a.las",\r\n' + STAGE + b"\r\n]\r\n",
     "comments of both kinds": b'// a\n[ /* b */ "a.las", // "c"\n' + STAGE + b"/* d\n */]",
-    "comment marks inside texts": b'["http://a/b.las", {"type": "filters.range", "limits": "/* Z */"}, ' + STAGE + b"]",
+    "comment marks inside texts": b'["http://a/b.las", {"type": "filters.range", "limits": "/* Z '
+                                  b'*/"}, ' + STAGE + b"]",
     "non-ASCII names": '["Stra\u00dfe/\u6e2c\u91cf.las", '.encode() + STAGE + b"]",
     "object with other keys": b'{"name": "x", "pipeline": ["a.las", ' + STAGE + b'], "more": [1]}',
     "key 'pipeline' twice: the last counts": b'{"pipeline": 3, "pipeline": ["a.las", ' + STAGE + b"]}",

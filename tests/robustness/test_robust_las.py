@@ -1,4 +1,5 @@
-"""LAS and LAZ files of every version and point format, damaged ones, and dimensions whose names are ours."""
+"""LAS and LAZ files of every version and point format, damaged ones, and dimensions whose names are
+ours."""
 
 from __future__ import annotations
 
@@ -129,7 +130,8 @@ OURS = ["HeightAboveGround", "Reliability", "Linearity_c1", "Margin", "Probabili
 
 @pytest.mark.parametrize("kind", ["u1", "i8", "f8"])
 def test_dimensions_named_like_ours(command, tmp_path, write_las, model, kind):
-    """An earlier run's, or another program's: overwritten, with the fractions kept whatever the type was."""
+    """An earlier run's, or another program's: overwritten, with the fractions kept whatever the
+    type was."""
     before = {name: np.full(600, 77).astype(kind) for name in OURS}
     classify = {
         "type": "filters.modelclassifier",
@@ -137,15 +139,16 @@ def test_dimensions_named_like_ours(command, tmp_path, write_las, model, kind):
         "margin": True,
         "probabilities": True,
     }
-    words, found = pipeline(tmp_path, tmp_path / "in.las", model, *STAGES, classify), []
+    words, outputs = pipeline(tmp_path, tmp_path / "in.las", model, *STAGES, classify), []
     for arrays in ({**scene(), **before}, scene()):
         write_las(tmp_path / "in.las", arrays, point_format=6)
         command.runs(words)
-        found.append(check(tmp_path))
+        outputs.append(check(tmp_path))
         (tmp_path / "out.las").unlink()
-    out, fresh = found
+    out, fresh = outputs
     for name in OURS:
-        # Heights kept in 64 bits can fall on the other side of a tree's threshold, for a point or two.
+        # Heights kept in 64 bits can fall on the other side of a tree's threshold, for a point or
+        # two.
         assert np.isclose(out[name], fresh[name], rtol=1e-6).mean() >= 0.99, name
     assert np.ptp(np.asarray(fresh["Linearity_c1"])) > 0.1
 
@@ -183,12 +186,13 @@ def header(name, value):
 
 
 def table(data) -> int:
-    """Where the chunk table of a LAZ file is."""
+    """Return the offset of the chunk table of a LAZ file."""
     return struct.unpack_from("<q", data, struct.unpack_from("<I", data, 96)[0])[0]
 
 
 def after(number=1, place=None, length=10):
-    """Give the records after the points another number, place or length; with one good record at the end."""
+    """Give the records after the points another number, place or length; with one good record at
+    the end."""
 
     def edit(data):
         end = len(data)
@@ -220,7 +224,8 @@ DAMAGED = {
     "point length of 0": (".las 3", header("length", 0), "shorter than their format"),
     "point format 77": (".las 3", header("format", 77 & 63), "point format is not known"),
     "version 1.9": (".las 3", header("minor", 9), "version is not known"),
-    "a million records before the points": (".las 3", header("vlrs", 10**6), "more records than there is room for"),
+    "a million records before the points": (".las 3", header("vlrs", 10**6), "more records than "
+                                                                             "there is room for"),
     "scale of NaN": (".las 3", header("scale", float("nan")), "not valid numbers"),
     "a scale that is no length": (".las 6", lambda d: d.__setitem__(slice(149, 155), bytes(6)), "not valid numbers"),
     "header of an older version": (".las 6", header("header", 227), "its header is too short"),
@@ -232,12 +237,16 @@ DAMAGED = {
     "LAZ: cut in the points": (".laz 3", lambda d: d[: len(d) // 2], "it is cut short"),
     "LAZ: cut in the chunk table": (".laz 3", lambda d: d[:-4], "LAS file"),
     "LAZ: chunk table beyond the end": (".laz 3", lambda d: struct.pack_into("<q", d, struct.unpack_from("<I", d, 96)[0], 10**12), "cut short"),
-    "LAZ: more points in the header": (".laz 3", header("count", 60_000), "60,000 counted, 50,000 held"),
+    "LAZ: more points in the header": (".laz 3", header("count", 60_000), "60,000 counted, 50,000 "
+                                                                          "held"),
     "LAZ: a million chunks": (".laz 3", lambda d: struct.pack_into("<I", d, table(d) + 4, 10**6), "more chunks than there is room for"),
-    "LAZ: no chunks": (".laz 3", lambda d: struct.pack_into("<I", d, table(d) + 4, 0), "do not fill the file"),
+    "LAZ: no chunks": (".laz 3", lambda d: struct.pack_into("<I", d, table(d) + 4, 0), "do not "
+                                                                                       "fill the "
+                                                                                       "file"),
     "LAZ: chunk table of version 7": (".laz 3", lambda d: struct.pack_into("<I", d, table(d), 7), "unknown version"),
     "LAZ: another size in the chunk table": (".laz 3", lambda d: d.__setitem__(table(d) + 9, d[table(d) + 9] ^ 0x40), "LAS file"),
-    "LAZ: no record of the compression": (".laz 3", lambda d: d.__setitem__(d.index(b"laszip encoded"), ord("k")), "no record of how"),
+    "LAZ: no record of the compression": (".laz 3", lambda d: d.__setitem__(d.index(b"laszip "
+                                                                                    b"encoded"), ord("k")), "no record of how"),
     "LAZ: records after the points at 2^62": (".laz 6", after(place=2**62), "not where it says"),
     "LAZ: no points in the header": (".laz 6", zero, "counts no points, but the file holds some"),
     "LAZ: another count in the header": (".laz 6", lambda d: struct.pack_into("<Q", d, 247, 599), "599 counted, 600 held"),
@@ -298,7 +307,8 @@ def test_a_file_without_points(command, tmp_path, write_las, suffix):
 
 
 def test_cut_short_whoever_reads_it(tmp_path, write_las):
-    """Newer PDAL crashes of such a file, so it is asked for nothing of it: not for a reference, nor for dimensions."""
+    """Newer PDAL crashes of such a file, so it is asked for nothing of it: not for a reference, nor
+    for dimensions."""
     cut = damaged(write_las(tmp_path / "cut.laz", scene(5000)), lambda d: d[:-100])
     reader = {"type": "readers.las", "filename": str(cut), "count": 1}
     for read in (lambda: reference_of(reader), lambda: reference_of_file(str(cut))):

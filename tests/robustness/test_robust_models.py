@@ -30,7 +30,8 @@ class Evil:
         return (open, (str(TRAPPED), "w"))
 
 
-#: Edit of manifest and members of a good file, what the message must hold; test_classifier_modelfile.py has more.
+#: Edit of manifest and members of a good file, what the message must hold;
+#: test_classifier_modelfile.py has more.
 BROKEN = {
     "version 4": (lambda h, m: h.update(version=4), ["version", "Update pdal-stages"]),
     "997 neighborhoods": (lambda h, m: h["passes"][0].update(neighborhoods=[f"ropt(0.25,{k / 100},0.05)" for k in range(30, 1027)]),
@@ -194,7 +195,8 @@ def test_figures_of_any_size(command, tmp_path, model):
 #: What would touch FILE; test_preparation.py has more.
 HOSTILE = {
     "runs Python": {"type": "filters.python", "function": "f", "module": "m",
-                    "source": "import pathlib\npathlib.Path('FILE').unlink()\ndef f(a, b): return True"},
+                    "source": "import pathlib\npathlib.Path('FILE').unlink()\ndef f(a, b): return "
+                              "True"},
     "empties a file by a log of PDAL's": {"type": "filters.smrf", "log": "FILE"},
     "is another name for a filter": {"type": "filters.hag_minima ", "log": "FILE"},
     "nests a pipeline": {**HAG, "inputs": [{"type": "writers.las", "filename": "FILE"}]},
@@ -228,11 +230,11 @@ def test_training_on_heights_that_a_model_cannot_carry(command, tmp_path, cloud)
     target, out = tmp_path / "m.model", tmp_path / "out.las"
     write = {"type": "writers.classifiermodel", "filename": str(target), "neighborhoods": "c1", "trees": 3, "passes": 1, "label": "Reference",
              "feature_set": "covariance", "count": 50, "dimensions": "HeightAboveGround", "folds": 0}  # fmt: skip
-    made = [{"type": "filters.pmf"}, {"type": "filters.hag_nn"}]
-    done = command.runs(["pipeline", job(tmp_path, cloud, KEEP, *made, write)])
+    preparation = [{"type": "filters.pmf"}, {"type": "filters.hag_nn"}]
+    done = command.runs(["pipeline", job(tmp_path, cloud, KEEP, *preparation, write)])
     assert "'filters.pmf'" in done.err and "Write a pipeline with the same stages" in done.err
-    found = ps.load_model(target)
-    assert found.info["preparation"] == [] and found.info["by_hand"] == [
+    model = ps.load_model(target)
+    assert model.info["preparation"] == [] and model.info["by_hand"] == [
         "filters.pmf",
         "filters.hag_nn",
     ]
@@ -240,7 +242,7 @@ def test_training_on_heights_that_a_model_cannot_carry(command, tmp_path, cloud)
     command.refused(["classify", cloud, out, "--model", target], says, "Write a pipeline")
     apply = {"type": "filters.modelclassifier", "model": str(target)}
     command.refused(["pipeline", job(tmp_path, cloud, apply, "out.las")], says)
-    command.runs(["pipeline", job(tmp_path, cloud, *made, apply, out)])
+    command.runs(["pipeline", job(tmp_path, cloud, *preparation, apply, out)])
 
 
 def test_heights_of_pdal_are_carried(command, tmp_path, cloud):

@@ -25,9 +25,9 @@ SMALL = ["--neighborhoods", "c1", "--count", "20", "--writers.classifiermodel.tr
 
 
 def test_devices(command, tmp_path, cloud):
-    """Of a superuser too, they stay what they are."""
+    """Devices stay what they are, for a superuser too."""
     watched = ["/dev/null", "/dev/stdout"]
-    before = [(found.st_ino, found.st_mode, found.st_rdev) for found in map(os.lstat, watched)]
+    before = [(status.st_ino, status.st_mode, status.st_rdev) for status in map(os.lstat, watched)]
     done = command.runs(
         command.process("pipeline", job(tmp_path, cloud, HAG), "--metadata", "/dev/stdout")
     )
@@ -37,7 +37,7 @@ def test_devices(command, tmp_path, cloud):
         ["pipeline", job(tmp_path, cloud, {"type": "writers.las", "filename": "/dev/null"})]
     )
     assert [
-        (found.st_ino, found.st_mode, found.st_rdev) for found in map(os.lstat, watched)
+        (status.st_ino, status.st_mode, status.st_rdev) for status in map(os.lstat, watched)
     ] == before
     done = command.runs(command.process("pipeline", job(tmp_path, cloud, "STDOUT")))
     assert done.out.count("\n") == 601 and '"X"' in done.out and not (tmp_path / "STDOUT").exists()
@@ -78,8 +78,8 @@ def test_names_with_a_leading_dash(command, files, words):
     shutil.copy("m.model", "-m.model")
     job(files, "./-a.las", HAG, name="-p.json")
     command.runs(words)
-    made = {"-o.las": "-o.las", "-t.gpkg": "-t.gpkg", "--folder/": "--folder/b.las"}
-    assert words[-1] not in made or (files / made[words[-1]]).is_file()
+    outputs = {"-o.las": "-o.las", "-t.gpkg": "-t.gpkg", "--folder/": "--folder/b.las"}
+    assert words[-1] not in outputs or (files / outputs[words[-1]]).is_file()
 
 
 @pytest.mark.parametrize("door", ["files", "folder", "pattern", "index", "pipeline"])
@@ -119,7 +119,8 @@ def index(path, *names):
 
 @pytest.fixture()
 def files(tmp_path, cloud, model, monkeypatch):
-    """A cloud, another, a model and a page in the test's own folder, and a check that they are what they were."""
+    """A cloud, another, a model and a page in the test's own folder, and a check that they are what
+    they were."""
     monkeypatch.chdir(tmp_path)
     for source, names in (
         (cloud, ("a.las", "b.las", "t_1.las")),
@@ -162,7 +163,8 @@ PIPELINES = {
 }  # fmt: skip
 CLASSIFY = ["classify", "a.las", "--model", "m.model"]
 ACCURACY = ["accuracy", "a.las", "--reference", "b.las"]
-INPUT, OTHER = "is one of the inputs", "would replace a LAS or LAZ file"
+INPUT = "is one of the inputs"
+OTHER = "would replace a LAS or LAZ file"
 REPLACING = [
     (["train", "b.las", "--model", "a.las", *SMALL], OTHER),
     (["train", "a.las", "--model", "page.html", *SMALL], "would replace an HTML page"),
@@ -174,7 +176,8 @@ REPLACING = [
     ([*ACCURACY, "--json", "b.las"], OTHER),
     ([*ACCURACY, "--json", "x", "--html", "x"], "is the json file too"),
     (["objects", "a.las", "t.gpkg", "--metadata", "a.las"], OTHER),
-    (["objects", "a.las", "t.gpkg", "--metadata", "t.gpkg"], "the metadata file is the objects file too"),
+    (["objects", "a.las", "t.gpkg", "--metadata", "t.gpkg"], "the metadata file is the objects "
+                                                             "file too"),
     *((["train", "a.las", "--base", "m.model", "--model", name], INPUT) for name in ("m.model", "link.model", "hard.model")),
     (["train", "a.las", "--base", "link.model", "--model", "m.model"], INPUT),
     (["pipeline", "base.json"], INPUT),
@@ -184,7 +187,9 @@ REPLACING = [
     *((["classify", *names, "o/", "--model", "m.model", "--polygons", "poly.geojson=9", "--metadata", "poly.geojson"], INPUT)
       for names in (["a.las"], ["a.las", "b.las"])),
     ([*CLASSIFY, "o.las", "--polygons", "poly.geojson=9", "--objects", "poly.geojson"], INPUT),
-    ([*CLASSIFY, "o.las", "--objects", "x.geojson", "--metadata", "x.geojson"], "the objects file is the metadata file too"),
+    ([*CLASSIFY, "o.las", "--objects", "x.geojson", "--metadata", "x.geojson"], "the objects file "
+                                                                                "is the metadata "
+                                                                                "file too"),
     (["accuracy", "ti.geojson", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
     (["accuracy", "a.las", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
     (["objects", "ti.geojson", "t.gpkg", "--metadata", "ti.geojson"], INPUT),
@@ -232,25 +237,26 @@ def test_files_of_the_same_kind_are_replaced(command, files):
 
 
 def test_a_run_works_in_a_folder_of_its_own(tmp_path, cloud):
-    """Only its owner can enter it; one of another user's, or that others may write to, is refused and left alone."""
-    path, own = job(tmp_path, cloud, HAG, tmp_path / "o.las"), tmp_path / ".pdal-stages"
+    """Only its owner can enter it; one of another user's, or that others may write to, is refused
+    and left alone."""
+    path, notes = job(tmp_path, cloud, HAG, tmp_path / "o.las"), tmp_path / ".pdal-stages"
 
     def run(mode: int, owner: int = -1) -> None:
-        own.chmod(mode)
-        os.chown(own, owner, -1)
+        notes.chmod(mode)
+        os.chown(notes, owner, -1)
         run_tiled(path, 20, workers=0, progress=False)
 
     before = os.umask(0)
     try:
         run_tiled(path, 20, workers=0, progress=False)
-        assert stat.S_IMODE(own.stat().st_mode) == 0o700
+        assert stat.S_IMODE(notes.stat().st_mode) == 0o700
         run(0o755)  # of an older release
-        assert stat.S_IMODE(own.stat().st_mode) == 0o700
-        (own / "kept" / "mine").write_text("mine")
+        assert stat.S_IMODE(notes.stat().st_mode) == 0o700
+        (notes / "kept" / "mine").write_text("mine")
         cases = [(0o777,), (0o775,)] + [(0o700, 65534)] * (os.geteuid() == 0)
         for case in cases:
             with pytest.raises(StageError, match="another user's or open to others"):
                 run(*case)
-            assert (own / "kept" / "mine").read_text() == "mine"
+            assert (notes / "kept" / "mine").read_text() == "mine"
     finally:
         os.umask(before)

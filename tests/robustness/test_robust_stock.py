@@ -1,4 +1,5 @@
-"""Errors of our stages in stock ``pdal pipeline``: its exit code is 1, and the message is ours; arrays of odd kinds."""
+"""Errors of our stages in stock ``pdal pipeline``: its exit code is 1, and the message is ours;
+arrays of odd kinds."""
 
 from __future__ import annotations
 
