@@ -416,10 +416,13 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
     passes: list[Any] = []
     before: list[int] = []
     for number, (entry, of_pass) in enumerate(zip(manifest["passes"], arrays, strict=True)):
-        here, own = f"pass {number + 1}", entry.get("codes") or codes
-        if sorted(set(own)) != own:
-            raise ModelError("a model's classes must ascend, each once", found=own[:10])
-        for key, length in (("factors", len(own)), ("importances", len(entry["feature_names"]))):
+        here, codes_here = f"pass {number + 1}", entry.get("codes") or codes
+        if sorted(set(codes_here)) != codes_here:
+            raise ModelError("a model's classes must ascend, each once", found=codes_here[:10])
+        for key, length in (
+            ("factors", len(codes_here)),
+            ("importances", len(entry["feature_names"])),
+        ):
             if entry.get(key) is not None and len(entry[key]) != length:
                 raise ModelError(f"{here} must have {length} {key}", found=len(entry[key]))
         if bool(number) != bool(entry["context"]) or (number and passes[0].features is None):
@@ -427,11 +430,11 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
                 "every pass but the first must read context, and a network is the only one",
                 found=here,
             )
-        classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, of_pass, own)
-        if number and classifier.classes_before(own) != before:
+        classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, of_pass, codes_here)
+        if number and classifier.classes_before(codes_here) != before:
             raise ModelError("a pass reads other classes than the one before gives", found=here)
         passes.append(classifier)
-        before = own
+        before = codes_here
     priors = manifest.get("priors") or {"factors": codes}
     if before != codes or len(priors["factors"]) != len(codes):
         raise ModelError("the last pass has other classes than the model", found=before[:10])

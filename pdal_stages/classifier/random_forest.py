@@ -298,8 +298,6 @@ def grow_forest(
         Times a row counts; rows of weight 0 take no part.
     trees : int or sequence of int
         Number of trees; of several numbers the one with the highest out-of-bag accuracy [B16 4.2].
-    growth : Growth
-    progress : Progress, optional
 
     Returns
     -------
