@@ -234,7 +234,7 @@ def tower_error(heights: Heights) -> float:
     return heights.error(found, 15)
 
 
-def no_outliers(raster: np.ndarray, highest: np.ndarray, cell: float) -> np.ndarray:
+def no_outliers(raster: np.ndarray, cell: float) -> np.ndarray:
     """Find no low outliers."""
     return np.zeros(raster.shape, bool)
 
@@ -267,12 +267,11 @@ def option(**values: float) -> Row:
 ROWS: dict[str, dict[str, Row]] = {
     "ground": {
         "as it is": Row(),
-        "without low outliers": Row(smrf, "pits", no_outliers),
+        "without low outliers": Row(smrf, "find_low_outliers", no_outliers),
         "outliers: no ground as deep is looked for": rule(low_outliers, min_company=10**6),
-        "outliers: no support for deep ground": rule(
+        "outliers: ground as deep needs no support": rule(
             low_outliers, min_support=-1, min_support_share=0.0
         ),
-        "outliers: covered islands are small": rule(low_outliers, covered=2.0),
         "holes stay holes": Row(openings, "fill_holes", unchanged),
         "without regaining ground": Row(smrf, "ROUNDS", 0),
         "regained once": Row(smrf, "ROUNDS", 1),
@@ -294,14 +293,12 @@ ROWS: dict[str, dict[str, Row]] = {
         "extent does not grow with density": rule(noise, extent_growth=0.0),
         "voxels are not widened in thin clouds": rule(noise, scales=0),
         "gap does not grow in thin clouds": rule(noise, gap_growth=0.0),
-        "looks no farther in thin clouds": rule(noise, spacings_aside=0.0),
         "what hangs in line is noise": rule(noise, strung=99),
         "single points of wires are noise": rule(noise, strung_share=9.0),
-        "large covered clusters are good": rule(noise, covered=2.0),
-        "tall covered clusters are good": rule(noise, steep=1e9),
         "low: no ground as deep is looked for": rule(low_outliers, min_company=10**6),
-        "low: that needs no support": rule(low_outliers, min_support=-1, min_support_share=0.0),
-        "low: scatter does not matter": rule(low_outliers, scatters=0.0),
+        "low: ground as deep needs no support": rule(
+            low_outliers, min_support=-1, min_support_share=0.0
+        ),
     },
     "decks": {
         "as it is": Row(),

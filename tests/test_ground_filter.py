@@ -283,13 +283,13 @@ def test_land_without_points_costs_nothing_and_changes_nothing(monkeypatch, spac
     )
     mask = rng.random(n) < 0.95
     options = {"openings": (5, 120), "slope_too": True, "window": 40.0, "mask": mask}
-    shapes, real = [], smrf.pits
+    shapes, real = [], smrf.find_low_outliers
 
     def looked_at(raster, *others):
         shapes.append(raster.size)
         return real(raster, *others)
 
-    monkeypatch.setattr(smrf, "pits", looked_at)
+    monkeypatch.setattr(smrf, "find_low_outliers", looked_at)
     monkeypatch.setattr(pieces, "SMALL_RASTER", 1 << 40)
     monkeypatch.setattr(pieces, "LARGEST_RASTER", 1 << 40)
     figures, again = {}, {}

@@ -11,20 +11,15 @@ from test_noise import slow_below, slow_linked
 
 from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.cells import HOLE
-from pdal_stages.terrain.low_outliers import pits, pits_reach
+from pdal_stages.terrain.low_outliers import find_low_outliers, outlier_reach
 
 # ---- a slow reference -----------------------------------------------------------------------------------
 
 
-def slow_pits(raster, highest, cell=1.0):
+def slow_outliers(raster, cell=1.0):
     number = slow_linked(raster, cell)
     sets = [np.argwhere(number == k) for k in range(number.max() + 1)]
-    covered = np.pad(highest > raster + 2.5, 1)
-    under = lambda j, i: covered[j : j + 3, i : i + 3].any()  # noqa: E731
-    few = [len(mine) <= 30 or np.mean([under(*at) for at in mine]) >= 0.8 for mine in sets]
-    small = [
-        some and (np.ptp(mine, axis=0) < 20).all() for some, mine in zip(few, sets, strict=True)
-    ]
+    small = [len(cells) <= 30 and (np.ptp(cells, axis=0) < 20).all() for cells in sets]
     island = np.append(small, False)[number]
     low, base = np.where(island, raster, np.inf), np.where(island, np.inf, raster)
     return np.isfinite(slow_below(low.astype(float), base.astype(float), cell))
@@ -47,25 +42,20 @@ def rough(seed, shape=(44, 50), holes=0.2):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_pits_equal_the_slow_reference(seed):
+def test_outliers_equal_the_slow_reference(seed):
     raster = rough(seed, holes=0.2 if seed % 2 else 0.7)
-    highest = np.where(raster < 0, 3.0, raster)
-    raster[20:30, 20:28] -= 9
-    found = pits(raster, highest, 1.0)
-    assert np.array_equal(found, slow_pits(raster, highest))
+    found = find_low_outliers(raster, 1.0)
+    assert np.array_equal(found, slow_outliers(raster))
     assert found.any()
 
 
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 10_000))
-def test_pits_do_not_depend_on_where_the_raster_ends(seed):
-    far = pits_reach(1.0)
+def test_outliers_do_not_depend_on_where_the_raster_ends(seed):
+    far = outlier_reach(1.0)
     raster = rough(seed, (2 * far + 15, 2 * far + 23))
-    highest = raster + np.where(raster < 0, 8, 0)
-    whole, cut = (
-        pits(raster, highest, 1.0),
-        pits(*(a[3:-3, 3:-3].copy() for a in (raster, highest)), 1.0),
-    )
+    whole = find_low_outliers(raster, 1.0)
+    cut = find_low_outliers(raster[3:-3, 3:-3].copy(), 1.0)
     inner = slice(far, -far)
     assert np.array_equal(cut[inner, inner], whole[3:-3, 3:-3][inner, inner])
 
@@ -78,14 +68,14 @@ def field(seed=0, shape=(70, 70)):
     return rng.normal(0, 0.03, shape).astype(np.float32), rng
 
 
-def test_clusters_at_one_depth_are_pits():
+def test_clusters_at_one_depth_are_outliers():
     """They keep each other company: nine clusters of 3 x 3 cells, all about 6 m below."""
     raster, rng = field()
     for j in (10, 30, 50):
         for i in (12, 32, 52):
             raster[j : j + 3, i : i + 3] = rng.normal(-6, 0.3, (3, 3)) - 0.5 * j / 10
     low = raster < -2
-    assert np.array_equal(pits(raster, raster, 1.0), low)
+    assert np.array_equal(find_low_outliers(raster, 1.0), low)
 
 
 @pytest.mark.parametrize("what", ["ditch", "quarry", "cellar beside a street"])
@@ -99,15 +89,9 @@ def test_what_is_deep_but_ground_is_kept(what):
         raster[:, :] += 9
         raster[:, 60:] -= 9
         raster[40:45, 40:44] -= 9
-    assert not pits(raster, raster, 1.0)[raster < (4 if what.startswith("cellar") else -1.5)].any()
-
-
-def test_a_wide_floor_is_a_pit_where_others_lie_above_it():
-    raster, _ = field()
-    highest = raster.copy()
-    raster[20:29, 20:30] -= 12
-    assert not pits(raster, raster, 1.0).any()
-    assert np.array_equal(pits(raster, highest, 1.0), raster < -11)
+    assert not find_low_outliers(raster, 1.0)[
+        raster < (4 if what.startswith("cellar") else -1.5)
+    ].any()
 
 
 def points_of(side=60.0, density=10, seed=1):

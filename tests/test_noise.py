@@ -83,40 +83,16 @@ def slow_near(k):
     ]
 
 
-def slow_small(count, usual, most, widest):
-    """Voxels in small clusters as a mapping, and the first of each one's cluster, None where it is wide."""
-    small, whole = {}, {}
+def slow_small(count, usual, most):
+    """Return which voxels belong to small clusters, as a mapping."""
+    small = {}
     for members in slow_components(count.keys()):
         start, total = members[0], sum(count[m] for m in members)
         extents = np.ptp(np.array(members), axis=0)
         longest = min(RULES.extent + RULES.extent_growth * usual(start), RULES.max_extent)
         for m in members:
             small[m] = total <= most and extents.max() < longest
-            whole[m] = start if extents[:2].max() < widest else None
-    return small, whole
-
-
-def slow_covered(count, whole, spacing, most):
-    """Voxels of clusters that others lie above, in most of their columns, of more than `most` points, or steep."""
-    top, above = {}, defaultdict(list)
-    for k in sorted(count):
-        top[k[:2]] = k
-    for k in count:
-        if whole[k] is not None:
-            near = [n for n in range(3) if n < spacing(k) * RULES.spacings / SIDE + 0.5]
-            columns = product(range(-near[-1], near[-1] + 1), repeat=2)
-            tops = [top.get((k[0] + b, k[1] + a)) for b, a in columns]
-            above[whole[k]].append(
-                any(t is not None and whole[t] != whole[k] and t[2] > k[2] for t in tops)
-            )
-    under = set()
-    for c, seen in above.items():
-        members = [k for k in count if whole[k] == c]
-        *wide, tall = np.ptp(members, axis=0)
-        steep = tall > RULES.extent and tall >= RULES.steep * max(wide)
-        if np.mean(seen) >= RULES.covered and (steep or sum(count[k] for k in members) > most):
-            under |= set(members)
-    return under
+    return small
 
 
 def slow_plane(low, j, i, radius, blocks, inner=-1):
@@ -141,9 +117,7 @@ def slow_plane(low, j, i, radius, blocks, inner=-1):
         plane = np.linalg.solve(normal, design.T @ (weight * z))
         off = z - design @ plane
         weight = np.where(off < 0, 1 / (1 + off**2) ** 2, 0.1 / (1 + off**2))
-        under = weight[off < 0]
-        scatter = np.sqrt((under * off[off < 0] ** 2).sum() / under.sum()) if under.sum() else 0.0
-    return plane[0] + lowest, plane[1], plane[2], scatter
+    return plane[0] + lowest, plane[1], plane[2]
 
 
 def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
@@ -177,7 +151,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
             known[key] = n / held, np.sqrt(blocks * (block * SIDE) ** 2 / n)
         return known[key]
 
-    small, cluster = slow_small(count, lambda k: density(k)[0], most, RULES.max_extent)
+    small = slow_small(count, lambda k: density(k)[0], most)
     for scale in range(1, RULES.scales + 1):
         thin = [
             k
@@ -190,18 +164,15 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         coarse = defaultdict(int)
         for k, n in count.items():
             coarse[wider(k)] += n
-        still, all_of = slow_small(coarse, lambda k: 1.0, most, RULES.max_extent >> scale)
+        still = slow_small(coarse, lambda k: 1.0, most)
         for k in thin:
             small[k] = still[wider(k)]
-            cluster[k] = all_of[wider(k)] and (scale, all_of[wider(k)])
-    covered = slow_covered(count, cluster, lambda k: density(k)[1], most)
     top, base = np.full((h, w), -np.inf), np.full((h, w), np.inf)
     lowest = {k: xyz[m, 2].min() for k, m in members.items()}
     highest = {k: xyz[m, 2].max() for k, m in members.items()}
     for k in count:
         if not small[k]:
             top[k[:2]] = max(top[k[:2]], highest[k])
-        if not small[k] and k not in covered:
             base[k[:2]] = min(base[k[:2]], lowest[k])
     hung = {}
     for c in full:
@@ -216,9 +187,8 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         if not small[k]:
             continue
         square = (j - k[0]) ** 2 + (i - k[1]) ** 2
-        apart = density(k)[1]
-        least = gap + RULES.gap_growth * max(0, apart - RULES.dense_m)
-        r = min(max(RULES.aside, int(np.ceil(RULES.spacings_aside * apart / SIDE))), RULES.far)
+        least = gap + RULES.gap_growth * max(0, density(k)[1] - RULES.dense_m)
+        r = RULES.aside
         while True:
             near = top[(square <= r * r) & np.isfinite(top)]
             if len(near) >= low_outliers.RULES.min_columns or r == RULES.far:
@@ -247,7 +217,7 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
                 del codes[k]
                 break
     low = np.full((h, w), np.inf)
-    lone = {k for k in count if small[k] or k in covered} - codes.keys()
+    lone = {k for k in count if small[k]} - codes.keys()
     for k in lone:
         low[k[:2]] = min(low[k[:2]], lowest[k])
     limit = slow_below(low, base, SIDE, depth)
@@ -261,7 +231,7 @@ def slow_below(low, base, side, depth=1.0):
     limit, supported = np.full(low.shape, -np.inf), slow_supported(base)
     for at in np.argwhere(np.isfinite(low)):
         plane = slow_plane(base, *at, near, 2 * near + 1)
-        lowest = plane[0] - depth - low_outliers.RULES.scatters * plane[3] if plane else -np.inf
+        lowest = plane[0] - depth if plane else -np.inf
         if low[tuple(at)] < lowest and not slow_company(
             base, supported, at, low[tuple(at)], plane, side
         ):
@@ -274,11 +244,8 @@ def slow_supported(base):
     for b, a in np.argwhere(np.isfinite(base)):
         square = base[max(b - 2, 0) : b + 3, max(a - 2, 0) : a + 3]
         level = (np.abs(square - base[b, a]) <= low_outliers.RULES.level_m).sum()
-        out[b, a] = (
-            level
-            > low_outliers.RULES.min_support
-            + low_outliers.RULES.min_support_share * np.isfinite(square).sum()
-        )
+        share = low_outliers.RULES.min_support_share * np.isfinite(square).sum()
+        out[b, a] = level > low_outliers.RULES.min_support + share
     return out
 
 
@@ -295,7 +262,7 @@ def slow_linked(raster, side):
 
 
 def slow_company(base, supported, at, z, plane, side):
-    """Whether enough columns with others of their level are about as deep as z, below the plane."""
+    """Return whether enough columns are about as deep as z, below the plane."""
     j, i = np.mgrid[: base.shape[0], : base.shape[1]]
     away = side * np.hypot(j - at[0], i - at[1])
     half = 0.5 * (plane[0] - z)
@@ -315,7 +282,7 @@ def test_the_kernels_equal_the_slow_reference(seed, density):
 
 @pytest.mark.parametrize(
     ("density", "clusters", "size", "extent", "depth"),
-    [(0.4, 1, 30, 10, 60), (0.4, 3, 30, 4, 22)],
+    [(0.4, 3, 30, 4, 22)],
 )
 def test_clusters_below_thin_clouds(density, clusters, size, extent, depth):
     rng = np.random.default_rng(0)
@@ -409,26 +376,6 @@ def test_wires_stay_however_thin_the_cloud(spacing, wires, density):
     wire = np.column_stack([along, 40 + 0.5 * along + apart, 30 + 0.001 * (along - 75) ** 2])
     found = detached_noise(np.vstack([ground, wire]))
     assert (found[len(ground) :] > 0).mean() <= 0.05
-
-
-@pytest.mark.parametrize(("size", "across", "below"), [(128, 7, 22), (1000, 10, 10), (300, 2, 5)])
-@pytest.mark.parametrize("density", [0.5, 8.0])
-def test_clusters_of_any_size_under_the_ground_are_found(size, across, below, density):
-    xyz, _ = scene(2, 90, density)
-    rng = np.random.default_rng(size)
-    # Land, land, under a house, under a wood.
-    at = np.array([[10, 60, 0], [35, 70, 0], [32, 25, 0], [75, 75, 0]])
-    level = 0.15 * at[:, 0] + 2 * np.sin(at[:, 1] / 15)
-    clusters = [rng.uniform(-across / 2, across / 2, (size, 3)) + each for each in at]
-    for part, ground in zip(clusters, level, strict=True):
-        part[:, 2] += ground - below - part[:, 2].max() - 1
-    found = detached_noise(np.vstack([xyz, *clusters]))
-    missed = (found[len(xyz) :] != 7).reshape(4, -1).any(axis=1)
-    assert not missed[
-        : 3 if density < 1 else 4
-    ].any()  # a thin wood shows its ground in single points, too
-    changed = (found[: len(xyz)] == 7) & (detached_noise(xyz) == 0)
-    assert changed.sum() <= 2
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,12 @@ class DetachedNoise(ClassStage):
 
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
+    algorithm_version = 2
     where_help = "Points outside are not marked but still serve as neighbors"
     cluster: int = option(
         "integer",
         60,
-        "Maximum number of points of a noise cluster; clusters with points above them may have "
-        "more",
+        "Maximum number of points of a noise cluster",
         *(1, 1_000_000),
     )
     gap: float = option(
@@ -36,7 +36,7 @@ class DetachedNoise(ClassStage):
     depth: float = option(
         "number",
         1.0,
-        "Minimum depth of low noise below the ground; more where the ground is rough",
+        "Minimum depth of low noise below the ground",
         *(0, 1000),
         exclusive=True,
         unit="m",

@@ -40,7 +40,7 @@ class HagMorphological(FarReaching):
         "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote "
         "Sensing 77, 21-30"
     )
-    algorithm_version = 3
+    algorithm_version = 4
     where_help = HEIGHTS_OUTSIDE
     in_models = (
         "cell",
@@ -58,7 +58,7 @@ class HagMorphological(FarReaching):
     cell: float = option("number", 1.0, "Side of the grid's cells", 0.05, 1000, unit="m")
     slope: float = option(
         "number",
-        0.12,
+        0.1,
         "Rise over run: a window removes what it lowers by more than this times its radius; raise "
         "it for rugged terrain without buildings",
         *(0, 100),

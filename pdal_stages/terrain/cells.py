@@ -95,19 +95,16 @@ def lowest_of_cells(
     z: NDArray[np.float64],
     use: NDArray[np.bool_],
     cell: float,
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Numbers of the points that are the lowest usable ones of their cells, and the heights of the
-    highest ones there.
+) -> NDArray[np.int64]:
+    """Return the indices of the points that are the lowest usable ones of their cells.
 
-    In meters, finite coordinates.
+    Coordinates are finite, in meters.
     """
     mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     x, y, z = x[mine], y[mine], z[mine]
     key = cell_keys(cell_numbers(x, cell), cell_numbers(y, cell))
     cells, number = np.unique(key, return_inverse=True)
-    highest = np.full(len(cells), -np.inf)
-    np.maximum.at(highest, number, z)
-    return mine[lowest_points(x, y, z, number, len(cells))], highest
+    return mine[lowest_points(x, y, z, number, len(cells))]
 
 
 def levels(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..base.grid import GridWindow
 from .cells import HOLE
-from .low_outliers import pits_reach
+from .low_outliers import outlier_reach
 from .openings import FILL_RINGS, fill_holes, openings_of
 from .pieces import patches
 from .smrf import (
@@ -33,7 +33,7 @@ def reach_of_given(options: FilterOptions) -> int:
     surfaces = sum(planes_reach(options.levels(block)) for block in (NEAR, FAR))
     if not options.opening_radii:
         return surfaces + 4
-    openings = 2 * max(options.opening_radii) + 2 * FILL_RINGS + pits_reach(options.cell)
+    openings = 2 * max(options.opening_radii) + 2 * FILL_RINGS + outlier_reach(options.cell)
     return max(surfaces, openings) + 4
 
 

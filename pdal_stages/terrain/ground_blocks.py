@@ -128,10 +128,9 @@ def around_blocks(
     use: NDArray[np.bool_],
     options: FilterOptions,
 ) -> NDArray[np.float64]:
-    """What of points must be known around blocks (n, 4), meters: the lowest of each cell and how
-    high the highest one there is."""
-    low, top = lowest_of_cells(x, y, z, use, options.cell)
-    return np.column_stack([*(axis[low] for axis in (x, y, z)), top])
+    """Return the points that must be known around blocks: the lowest of each cell (n, 3), meters."""
+    low = lowest_of_cells(x, y, z, use, options.cell)
+    return np.column_stack([axis[low] for axis in (x, y, z)])
 
 
 def cells_of_block(
@@ -142,20 +141,20 @@ def cells_of_block(
 ) -> GroundCells:
     """The cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
 
-    `outer` is (n, 4) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the
+    `outer` is (n, 3) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the
     block, and few more. `points` are all that may be ground in the block, in parts (n, 3).
     """
-    x, y, z, top = np.ascontiguousarray(outer.T)
     own = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     cell, openings = options.cell, options.opening_radii
     # Openings reach into cells without points.
     spill = max([*openings, 0]) + FILL_RINGS + 2
     margin = max(spill, _beside(options))
 
-    def given(x, y, z, top) -> GroundPoints:
-        return GroundPoints.of(x, y, z, top, np.ones(len(x), bool), cell)
+    def usable(xyz: NDArray[np.float64]) -> GroundPoints:
+        x, y, z = np.ascontiguousarray(xyz.T)
+        return GroundPoints.of(x, y, z, np.ones(len(x), bool), cell)
 
-    low = given(x, y, z, top)
+    low = usable(outer)
     if not own.padded(margin).contains(low.column, low.row).any():
         return GroundCells.of_blocks([], len(openings))
     raster, _ = ground_raster(low, options, margin=spill, wanted=own.padded(margin))
@@ -168,8 +167,7 @@ def cells_of_block(
     left, bottom, _, _ = kept
     count, means = np.zeros(raster.shape, np.int64), np.zeros((*raster.shape, 3))
     for xyz in points:
-        x, y, z = np.ascontiguousarray(xyz.T)
-        some = given(x, y, z, z)
+        some = usable(xyz)
         height, gradient = np.empty((2, len(xyz)))
         heights_above(*some[:3], cell, left, bottom, planes, height, gradient)
         is_ground = options.is_ground(some.use, height, gradient)

@@ -1,7 +1,7 @@
 """Tell low outliers, as of multiple reflections, from ground that is deep.
 
-A low place is below the ground if it lies below the plane through its surroundings by more than
-these scatter about it, and if no ground as deep is near, as a street is to a courtyard.
+A low place is an outlier if it lies below the plane through its surroundings, and if no ground as
+deep is near, as a street is to a courtyard.
 """
 
 from __future__ import annotations
@@ -19,46 +19,39 @@ from .openings import highest_around
 
 
 class LowRules(NamedTuple):
-    """Thresholds of low outliers, which kernels take as they are; columns are those of the raster
-    that is looked at."""
+    """Thresholds of low outliers; a NamedTuple, as kernels read it. Columns are those of the
+    raster: 1 m for the ground filter, 1.5 m for noise."""
 
     near: int = 9  #: columns to each side through which the plane is fitted
     min_columns: int = 12  #: that a plane needs
-    scatters: float = 4.0  #: depth below the plane, in units of the scatter below it
-    far_m: float = (
-        30.0  #: within which ground as deep is looked for: the width of a block of houses
-    )
+    far_m: float = 30.0  #: where ground as deep is searched: the width of a block of houses
     min_company: int = 4  #: columns of such ground that show that a deep place is ground
-    level_m: float = (
-        1.0  #: columns whose heights differ by less are level; such ground is no higher than that
-    )
-    max_rise: float = 0.05  #: and so much more per meter away
-    min_support: int = 2  #: columns of the 5 x 5 around that are level with one of ground
-    min_support_share: float = 0.2  #: and of those that hold points
-    link: int = 3  #: cells of a minimum grid that are so near to each other are linked
-    max_step_m: float = 0.35  #: across a step: a curb
-    max_grade: float = 0.15  #: and so much more per meter
-    max_island: int = 30  #: cells of an island, which may be below the ground
-    covered: float = 0.8  #: or the share of its cells that lie below others
-    above_m: float = 2.5  #: which are so much higher: not a car's roof
-    max_extent: int = 20  #: cells along either axis of an island
+    #: others of the 5 x 5 columns around that must be level with one of these, or it is noise too,
+    min_support: int = 2
+    min_support_share: float = 0.2  #: and this share more of those that hold points
+    level_m: float = 1.0  #: level columns differ by at most this; such ground is at most this much higher than the place,
+    max_rise: float = 0.05  #: and this much more per meter away
+    link: int = 3  #: cells of a minimum grid that are at most this far from each other are linked
+    max_step_m: float = 0.35  #: across a step of at most this height: a curb,
+    max_grade: float = 0.15  #: and this much more per meter
+    max_island: int = 30  #: cells of a set of linked cells that may be outliers
+    max_extent: int = 20  #: cells along either axis of such a set
 
 
 RULES = LowRules()
 
 
 def reach(side: float) -> int:
-    """Return how far away, in columns of a `side` in meters, points change what is below the
-    ground."""
-    return RULES.near + math.ceil(RULES.far_m / side + 2)
+    """Return how far away, in columns of a `side` in meters, points change what is an outlier."""
+    return RULES.near + math.ceil(RULES.far_m / side) + 2
 
 
 @device(_nrt=True, fastmath=set(FAST))
 def _plane_under(low, j, i, rules):
-    """Fit a plane under the columns around one: its height there, per column across, along; and the
-    scatter below it.
+    """Fit a plane under the columns around one: return its height there, and its rise per column
+    along both axes.
 
-    The height is -inf where there are too few columns.
+    Iteratively reweighted least squares; the height is -inf where there are too few columns.
     """
     h, w = low.shape
     u, v, zs = np.empty((3, (2 * rules.near + 1) ** 2))
@@ -69,15 +62,13 @@ def _plane_under(low, j, i, rules):
                 u[n], v[n], zs[n] = a, b, low[j + b, i + a]
                 n += 1
     if n < rules.min_columns:
-        return -np.inf, 0.0, 0.0, 0.0
+        return -np.inf, 0.0, 0.0
     lowest = zs[:n].min()
     zs = zs[:n] - lowest
-    weight = np.ones(n)
-    p0 = p1 = p2 = scatter = 0.0
-    for turn in range(1, 9):
-        if turn == 1:
-            order = np.sort(zs)
-            weight = np.where((zs >= order[n // 10]) & (zs <= order[n // 2]), 1.0, 0.01)
+    order = np.sort(zs)
+    weight = np.where((zs >= order[n // 10]) & (zs <= order[n // 2]), 1.0, 0.01)
+    p0 = p1 = p2 = 0.0
+    for _ in range(8):
         s0 = s1 = s2 = s11 = s12 = s22 = t0 = t1 = t2 = 0.0
         for k in range(n):
             g = weight[k]
@@ -99,16 +90,11 @@ def _plane_under(low, j, i, rules):
         p0 = (t0 * c0 + t1 * c1 + t2 * c2) / det
         p1 = (t0 * c1 + t1 * (s0 * s22 - s2 * s2) + t2 * (s1 * s2 - s0 * s12)) / det
         p2 = (t0 * c2 + t1 * (s1 * s2 - s0 * s12) + t2 * (s0 * s11 - s1 * s1)) / det
-        below, number = 0.0, 0.0
         for k in range(n):
             off = zs[k] - p0 - p1 * u[k] - p2 * v[k]
             g = 1.0 / (1.0 + off * off)
             weight[k] = g * g if off < 0.0 else 0.1 * g
-            g = weight[k] if off < 0.0 else 0.0
-            below += g * off * off
-            number += g
-        scatter = np.sqrt(below / number) if number > 0.0 else 0.0
-    return p0 + lowest, p1, p2, scatter
+    return p0 + lowest, p1, p2
 
 
 @njit
@@ -136,39 +122,43 @@ def _has_company(base, supported, side, j, i, z, plane, rules):
     far, half, company = int(np.ceil(rules.far_m / side)), 0.5 * (plane[0] - z), 0
     for b in range(max(j - far, 0), min(j + far + 1, h)):
         for a in range(max(i - far, 0), min(i + far + 1, w)):
-            if supported[b, a]:
-                away = side * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))
-                below = plane[0] + plane[1] * (a - i) + plane[2] * (b - j) - base[b, a]
-                most = z + min(half, rules.level_m + rules.max_rise * away)
-                company += away <= rules.far_m and base[b, a] <= most and below >= half
+            if not supported[b, a]:
+                continue
+            away = side * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))
+            below = plane[0] + plane[1] * (a - i) + plane[2] * (b - j) - base[b, a]
+            most = z + min(half, rules.level_m + rules.max_rise * away)
+            company += away <= rules.far_m and base[b, a] <= most and below >= half
     return company >= rules.min_company
 
 
 @njit
 def _limits(low, base, supported, side, depth, limit, rules):
-    """Fill `limit` with the height below which each low place is deep, -inf where it is not or may
-    be ground."""
+    """Fill `limit` with the height below which each low place is an outlier, -inf where it may be
+    ground."""
     for j in range(low.shape[0]):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:
                 continue
             plane = _plane_under(base, j, i, rules)
-            lowest = plane[0] - depth - rules.scatters * plane[3]
+            lowest = plane[0] - depth
             if low[j, i] < lowest and not _has_company(
                 base, supported, side, j, i, low[j, i], plane, rules
             ):
                 limit[j, i] = lowest
 
 
-def below_ground(
+def limits_below_ground(
     low: NDArray, base: NDArray, side: float, depth: float = 1.0
 ) -> NDArray[np.float64]:
-    """Return the heights (h, w) below which low places are below the ground; -inf where they are
-    not.
+    """Return the heights (h, w) below which low places are outliers, in meters; -inf where none is.
 
-    `low` (h, w) has the lowest of what may be in each column, `base` that of what is not, both
-    ``inf`` where there is none; `side` is that of a column, and what is below the ground is so by
-    `depth` at least; meters.
+    Parameters
+    ----------
+    low, base : (h, w)
+        The lowest heights in meters of what may be an outlier, and of the rest; ``inf`` where there
+        is none.
+    side, depth : float
+        Side of a column, and least depth of outliers below the ground, in meters.
     """
     limit = np.full(low.shape, -np.inf)
     # Where all around lies lower, no plane through it runs above.
@@ -178,29 +168,24 @@ def below_ground(
     return limit
 
 
-def pits(
-    raster: NDArray[np.float32], highest: NDArray[np.floating], cell: float
-) -> NDArray[np.bool_]:
-    """Find the cells (h, w) of a minimum grid whose lowest point is a low outlier: of islands from
-    which one walks nowhere.
+def find_low_outliers(raster: NDArray[np.float32], cell: float) -> NDArray[np.bool_]:
+    """Find the cells (h, w) of a minimum grid whose lowest point is a low outlier.
 
-    `raster` has heights, holes ``inf``; `highest` those of the highest points; `cell` is a cell's
-    side; meters.
+    Only small sets of cells that no small step links to others are judged. The raster is in meters,
+    holes are ``inf``; `cell` is the side of a cell in meters.
     """
     rules = RULES
     number, size, side = linked_cells(
         raster, rules.link, lambda away: rules.max_step_m + rules.max_grade * cell * away
     )
-    covered = highest_around(highest > raster + rules.above_m, 1, 0)
-    share = np.bincount(number[covered & (number >= 0)], minlength=len(size))
-    small = (size <= rules.max_island) | (share >= rules.covered * size)
-    island = np.append(small & (side < rules.max_extent), False)[number]
+    small = (size <= rules.max_island) & (side < rules.max_extent)
+    island = np.append(small, False)[number]
     if not island.any():
         return island
     low, base = np.where(island, raster, HOLE), np.where(island, HOLE, raster)
-    return below_ground(low, base, cell) > -np.inf
+    return limits_below_ground(low, base, cell) > -np.inf
 
 
-def pits_reach(cell: float) -> int:
-    """Return how far away cells change what is a low outlier, in cells."""
+def outlier_reach(cell: float) -> int:
+    """Return how far away cells of a minimum grid change what is a low outlier, in cells."""
     return reach(cell) + RULES.max_extent + RULES.link + 1

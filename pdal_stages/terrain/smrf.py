@@ -21,7 +21,7 @@ from ..base.errors import OptionError
 from ..base.grid import GridWindow, cell_numbers
 from ..base.jit import njit
 from .cells import HOLE, lowest_points
-from .low_outliers import pits, pits_reach
+from .low_outliers import find_low_outliers, outlier_reach
 from .openings import FILL_RINGS, objects_of, opening_radius
 from .surface import GroundRaster, from_parents, planes_of_blocks
 from .surface import reach as planes_reach
@@ -45,7 +45,7 @@ class FilterOptions:
     :class:`OptionError`."""
 
     cell: float = 1.0
-    slope: float = 0.12
+    slope: float = 0.1
     window: float = 18.0
     threshold: float = 0.5
     scalar: float = 1.25
@@ -106,7 +106,7 @@ class FilterOptions:
         """
         surfaces = ROUNDS * planes_reach(self.levels(NEAR))
         openings = 2 * self.largest_radius + 2 * FILL_RINGS
-        return pits_reach(self.cell) + openings + surfaces + 2
+        return outlier_reach(self.cell) + openings + surfaces + 2
 
     @property
     def reach_of_points(self) -> int:
@@ -127,7 +127,7 @@ class FilterOptions:
         """How far one step looks, in cells: no step of the filter sees from a point to another
         across more empty land."""
         openings = self.largest_radius + 2 * FILL_RINGS
-        return max(pits_reach(self.cell), openings, planes_reach(self.levels(FAR))) + 2
+        return max(outlier_reach(self.cell), openings, planes_reach(self.levels(FAR))) + 2
 
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
@@ -143,15 +143,14 @@ class GroundPoints(NamedTuple):
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     z: NDArray[np.float64]
-    top: NDArray[np.float64]  #: as high as others of the same cell are, where these are not given
     use: NDArray[np.bool_]  #: whether they may be ground
     column: NDArray[np.int64]
     row: NDArray[np.int64]
 
     @classmethod
-    def of(cls, x, y, z, top, use, cell: float) -> GroundPoints:
+    def of(cls, x, y, z, use, cell: float) -> GroundPoints:
         """Of a grid of such cells."""
-        return cls(x, y, z, top, use, cell_numbers(x, cell), cell_numbers(y, cell))
+        return cls(x, y, z, use, cell_numbers(x, cell), cell_numbers(y, cell))
 
     def some(self, which: NDArray | slice) -> GroundPoints:
         """Part of them."""
@@ -184,7 +183,7 @@ def ground_raster(
     low_outliers : (m,) int64
         Numbers of the points that are low outliers.
     """
-    x, y, z, _, _, column, row = points
+    x, y, z, _, column, row = points
     window = GridWindow.enclosing(column, row).padded(margin)
     lowest, raster, low_outliers = minimum_grid(points, window, options.cell)
     objects, floor, opened = objects_of(
@@ -237,9 +236,7 @@ def minimum_grid(
     low = lowest_points(x, y, z, inside, cells).reshape(shape)
     lowest = np.append(usable, -1)[low]
     raster = np.where(lowest >= 0, points.z[lowest], HOLE).astype(np.float32)
-    highest = np.full(cells, -np.inf)
-    np.maximum.at(highest, inside, points.top[usable])
-    outliers = pits(raster, highest.reshape(shape), cell)
+    outliers = find_low_outliers(raster, cell)
     raster[outliers] = HOLE
     return lowest, raster, lowest[outliers]
 
