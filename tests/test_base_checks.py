@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import processes
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -48,28 +49,26 @@ def test_what_is_taken_and_what_is_not():
             check()
 
 
-def test_cores_are_bounded_by_affinity_quota_and_what_a_worker_is_told(tmp_path, monkeypatch):
-    count = threads.available_threads.__wrapped__
-    monkeypatch.setattr(threads.os, "cpu_count", lambda: 16)
-    monkeypatch.setattr(threads.os, "sched_getaffinity", lambda _: range(12), raising=False)
-    monkeypatch.delenv(threads.CORES, raising=False)
-    quota = threads._quota
-    monkeypatch.setattr(threads, "_quota", lambda: quota(str(tmp_path)))
-    assert count() == 12
-    for told, cores in (("3", 3), ("0", 1), ("many", 12), ("40", 12)):
-        monkeypatch.setenv(threads.CORES, told)
-        assert count() == cores
+@pytest.mark.parametrize(
+    ("files", "cores"),
+    [
+        ({}, []),
+        ({"cpu.max": "max 100000"}, []),
+        ({"cpu.max": "250000 100000"}, [3]),
+        ({"cpu.max": "1000 100000"}, [1]),
+        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, []),
+        ({"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"}, [4]),
+    ],
+)
+def test_quotas_of_control_groups(tmp_path, files, cores):
     (tmp_path / "cpu").mkdir()
-    (tmp_path / "cpu/cpu.cfs_quota_us").write_text("-1\n")
-    (tmp_path / "cpu/cpu.cfs_period_us").write_text("100000\n")
-    assert count() == 12
-    for text, cores in (
-        ("max 100000\n", 12),
-        ("250000 100000\n", 3),
-        ("1000 100000\n", 1),
-        ("", 12),
-    ):
-        (tmp_path / "cpu.max").write_text(text)
-        assert count() == cores
-    (tmp_path / "cpu/cpu.cfs_quota_us").write_text("400000\n")
-    assert count() == 4
+    for name, text in files.items():
+        (tmp_path / name).write_text(f"{text}\n")
+    assert list(threads._quota(str(tmp_path))) == cores
+
+
+def test_a_worker_takes_the_cores_that_it_is_told():
+    code = "from pdal_stages.base.threads import available_threads; print(available_threads())"
+    every = int(processes.python(code, env={threads.CORES: "many"}))
+    for told, cores in (("1", 1), ("0", 1), ("4000", every)):
+        assert int(processes.python(code, env={threads.CORES: told})) == cores

@@ -14,13 +14,9 @@ from .grid import cell_numbers
 
 #: Names users write, in meters.
 NAMED = {
-    "metre": 1.0,
-    "meter": 1.0,
-    "m": 1.0,
-    "foot": 0.3048,
-    "ft": 0.3048,
-    "us-ft": 1200.0 / 3937.0,
-    "us survey foot": 1200.0 / 3937.0,
+    **dict.fromkeys(("metre", "meter", "m"), 1.0),
+    **dict.fromkeys(("foot", "ft"), 0.3048),
+    **dict.fromkeys(("us-ft", "us survey foot"), 1200.0 / 3937.0),
     "centimetre": 0.01,
     "kilometre": 1000.0,
 }

@@ -149,29 +149,19 @@ class ApplyModel(Stage, settings=PredictionOptions):
         """Return where the dimensions of the model come from, if its file tells."""
         if self.preparation:
             return f"Put before this stage: {as_json(self.preparation)}"
-        by_hand = self.model.info.get("by_hand")
-        return (
-            f"Put before this stage what stood there in training: {', '.join(by_hand)}"
-            if by_hand
-            else None
-        )
-
-    @property
-    def measured_by_pdal(self) -> bool:
-        """Return whether heights come from PDAL's stages, which measure from class 2."""
-        types = {stage["type"] for stage in self.upstream}
-        return bool(types) and types <= {*OF_PDAL}
+        by_hand = ", ".join(self.model.info.get("by_hand", ()))
+        return by_hand and f"Put before this stage what stood there in training: {by_hand}"
 
     def check_upstream(self) -> str | None:
         """Return a warning about the stages upstream; None where they fit."""
-        if not self.preparation or not self.upstream or same(self.upstream, self.preparation):
-            return None
-        if self.given_ground and same(self.upstream, with_given_ground(self.preparation)):
+        trained = self.preparation
+        fits = not trained or not self.upstream or same(self.upstream, trained)
+        if fits or (self.given_ground and same(self.upstream, with_given_ground(trained))):
             return None
         names = ", ".join(self.made_from_ground)
         return (
             f"{self.type}: the model was trained on other heights than this pipeline makes. "
-            f"Trained on: {as_json(self.preparation)}. Here: "
+            f"Trained on: {as_json(trained)}. Here: "
             f"{as_json(self.upstream)}{f', and from points of class 2 {names}' if names else ''}. "
             "Expect lower accuracy, or use the former"
         )
@@ -182,7 +172,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
         The model needs them beside the heights, which PDAL's stages measured from class 2.
         """
-        if not self.measured_by_pdal or len(self.preparation) != 1 or not self._of_ground.creates():
+        by_pdal = all(stage["type"] in OF_PDAL for stage in self.upstream)
+        if not self.upstream or not by_pdal or len(self.preparation) != 1:
             return []
         created = self._of_ground.creates().keys() - {HEIGHT}
         return [name for name in self.model.required_dimensions if name in created]
@@ -287,10 +278,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
     def _columns(self, points: Points, prediction: Prediction) -> dict[str, NDArray]:
         """Return all dimensions but the class; points outside `where` keep what they had."""
         values: dict[str, NDArray] = {"Reliability": prediction.reliability}
-        if prediction.margin is not None:
-            values["Margin"] = prediction.margin
-        if prediction.variance is not None:
-            values["Variance"] = prediction.variance
+        more = {"Margin": prediction.margin, "Variance": prediction.variance}
+        values |= {name: column for name, column in more.items() if column is not None}
         if prediction.probabilities is not None:
             columns = zip(self.model.codes, prediction.probabilities.T, strict=True)
             values |= {f"Probability_{code}": column for code, column in columns}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -225,7 +225,7 @@ class Stage(ABC):
         return set()
 
     def sees_results_of(self, earlier: Stage) -> bool:
-        """Return whether an earlier stage's results at neighbors can change this stage's result at a point.
+        """Return whether an earlier stage's results at neighbors can change this stage's results.
 
         Where they cannot, tiles do not compute them in their halo.
         """
@@ -261,25 +261,20 @@ class Stage(ABC):
         self,
         arrays: Mapping[str, NDArray],
         context: StageContext = WHOLE_CLOUD,
-        *,
-        wkt: str = "",
-        legacy_flags: bool = False,
-        overlap_as_flag: bool = False,
-        lent_by_pdal: Set[str] = frozenset(),
+        **about: Any,
     ) -> Points:
-        """Return PDAL's arrays as this stage sees them: with its `where` and its units."""
-        units = (self.horizontal_unit, self.vertical_unit)
+        """Return PDAL's arrays as this stage sees them: with its `where` and its units.
+
+        `about` are fields of :class:`.points.Points` that describe the arrays, such as `wkt`.
+        """
         return Points(
             arrays,
-            wkt,
-            self._condition,
-            units,
-            legacy_flags,
-            overlap_as_flag,
-            arrays.get(context.outside),
-            context.used(arrays) if self.where_chooses else None,
-            context.code_limit,
-            lent_by_pdal,
+            where=self._condition,
+            unit_names=(self.horizontal_unit, self.vertical_unit),
+            meters_outside=arrays.get(context.outside),
+            used=context.used(arrays) if self.where_chooses else None,
+            code_limit=context.code_limit,
+            **about,
         )
 
     @abstractmethod
@@ -302,17 +297,14 @@ class Stage(ABC):
     @classmethod
     def schema(cls) -> dict[str, Any]:
         """Return the JSON Schema of the stage's object in a pipeline."""
-        properties: dict[str, Any] = {
-            "type": {"const": cls.type},
-            "tag": {"type": "string"},
-            "inputs": {"type": ["array", "string"]},
-        }
-        properties.update({option.name: option.schema() for option in cls.all_options()})
+        options = cls.all_options()
+        shared = {"tag": {"type": "string"}, "inputs": {"type": ["array", "string"]}}
         return {
             "type": "object",
             "description": cls.summary,
-            "properties": properties,
-            "required": ["type"] + [o.name for o in cls.all_options() if o.required],
+            "properties": {"type": {"const": cls.type}, **shared}
+            | {option.name: option.schema() for option in options},
+            "required": ["type", *(option.name for option in options if option.required)],
             "additionalProperties": False,
         }
 
@@ -329,7 +321,7 @@ class ClassStage(Stage):
         return ["Classification"]
 
     def sees_results_of(self, earlier: Stage) -> bool:
-        """Neighbors matter by :attr:`reads_around` and by the selection `ignore`, but not by other classes."""
+        """Neighbors matter by :attr:`reads_around` and by `ignore`, but not by other classes."""
         ignored = self.options["ignore"]
         read = {
             name.lower() for name in (*self.reads_around, *(s.dimension for s in ignored.spans))

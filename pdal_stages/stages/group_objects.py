@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.errors import StageError
 from ..base.grid import places_among
-from ..objects.attributes import CHECK, REASONS
+from ..objects.attributes import REASONS
 from ..objects.cells import (
     CLASSES,
     MIN_POINTS_PER_CELL,
@@ -118,11 +118,6 @@ class ObjectOptions:
         )
 
 
-#: What each kind of object is measured by, as points carry it: height and area or length.
-_HEIGHT = {Kind.BUILDING: "h_ridge", Kind.TREE: "height", Kind.SPAN: "h_low", Kind.DECK: "clear"}
-_EXTENT = {Kind.BUILDING: "area", Kind.TREE: "area", Kind.SPAN: "length", Kind.DECK: "area"}
-
-
 class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
     """Number the objects that points belong to."""
 
@@ -137,12 +132,6 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
     where_help = "Points outside form no object, and keep what they have"
     counts = {"refused_points": "points of rejected objects (refuse)"}
     open_ended = True  # a building may be larger than the surroundings of a tile
-    judged: bool = option(
-        "boolean",
-        False,
-        "Also write ObjectVerdict (1 sure, 2 to be checked), ObjectHeight and ObjectExtent (area; "
-        "of spans the length)",
-    )
     refused_class: int = code_option(
         1, "Class code for the points of objects that 'refuse' rejects"
     )
@@ -153,12 +142,7 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""
-        out = {"ObjectID": "uint64_t"}
-        if self.judged:
-            out |= {"ObjectVerdict": "uint8_t", "ObjectHeight": "float", "ObjectExtent": "float"}
-        if self.refuse:
-            out["Classification"] = "uint8_t"
-        return out
+        return {"ObjectID": "uint64_t", **({"Classification": "uint8_t"} if self.refuse else {})}
 
     def written_classes(self) -> set[int]:
         """Return the class codes that may be written."""
@@ -205,28 +189,14 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
         objects = self._find(points, context)
         ids = self._ids(objects, points)
         out: dict[str, NDArray] = {"ObjectID": ids}
-        if self.judged:
-            for name in ("ObjectVerdict", "ObjectHeight", "ObjectExtent"):
-                out[name] = np.array(points.arrays[name])
-                out[name][points.inside] = 0
         points.report.figures |= {
             kind: counts for kind, counts in objects.summary().items() if counts["objects"]
         }
-        refused = np.zeros(points.count, bool)
-        for kind, table in objects.tables.items():
-            if not len(table):
-                continue
-            place, there = places_among(table.ids, ids)
-            rows = np.flatnonzero(there)
-            which, columns = place[rows], table.columns
-            if self.judged:
-                out["ObjectVerdict"][rows] = np.where(columns["verdict"][which] == CHECK, 2, 1)
-                out["ObjectHeight"][rows] = (
-                    np.nan_to_num(columns[_HEIGHT[kind]][which]) / points.units.vertical
-                )
-                out["ObjectExtent"][rows] = columns[_EXTENT[kind]][which]
-            refused[rows] = table.has_reason(self.refuse)[which]
         if self.refuse:
+            refused = np.zeros(points.count, bool)
+            for table in filter(len, objects.tables.values()):
+                place, there = places_among(table.ids, ids)
+                refused[there] = table.has_reason(self.refuse)[place[there]]
             codes = points.class_codes.copy()
             codes[refused] = self.refused_class
             ids[refused] = 0

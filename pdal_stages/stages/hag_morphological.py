@@ -27,6 +27,8 @@ from .base import HEIGHTS_OUTSIDE, Blocks, FarReaching, StageContext, inside_blo
 from .options import Selection, ignore_option, option
 from .points import Points
 
+#: The options of the filter.
+_FILTER = tuple(field.name for field in fields(FilterOptions))
 #: Cells along the side of squares of a block that a tile reads by themselves.
 _PART = 256
 
@@ -42,19 +44,7 @@ class HagMorphological(FarReaching):
     )
     algorithm_version = 4
     where_help = HEIGHTS_OUTSIDE
-    in_models = (
-        "cell",
-        "slope",
-        "window",
-        "threshold",
-        "scalar",
-        "ignore",
-        "ground",
-        "terrain_slope",
-        "openings",
-        "given_ground",
-        "where",
-    )
+    in_models = (*_FILTER, "ignore", "ground", "terrain_slope", "given_ground", "where")
     cell: float = option("number", 1.0, "Side of the grid's cells", 0.05, 1000, unit="m")
     slope: float = option(
         "number",
@@ -104,9 +94,7 @@ class HagMorphological(FarReaching):
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
-        self._filter = FilterOptions(
-            **{field.name: self.options[field.name] for field in fields(FilterOptions)}
-        )
+        self._filter = FilterOptions(**{name: self.options[name] for name in _FILTER})
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""

@@ -121,9 +121,9 @@ class MultiscaleFeatures(Stage):
 
     def outputs(self) -> list[Output]:
         """Return the files that are written."""
-        return (
-            [Output(self.bins, "bins", JSON)] if self.bins and not Path(self.bins).exists() else []
-        )
+        if self.bins is None or Path(self.bins).exists():
+            return []
+        return [Output(self.bins, "bins", JSON)]
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""
@@ -169,8 +169,8 @@ class MultiscaleFeatures(Stage):
                 rows = there[rows]
                 for name, column in zip(names, columns, strict=True):
                     out[name][rows] = values[:, column]
-        if self.bins and not Path(self.bins).exists() and len(engine):
-            _write_bins(self.bins, engine.fit())
+        for output in self.outputs() if len(engine) else ():
+            _write_bins(output.path, engine.fit())
         figures = points.report.figures
         figures |= {"neighborhoods": len(plan.neighborhoods), "features": len(names)}
         if plan.copt:
@@ -189,10 +189,8 @@ def _read_bins(path: str | None) -> tuple[ShapeBins | None, float | None]:
     try:
         content = strict_json(Path(path).read_bytes())
         bins, threshold = content["bins"], content["copt_threshold"]
-        return (
-            ShapeBins.from_dict(bins) if bins is not None else None,
-            None if threshold is None else float(threshold),
-        )
+        bins = None if bins is None else ShapeBins.from_dict(bins)
+        return bins, None if threshold is None else float(threshold)
     except (OSError, ValueError, AttributeError, TypeError, KeyError, RecursionError) as error:
         raise _not_thresholds(path, str(error)) from None
 

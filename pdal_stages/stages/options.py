@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -170,23 +169,21 @@ class Option:
     def parse(self, value: Any) -> Any:
         """Parse a value from JSON or the command line; OptionError where it does not fit."""
         parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
-        return (
-            checks.one_of(f"option '{self.name}'", parsed, self.choices) if self.choices else parsed
-        )
+        if self.choices:
+            checks.one_of(f"option '{self.name}'", parsed, self.choices)
+        return parsed
 
     def _wrong(self, value: Any) -> OptionError:
-        return OptionError(
-            f"option '{self.name}' must be {_KINDS[self.kind][1]}",
-            found=json.dumps(value, default=str),
-        )
+        what = f"option '{self.name}' must be {_KINDS[self.kind][1]}"
+        return OptionError(what, found=json.dumps(value, default=str))
 
     def _parse_number(self, value: Any) -> float:
         with suppress(ValueError):
             value = float(value) if isinstance(value, str) else value
-        check: Any = (
-            checks.whole if self.kind == "integer" else partial(checks.number, above=self.exclusive)
-        )
-        return check(f"option '{self.name}'", value, self.minimum, self.maximum, unit=self.unit)
+        what, limits = f"option '{self.name}'", (self.minimum, self.maximum)
+        if self.kind == "integer":
+            return checks.whole(what, value, *limits, unit=self.unit)  # type: ignore[arg-type]
+        return checks.number(what, value, *limits, above=self.exclusive, unit=self.unit)
 
     _parse_integer = _parse_number
 
@@ -262,19 +259,16 @@ class Option:
         return list(chosen.codes)
 
     def _parse_selection(self, value: Any) -> Selection:
-        return Selection.parse(
-            self._parse_list(value.split(",") if isinstance(value, str) else value), self.name
-        )
+        items = value.split(",") if isinstance(value, str) else value
+        return Selection.parse(self._parse_list(items), self.name)
 
     def _parse_mapping(self, value: Any) -> dict:
-        if isinstance(value, str):
-            try:
-                value = json.loads(value)
-            except ValueError:
-                raise self._wrong(value) from None
-        if not isinstance(value, dict):
+        parsed = value
+        with suppress(ValueError):
+            parsed = json.loads(value) if isinstance(value, str) else value
+        if not isinstance(parsed, dict):
             raise self._wrong(value)
-        return value
+        return parsed
 
 
 def option(
@@ -343,7 +337,6 @@ def parse_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[st
         elif option.kind == "selection" and option.default is not None:
             values[name] = option.parse(option.default)
         else:
-            values[name] = (
-                list(option.default) if isinstance(option.default, tuple) else option.default
-            )
+            default = option.default
+            values[name] = list(default) if isinstance(default, tuple) else default
     return values

@@ -21,7 +21,6 @@ from .where_expression import Expression
 
 #: Which stage makes a dimension that a user may lack.
 MAKERS = {
-    "Z": "The reader does not give it: check its file and options",
     "HeightAboveGround": (
         'Add {"type": "filters.hag_morphological"} before this stage, or the stage that the model '
         "was trained with"

@@ -20,7 +20,7 @@ from ..base.errors import ModelError, StageError
 from ..base.las import number_type
 from .base import WHOLE_CLOUD
 from .options import Option, split_list
-from .registry import stage_type, stage_types
+from .registry import PDAL_OWN, stage_type, stage_types
 
 #: The preprocessing of the dimensions that a model is trained on by default.
 PREPARATION: tuple[dict[str, Any], ...] = (
@@ -29,13 +29,8 @@ PREPARATION: tuple[dict[str, Any], ...] = (
 #: The stage that finds ground, or takes what is given.
 GROUND_FILTER = "filters.hag_morphological"
 #: PDAL's stages that heights come from; for ours, :meth:`Stage.creates` tells.
-OF_PDAL = (
-    "filters.smrf",
-    "filters.pmf",
-    "filters.csf",
-    "filters.hag_nn",
-    "filters.hag_delaunay",
-    "filters.hag_dem",
+OF_PDAL = tuple(
+    f"filters.{name}" for name in ("smrf", "pmf", "csf", "hag_nn", "hag_delaunay", "hag_dem")
 )
 #: PDAL's stages that measure from points of class 2; PDAL 2.2 crashes where there are none.
 NEEDS_GROUND = ("filters.hag_nn", "filters.hag_delaunay")
@@ -64,21 +59,11 @@ PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
 }
 #: Options on a stage's place in a pipeline, on how it is run and on the units of the points at
 #: hand; they do not change what it computes.
-_NOT_STORED = (
-    "tag",
-    "inputs",
-    "user_data",
-    "log",
-    "threads",
-    "horizontal_unit",
-    "vertical_unit",
-)
+_NOT_STORED = (*PDAL_OWN, "threads", "horizontal_unit", "vertical_unit")
 #: Prefix of the names of heights above openings; the width follows.
 _OPENING = "HeightAboveOpening_"
-#: Maximum number of stages; a longer list is no preprocessing but an attack on the reader's time.
-_MAX_STAGES = 8
-#: Maximum number of characters of a stage's options as JSON.
-_MAX_CHARACTERS = 1000
+#: Most characters of preprocessing as JSON; more is an attack on the reader's time.
+_MAX_CHARACTERS = 2000
 
 
 def entry(stage: Mapping[str, Any]) -> dict[str, Any]:
@@ -88,7 +73,7 @@ def entry(stage: Mapping[str, Any]) -> dict[str, Any]:
 
 def as_json(preparation: Iterable[Mapping[str, Any]]) -> str:
     """Return the stages as they are written in a pipeline."""
-    return ", ".join(json.dumps(dict(stage)) for stage in preparation)
+    return ", ".join(json.dumps(dict(stage), default=str) for stage in preparation)
 
 
 def same(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str, Any]]) -> bool:
@@ -120,9 +105,9 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         the stage.
     """
     try:
-        if len(preparation) > _MAX_STAGES:
+        if len(as_json(preparation)) > _MAX_CHARACTERS:
             raise ModelError(
-                f"a preparation has at most {_MAX_STAGES} stages", found=len(preparation)
+                f"a model cannot carry preprocessing of more than {_MAX_CHARACTERS} characters"
             )
         stages = [_check_stage(stage) for stage in preparation]
         types = [stage["type"] for stage in stages]
@@ -148,10 +133,6 @@ def _check_stage(stage: Mapping[str, Any]) -> dict[str, Any]:
     values = {name: value for name, value in stage.items() if name != "type"}
     if unknown := [name for name in values if name not in options]:
         raise ModelError(f"a model cannot carry option {unknown[0][:80]!r} of {kind}")
-    if len(json.dumps(values, default=str)) > _MAX_CHARACTERS:
-        raise ModelError(
-            f"a model cannot carry options of more than {_MAX_CHARACTERS} characters", found=kind
-        )
     try:
         values = {name: _value(options[name], value) for name, value in values.items()}
         if ours is not None:
@@ -165,14 +146,8 @@ def _value(option: Option, value: Any) -> Any:
     """Return an option's value in the spelling of JSON."""
     parsed = option.parse(value)
     if option.kind == "selection":
-        items = (
-            split_list(value)
-            if isinstance(value, str)
-            else value
-            if isinstance(value, list)
-            else [value]
-        )
-        return [str(item).strip() for item in items]
+        items = split_list(value) if isinstance(value, str) else value
+        return [str(item).strip() for item in (items if isinstance(items, list) else [items])]
     if option.kind == "numbers":
         return [_number(number) for number in parsed]
     return _number(parsed) if option.kind == "number" else parsed
@@ -194,12 +169,8 @@ def with_given_ground(preparation: Iterable[Mapping[str, Any]]) -> list[dict[str
 def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """Return the stage that creates these dimensions, as far as they are heights."""
     wanted = list(names)
-    widths = [
-        name.removeprefix(_OPENING).replace("_", ".")
-        for name in wanted
-        if name.startswith(_OPENING)
-    ]
-    openings = [_number(float(width)) for width in widths if re.fullmatch(r"\d+(\.\d+)?", width)]
+    matches = (re.fullmatch(rf"{_OPENING}(\d+(?:_\d+)?)", name) for name in wanted)
+    openings = [_number(float(match[1].replace("_", "."))) for match in matches if match]
     if not openings and "Ground" not in wanted:
         return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in wanted else []
     stage: dict[str, Any] = {"type": "filters.hag_morphological"}
@@ -235,16 +206,11 @@ def made_of_coordinates(
     dict
         Dimension -> (n,) array; empty where preprocessing is not exactly one stage of ours.
     """
-    if (
-        len(preparation) != 1
-        or "where" in preparation[0]
-        or preparation[0]["type"] not in stage_types()
-    ):
+    options = dict(preparation[0]) if len(preparation) == 1 else {}
+    kind = options.pop("type", "")
+    if "where" in options or kind not in stage_types():
         return {}
-    options = {name: value for name, value in preparation[0].items() if name != "type"}
-    stage = stage_type(preparation[0]["type"])(
-        {**options, "ignore": "withheld", "threads": threads or 0}
-    )
+    stage = stage_type(kind)({**options, "ignore": "withheld", "threads": threads or 0})
     if stage.reads() and classes is None:
         return {}
     empty = {name: np.zeros(len(xyz), number_type(kind)) for name, kind in stage.creates().items()}

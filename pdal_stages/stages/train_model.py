@@ -124,12 +124,13 @@ class TrainModel(Stage, settings=TrainingOptions):
         try:
             check(self.upstream)
         except ModelError as error:
+            error.cure = (
+                f"Write a pipeline with the same stages, {', '.join(self._upstream_types)}, before "
+                "filters.modelclassifier"
+            )
             return (
                 f"{self.type}: the model will not hold the stages before it, so `classify` cannot "
-                "run them by itself: "
-                f"{error.what}{f' (found {error.found})' if error.found is not None else ''}. "
-                f"Write a pipeline with the same stages, {', '.join(self._upstream_types)}, "
-                "before filters.modelclassifier"
+                f"run them by itself: {str(error).removesuffix('.')}"
             )
         return None
 

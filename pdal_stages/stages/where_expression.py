@@ -23,8 +23,6 @@ _TOKEN = re.compile(
     r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!]))",
     re.ASCII,
 )
-#: Nested deeper, an expression would exhaust Python's stack.
-_DEEPEST = 200
 #: PDAL's operator -> Python's.
 _IN_PYTHON = {"&&": "and", "||": "or", "!": "not"}
 
@@ -96,8 +94,9 @@ class Expression:
         self._places.append(end)
         try:
             self._root = ast.parse(python, mode="eval").body
-            if _depth(self._root) > _DEEPEST:
-                raise RecursionError
+            names = (node.id[1:] for node in ast.walk(self._root) if isinstance(node, ast.Name))
+            self._names = sorted(set(names))
+            tried = self._evaluate(self._root, dict.fromkeys(self._names, np.zeros(0)))
         except SyntaxError as error:
             if "nested" in error.msg:
                 raise self._error("it is nested too deeply", 0) from None
@@ -105,8 +104,7 @@ class Expression:
             raise self._error("it is not a condition of this form", place) from None
         except (MemoryError, RecursionError):
             raise self._error("it is nested too deeply", 0) from None
-        self._names = {node.id[1:] for node in ast.walk(self._root) if isinstance(node, ast.Name)}
-        if self._evaluate(self._root, dict.fromkeys(self._names, np.zeros(0))).dtype != bool:
+        if tried.dtype != bool:
             raise self._error("it gives a number, not true or false", 0)
 
     def evaluate(self, arrays: _Values) -> NDArray[np.bool_]:
@@ -117,7 +115,7 @@ class Expression:
         DimensionError
             If it names a dimension the points do not have.
         """
-        values = {name: arrays[_find(name, arrays)] for name in sorted(self._names)}
+        values = {name: arrays[_find(name, arrays)] for name in self._names}
         size = len(next(iter(arrays.values()))) if arrays else 0
         return np.broadcast_to(self._evaluate(self._root, values), (size,)).copy()
 
@@ -156,13 +154,8 @@ class Expression:
                 raise self._error(f"{needed} is needed", self._places[part.col_offset])
         function = (_OF_TRUTHS if takes_truth else _OF_NUMBERS)[type(op)]
         with np.errstate(all="ignore"):
-            return (
-                functools.reduce(function, operands) if len(operands) > 1 else function(*operands)
-            )
-
-
-def _depth(node: ast.AST) -> int:
-    return 1 + max(map(_depth, ast.iter_child_nodes(node)), default=0)
+            first, *others = operands
+            return functools.reduce(function, others, first) if others else function(first)
 
 
 def _find(name: str, arrays: _Values) -> str:
