@@ -38,7 +38,6 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
     "selection": _LISTED,
     "numbers": _LISTED,
     "bands": _LISTED,
-    "word": (["string", "number"], "a word or a number"),
     "classes": (["object", "array", "string"], "a list of class codes, or a mapping of labels"),
     "mapping": (["object", "string"], 'a mapping such as {"2": "Ground"}'),
 }
@@ -201,14 +200,6 @@ class Option:
                 f"option '{self.name}' is empty",
                 cure=f"Give {_KINDS[self.kind][1]}, or leave it out",
             )
-        return value
-
-    def _parse_word(self, value: Any) -> str | int | float:
-        if checks.finite(value) is not None:
-            return value
-        for kind in (int, float):
-            with suppress(ValueError):
-                return kind(self._parse_string(value))
         return value
 
     def _parse_classes(self, value: Any) -> Any:
