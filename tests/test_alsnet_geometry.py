@@ -6,16 +6,18 @@ from alsnet_scenes import TINY, coverage, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.alsnet.batches import Batches, halo_m, spacing_for
-from pdal_stages.alsnet.configuration import parse_configuration
-from pdal_stages.alsnet.sampling_and_grouping import (
+from pdal_stages.alsnet.batches import (
+    Batches,
     ball_query,
     build_pyramid,
     farthest_point_sampling,
+    halo_m,
     interpolation_weights,
     join_pyramids,
     random_order,
+    spacing_for,
 )
+from pdal_stages.alsnet.configuration import parse_configuration
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features.cell_means import density
 

@@ -15,13 +15,9 @@ from hypothesis import strategies as st
 
 import pdal_stages
 from pdal_stages import TrainingCloud, TrainingOptions, train
-from pdal_stages.alsnet.batches import Batches
+from pdal_stages.alsnet.batches import JITTER, THIN, Batches, augment, build_pyramid
 from pdal_stages.alsnet.configuration import Configuration, Level
-from pdal_stages.alsnet.sampling_and_grouping import build_pyramid
-from pdal_stages.alsnet.training_batches import (
-    JITTER,
-    THIN,
-    augment,
+from pdal_stages.alsnet.training_data import (
     class_weights,
     cover,
     histogram_deviation,
@@ -287,10 +283,10 @@ def test_transfer_from_something_else_is_refused(tmp_path):
 
 @needs_torch
 def test_a_class_only_in_the_ground_held_out_is_an_error(monkeypatch):
-    from pdal_stages.alsnet import training_batches
+    from pdal_stages.alsnet import training_data
 
     xyz, labels, values = scene()
-    monkeypatch.setattr(training_batches, "hold_out", lambda xyz, position, *_: position == 2)
+    monkeypatch.setattr(training_data, "hold_out", lambda xyz, position, *_: position == 2)
     with pytest.raises(OptionError, match=r"class 6 .* outside the ground held out"):
         fit([TrainingCloud(xyz, labels, values)], validation=0.5)
 

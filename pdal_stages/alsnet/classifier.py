@@ -10,16 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..base import checks
-from ..base.errors import ModelError, StageError
+from ..base.errors import ModelError
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.input_dimensions import add_return_features, take_dimensions
 from ..classifier.interface import ArrayRule, Block, Column, InputPlan, PredictRequest
-from .batches import Batches, halo_m
+from .batches import Batches, Pyramid, augment, build_pyramid, halo_m, random_order
 from .configuration import Configuration, parse_configuration
 from .network import NumpyNetwork, Weights, check_weights
-from .sampling_and_grouping import Pyramid, build_pyramid, random_order
-from .training_batches import augment
 
 #: A network whose batch would need more megabytes is not loaded; the published ones need a few
 #: thousand.
@@ -57,29 +54,22 @@ class AlsNet:
         """Return the network that a pass of a manifest describes; ModelError for contradictions."""
         names, parameters = entry["feature_names"], entry["parameters"]
         n_features, n_classes = len(names), len(codes)
-        inputs = parameters.get("inputs")
-        listed = isinstance(inputs, list) and all(isinstance(each, Mapping) for each in inputs)
-        if set(parameters) != {"configuration", "spacing", "inputs", "weights"} or not listed:
-            raise ModelError(
-                "the network's parameters are not right", found=sorted(map(str, parameters))[:6]
-            )
-        configuration = parse_configuration(parameters["configuration"])
-        spacing = checks.number("the network's spacing", parameters["spacing"], 1e-3, 1e6)
-        input_names = [each.get("name") for each in inputs]
-        if input_names != names or names != entry["dimensions"] or entry["context"]:
+        configuration, inputs = (
+            parse_configuration(parameters["configuration"]),
+            parameters["inputs"],
+        )
+        if [each["name"] for each in inputs] != names or names != entry["dimensions"]:
             raise ModelError(
                 "the network's inputs are not the model's dimensions", found=repr(names)[:80]
             )
-        means = [each.get("mean") for each in inputs]
-        scales = [each.get("scale") for each in inputs]
-        mean = tuple(checks.number("an input's mean", value, -1e12, 1e12) for value in means)
-        scale = tuple(checks.number("an input's scale", value, 1e-12, 1e12) for value in scales)
+        mean, scale = (tuple(float(each[key]) for each in inputs) for key in ("mean", "scale"))
         needed = configuration.memory_mb(n_features)
         if needed > MOST_MB:
             raise ModelError(
                 "a batch of the network would need too much memory", found=f"{needed:,.0f} MB"
             )
         check_weights(arrays, configuration, n_features, n_classes)
+        spacing = float(parameters["spacing"])
         return cls(dict(arrays), configuration, tuple(names), mean, scale, spacing, n_classes)
 
     def arrays(self) -> Weights:
@@ -124,19 +114,32 @@ class AlsNet:
     def predict(self, request: PredictRequest) -> Iterator[Block]:
         """Yield the mean probabilities over all batches a point is in [WM19 3], in one block.
 
-        Batches are computed side by side, as many as fit into the memory, at least one.
+        The variance of a class's probability over the batches, mean over the classes, marks errors
+        [WM19 5].
         """
-        values = take_dimensions(
-            self.inputs,
-            add_return_features(self.inputs, request.xyz, request.dimensions, request.threads),
-            len(request.xyz),
-        )
-        if request.count:
-            averages = self._average(request, values)
-            request.report.figures["batches_per_point"] = averages.batches_per_point()
-            mean, variance = averages.mean_and_variance()
-            rows = np.arange(len(request.xyz)) if request.rows is None else request.rows
-            yield Block(rows, mean, variance)
+        known = add_return_features(self.inputs, request.xyz, request.dimensions, request.threads)
+        values = take_dimensions(self.inputs, known, len(request.xyz))
+        if not request.count:
+            return
+        n, m = len(request.xyz), request.count
+        rows = np.arange(n) if request.rows is None else request.rows
+        place = np.full(n, -1)
+        place[rows] = np.arange(m)
+        total, squares = np.zeros((m, self.n_classes)), np.zeros(m)
+        count = np.zeros(m, np.int64)
+        for members, p in self._apply(request, values):
+            at, p = place[members], p[place[members] >= 0]
+            at = at[at >= 0]
+            if request.progress is not None:
+                request.progress.update(int(np.count_nonzero(count[at] == 0)))
+            total[at] += p
+            squares[at] += (p * p).sum(axis=1)
+            count[at] += 1
+        batches = {"mean": round(float(count.mean()), 2), "least": int(count.min())}
+        request.report.figures["batches_per_point"] = batches
+        mean = total / count[:, None]
+        variance = (squares / count - (mean * mean).sum(axis=1)) / self.n_classes
+        yield Block(rows, mean, np.maximum(variance, 0.0))
 
     def _apply_on(self, device: str) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
         """Return the function that applies the network to a batch.
@@ -153,18 +156,19 @@ class AlsNet:
             "cuda", self.weights, self.configuration, len(self.inputs), self.n_classes
         )
 
-    def _average(
+    def _apply(
         self, request: PredictRequest, dimensions: Mapping[str, npt.ArrayLike]
-    ) -> _Averages:
-        """Return the averages over all batches that hold a wanted point."""
+    ) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
+        """Yield the rows (k,) and probabilities (k, classes) of batches that hold wanted points.
+
+        Batches are computed side by side, as many as fit into the memory, at least one.
+        """
         from threadpoolctl import threadpool_limits
 
-        rows, xyz = request.rows, request.xyz
+        xyz = request.xyz
         columns = normalize_inputs(xyz, dimensions, self.inputs, self.mean, self.scale)
         batches = Batches(xyz, self.configuration.points, self.spacing, columns)
-        averages = _Averages(len(xyz), rows, self.n_classes)
-        each_mb = self.configuration.memory_mb(len(self.inputs))
-        fitting = int(request.memory_mb / each_mb)
+        fitting = int(request.memory_mb / self.configuration.memory_mb(len(self.inputs)))
         side_by_side = max(1, min(resolve_threads(request.threads), fitting))
         apply = self._apply_on(request.device)  # once, before there are threads
 
@@ -175,55 +179,11 @@ class AlsNet:
             )
             return members[order], apply(pyramid)
 
-        numbers = batches.holding(rows).tolist()
+        numbers = batches.holding(request.rows).tolist()
+        request.report.figures["batches"] = len(numbers)
         # With BLAS on one thread a result does not depend on how many are computed side by side.
         with threadpool_limits(1):
-            for members, p in map_blocks(classify, numbers, side_by_side, ahead=1):
-                new = averages.add(members, p)
-                if request.progress is not None:
-                    request.progress.update(new)
-        request.report.figures["batches"] = len(numbers)
-        return averages
-
-
-class _Averages:
-    """Sums of probabilities over the batches that each of m wanted points is in."""
-
-    def __init__(self, n: int, rows: npt.NDArray[np.int64] | None, n_classes: int) -> None:
-        m = n if rows is None else len(rows)
-        self._place = np.full(n, -1)
-        self._place[slice(None) if rows is None else rows] = np.arange(m)
-        self._sum, self._squares = np.zeros((m, n_classes)), np.zeros(m)
-        self._count = np.zeros(m, np.int64)
-
-    def add(self, members: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> int:
-        """Add the probabilities (k, classes) of a batch; return how many points are new."""
-        place = self._place[members]
-        wanted = place >= 0
-        place, p = place[wanted], p[wanted]
-        new = int(np.count_nonzero(self._count[place] == 0))
-        self._sum[place] += p
-        self._squares[place] += (p * p).sum(axis=1)
-        self._count[place] += 1
-        return new
-
-    def batches_per_point(self) -> dict[str, float]:
-        """Return the mean and the least number of batches that a point is in."""
-        if not self._count.all():
-            outside = int(np.count_nonzero(self._count == 0))
-            raise StageError("a point is in no batch; this is a bug", found=outside)
-        return {"mean": round(float(self._count.mean()), 2), "least": int(self._count.min())}
-
-    def mean_and_variance(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return mean probabilities (m, classes), and the variance (m,).
-
-        The variance of a class's probability over the batches, mean over the classes, marks errors
-        [WM19 5].
-        """
-        mean = self._sum / self._count[:, None]
-        squares = (mean * mean).sum(axis=1)
-        variance = (self._squares / self._count - squares) / mean.shape[1]
-        return mean, np.maximum(variance, 0.0)
+            yield from map_blocks(classify, numbers, side_by_side, ahead=1)
 
 
 def normalize_inputs(

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from .batches import Pyramid
 from .configuration import Configuration
-from .sampling_and_grouping import Pyramid
 
 Weights = dict[str, npt.NDArray[np.float32]]
 

@@ -22,12 +22,11 @@ from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
-from . import checkpoint, training_batches
+from .batches import SHIFT, Pyramid, join_pyramids
 from .classifier import AlsNet
 from .configuration import NetworkOptions
 from .network import Weights, check_weights, initial_weights
-from .sampling_and_grouping import Pyramid, join_pyramids
-from .training_data import TrainingData
+from .training_data import TrainingData, class_weights, cover, select_batches
 
 #: Share of the first learning rate that is left at the last epoch; in between it follows a cosine.
 LAST_RATE = 0.01
@@ -93,28 +92,29 @@ class NetworkTraining:
     """The network, its optimizer, and what has been reached."""
 
     def __init__(self, clouds: Sequence[TrainingCloud], options: TrainingOptions) -> None:
-        from .torch_network import Network, resolve_device, torch
+        from . import torch_network
 
-        self.torch, self.options, self.seed = torch, options.alsnet, options.seed
+        self.backend, self.torch = torch_network, torch_network.torch
+        self.options, self.seed = options.alsnet, options.seed
         self.threads = resolve_threads(options.threads)
-        self.device = resolve_device(self.options.device)
+        self.device = torch_network.resolve_device(self.options.device)
         names, network = inputs(options), self.options
         start_model = None if network.start_from is None else _load_start(network, names)
         start_from = None if start_model is None else start_model.algorithm
-        self.data = data = TrainingData.prepare(clouds, options, names, start_from)
+        self.data = data = TrainingData(clouds, options, names, start_from)
         count = data.count_trained()
-        self.selected = training_batches.select_batches(
+        self.selected = select_batches(
             data.batches, data.train_labels, data.n_classes, network.histogram_threshold
         )
-        self.held_batches = training_batches.cover(data.batches, data.held_labels >= 0)
+        self.held_batches = cover(data.batches, data.held_labels >= 0)
         weights = initial_weights(network.configuration, len(names), data.n_classes, self.seed)
         if start_model is not None:
             weights = _transfer(start_model, weights, data.labeled.classes)
-        self.network = Network(network.configuration, len(names), data.n_classes).load(weights)
-        self.network = self.network.to(self.device)
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=network.learning_rate)
-        weight = training_batches.class_weights(count, network.class_weights)
-        self.weight = torch.tensor(weight, dtype=torch.float32, device=self.device)
+        shape = network.configuration, len(names), data.n_classes
+        self.network = torch_network.Network(*shape).load(weights).to(self.device)
+        self.optimizer = self.torch.optim.Adam(self.network.parameters(), lr=network.learning_rate)
+        weight = class_weights(count, network.class_weights)
+        self.weight = self.torch.tensor(weight, dtype=self.torch.float32, device=self.device)
         self.curve: list[dict[str, Any]] = []  #: loss and scores of each epoch
         self.best: Weights = self.network.dump()  #: weights of the epoch of the best mean F1
         self.best_epoch = 0
@@ -196,7 +196,7 @@ class NetworkTraining:
         data, batches = self.data, self.data.batches
         center, members = batches.centers[number], batches.members(number)
         if self.options.augment:
-            shift = random.uniform(-1.0, 1.0, 2) * training_batches.SHIFT * data.spacing
+            shift = random.uniform(-1.0, 1.0, 2) * SHIFT * data.spacing
             moved = center + shift
             nearest = batches.nearest_points(float(moved[0]), float(moved[1]))
             if len(nearest):  # not moved off the cloud's edge
@@ -206,10 +206,8 @@ class NetworkTraining:
 
     def _step(self, pyramid: Pyramid, labels: npt.NDArray[np.int64]) -> float:
         """Do a step of the optimizer; return the cross entropy, the loss [WM19 2.4]."""
-        from .torch_network import tensors
-
         torch = self.torch
-        scores = self.network(tensors(pyramid, self.device))
+        scores = self.network(self.backend.tensors(pyramid, self.device))
         target = torch.from_numpy(labels).to(self.device)
         loss = torch.nn.functional.cross_entropy(
             scores, target, weight=self.weight, ignore_index=-1
@@ -228,8 +226,6 @@ class NetworkTraining:
 
     def _validate(self, bar: Progress) -> dict[str, Any]:
         """Return the scores on the ground held out, by the sums of probabilities over batches."""
-        from .torch_network import tensors
-
         data, torch = self.data, self.torch
         self.network.eval()
         sums = np.zeros((len(data.xyz), data.n_classes), np.float32)
@@ -239,7 +235,7 @@ class NetworkTraining:
 
         with torch.no_grad():
             for rows, pyramid in map_blocks(prepare, self.held_batches, self.threads):
-                scores = self.network(tensors(pyramid, self.device))
+                scores = self.network(self.backend.tensors(pyramid, self.device))
                 sums[rows] += torch.softmax(scores, dim=1).cpu().numpy()
                 bar.update(1)
         matrix = np.zeros((data.n_classes, data.n_classes), np.int64)
@@ -257,8 +253,10 @@ class NetworkTraining:
         classes = data.labeled.classes
         labels = [list(classes.codes), [list(part) for part in classes.labels]]
         values = (*data.xyz.T, *data.columns.T, data.position)
-        digest = [*data.counts, str(hash_rows(values, 0).sum())]
-        return json.dumps([checkpoint.FORMAT, options, self.seed, data.inputs, labels, digest])
+        digest = [*map(len, data.labeled.clouds), str(hash_rows(values, 0).sum())]
+        return json.dumps(
+            [self.backend.CHECKPOINT_FORMAT, options, self.seed, data.inputs, labels, digest]
+        )
 
     def _save(self, path: str) -> None:
         """Write all that training changes."""
@@ -271,7 +269,7 @@ class NetworkTraining:
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
-        checkpoint.save(path, state)
+        self.backend.save_checkpoint(path, state)
 
     def _resume(self, path: str) -> None:
         """Go on from a checkpoint of the same training."""
@@ -282,7 +280,7 @@ class NetworkTraining:
             self.best = {name: tensor.numpy() for name, tensor in state["best"].items()}
             self.curve, self.best_epoch = state["curve"], state["best_epoch"]
 
-        checkpoint.resume(path, self._identity(), apply)
+        self.backend.resume_checkpoint(path, self._identity(), apply)
 
     def describe(self) -> dict[str, Any]:
         """Return the manifest's entries: batches, epochs, curve, validation."""

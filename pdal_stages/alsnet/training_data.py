@@ -1,10 +1,8 @@
-"""Labeled clouds as one, cut into batches: what is trained on, and the ground held out."""
+"""Labeled clouds as one, cut into batches: those trained on, and the ground held out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,91 +11,57 @@ import numpy.typing as npt
 from ..base.errors import OptionError
 from ..base.threads import resolve_threads
 from ..classifier.input_dimensions import add_return_features, take_dimensions
-from ..classifier.training_clouds import Labeled, TrainingCloud, label_classes
+from ..classifier.sampling import Folds
+from ..classifier.training_clouds import TrainingCloud, label_classes
 from ..classifier.training_options import TrainingOptions
 from ..features.cell_means import density
-from . import training_batches
-from .batches import Batches, spacing_for
+from .batches import REACH, Batches, Pyramid, spacing_for
 from .classifier import AlsNet, make_pyramid, normalize_inputs
-from .configuration import Configuration
-from .sampling_and_grouping import Pyramid
 
 #: An input whose standard deviation is lower is not divided by it.
 _LEAST_DEVIATION = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
 class TrainingData:
-    """All n points of the training clouds, and the batches that they make."""
+    """All n points of the training clouds, and the batches that they make.
 
-    labeled: Labeled
-    counts: tuple[int, ...]  #: points of each cloud
-    configuration: Configuration
-    inputs: tuple[str, ...]
-    mean: tuple[float, ...]  #: of each input over the labeled points
-    scale: tuple[float, ...]  #: standard deviation of each input
-    spacing: float  #: of the batches, meters
-    xyz: npt.NDArray[np.float64]  #: (n, 3) meters; the clouds lie side by side
-    columns: npt.NDArray[np.float32]  #: (n, inputs) normalized
-    position: npt.NDArray[np.int64]  #: (n,) which class; -1 where a point is only a neighbor
-    held: npt.NDArray[np.bool_]  #: (n,) points on the ground held out
-    batches: Batches
+    Inputs are normalized as those of the network `start`, if there is one.
+    """
 
-    @classmethod
-    def prepare(
-        cls,
+    def __init__(
+        self,
         clouds: Sequence[TrainingCloud],
         options: TrainingOptions,
         inputs: tuple[str, ...],
         start: AlsNet | None,
-    ) -> TrainingData:
-        """Return the data of clouds; inputs are normalized as those of a network to start from."""
+    ) -> None:
         network = options.alsnet
-        labeled = label_classes(clouds, options)
-        position = np.concatenate([np.asarray(labels) for _, labels in labeled])
+        self.labeled = label_classes(clouds, options)
+        self.n_classes = len(self.labeled.classes.codes)
+        self.configuration, self.inputs = network.configuration, inputs
+        #: (n,) which class; -1 where a point is only a neighbor
+        self.position = np.concatenate([np.asarray(labels) for _, labels in self.labeled])
         values = _concatenate_inputs(clouds, inputs, resolve_threads(options.threads))
-        if start is None:
-            mean, scale = _mean_and_scale(values, inputs, position >= 0)
-        else:
-            mean, scale = start.mean, start.scale
+        #: mean and standard deviation of each input over the labeled points
+        self.mean, self.scale = (
+            _mean_and_scale(values, inputs, self.position >= 0)
+            if start is None
+            else (start.mean, start.scale)
+        )
         parts = [cloud.xyz for cloud in clouds]
-        points = network.configuration.points
+        points = self.configuration.points
         dense = float(np.median([density(xyz) for xyz in parts]))
-        spacing = network.spacing or spacing_for(points, dense)
-        xyz = training_batches.join_clouds(parts, spacing)
-        columns = normalize_inputs(xyz, values, inputs, mean, scale)
-        held = training_batches.hold_out(
-            np.concatenate(parts), position, network.validation, network.block_size
+        self.spacing = network.spacing or spacing_for(points, dense)  #: of the batches, meters
+        self.xyz = join_clouds(parts, self.spacing)  #: (n, 3) meters; the clouds lie side by side
+        #: (n, inputs) normalized
+        self.columns = normalize_inputs(self.xyz, values, inputs, self.mean, self.scale)
+        held = hold_out(
+            np.concatenate(parts), self.position, network.validation, network.block_size
         )
-        return cls(
-            labeled,
-            tuple(map(len, parts)),
-            network.configuration,
-            inputs,
-            mean,
-            scale,
-            spacing,
-            xyz,
-            columns,
-            position,
-            held,
-            Batches(xyz, points, spacing, columns),
-        )
-
-    @property
-    def n_classes(self) -> int:
-        """Number of classes."""
-        return len(self.labeled.classes.codes)
-
-    @cached_property
-    def train_labels(self) -> npt.NDArray[np.int64]:
-        """(n,) class positions that are trained on; -1 elsewhere."""
-        return np.where(self.held, -1, self.position).astype(np.int64)
-
-    @cached_property
-    def held_labels(self) -> npt.NDArray[np.int64]:
-        """(n,) class positions on the ground held out; -1 elsewhere."""
-        return np.where(self.held, self.position, -1).astype(np.int64)
+        #: (n,) class positions that are trained on, and those on the ground held out; -1 elsewhere
+        self.train_labels = np.where(held, -1, self.position).astype(np.int64)
+        self.held_labels = np.where(held, self.position, -1).astype(np.int64)
+        self.batches = Batches(self.xyz, points, self.spacing, self.columns)
 
     def count_trained(self) -> npt.NDArray[np.int64]:
         """Return the points of each class that are trained on; OptionError where there are none."""
@@ -146,3 +110,85 @@ def _mean_and_scale(
     mean = tuple(float(column.mean()) for column in columns)
     deviation = [float(column.std()) for column in columns]
     return mean, tuple(each if each > _LEAST_DEVIATION else 1.0 for each in deviation)
+
+
+def join_clouds(
+    clouds: Sequence[npt.NDArray[np.float64]], spacing: float
+) -> npt.NDArray[np.float64]:
+    """Join clouds, moved along x by whole spacings so that no batch holds points of two."""
+    out: list[npt.NDArray[np.float64]] = []
+    right = None
+    for xyz in clouds:
+        if len(xyz):
+            steps = 0.0 if right is None else np.ceil((right - xyz[:, 0].min()) / spacing)
+            xyz = xyz + np.array([steps * spacing, 0.0, 0.0])
+            right = float(xyz[:, 0].max()) + 8.0 * REACH * spacing
+        out.append(xyz)
+    return np.concatenate(out)
+
+
+def histogram_deviation(histogram: npt.NDArray[Any]) -> float:
+    """Return the standard deviation of a batch's class shares, in per cent [WM19 4.1].
+
+    It is large where one class is nearly all.
+
+    Infinite for a batch without labels.
+    """
+    total = histogram.sum()
+    return float(np.std(histogram / total) * 100.0) if total else float("inf")
+
+
+def select_batches(
+    batches: Batches, labels: npt.NDArray[Any], n_classes: int, threshold: float
+) -> list[int]:
+    """Return the numbers of batches with a variety of classes [WM19 4.1].
+
+    Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels
+    (n,) are class positions; -1 is not looked at.
+    """
+    parts = (labels[batches.members(number)] for number in range(len(batches)))
+    histograms = [np.bincount(part[part >= 0], minlength=n_classes) for part in parts]
+    spreads = [histogram_deviation(histogram) for histogram in histograms]
+    chosen = {number for number, value in enumerate(spreads) if value < threshold}
+    for position in range(n_classes):
+        having = [number for number, histogram in enumerate(histograms) if histogram[position]]
+        if having and not chosen.intersection(having):
+            chosen.add(min(having, key=lambda number: spreads[number]))
+    return sorted(chosen)
+
+
+def hold_out(
+    xyz: npt.NDArray[np.float64], labels: npt.NDArray[Any], share: float, block_size: float
+) -> npt.NDArray[np.bool_]:
+    """Return which labeled points (not -1) lie in the blocks held out for validation."""
+    out, use = np.zeros(len(xyz), bool), np.flatnonzero(labels >= 0)
+    if share == 0.0:
+        return out
+    folds = Folds.of_blocks(
+        xyz[use, :2], labels[use], np.ones(len(use)), max(2, round(1.0 / share)), block_size
+    )
+    out[use] = folds.points(xyz[use, :2]) == 0
+    return out
+
+
+def cover(batches: Batches, wanted: npt.NDArray[np.bool_]) -> list[int]:
+    """Return batches that hold every wanted point at least once, those with most of them first."""
+    left, out = wanted.copy(), []
+    numbers = batches.holding(np.flatnonzero(wanted)).tolist()
+    for number in sorted(
+        numbers, key=lambda number: -np.count_nonzero(wanted[batches.members(number)])
+    ):
+        members = batches.members(number)
+        if left[members].any():
+            left[members] = False
+            out.append(number)
+    return sorted(out)
+
+
+def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]:
+    """Return the weight of each class in the loss; their mean over the points is 1."""
+    share = count / count.sum()
+    if kind == "none":
+        return np.ones(len(count))
+    weight = 1.0 / np.sqrt(share) if kind == "sqrt" else 1.0 / share
+    return weight / (weight * share).sum()
