@@ -174,25 +174,6 @@ def test_other_points_are_refused(town, tmp_path, run):
     assert run("corrections", town, town, "--out", town)[0] == 1
 
 
-def test_training_draws_from_checked_points_alone(town, tmp_path, run):
-    las = laspy.read(town)
-    truth = np.asarray(las.classification).copy()
-    xyz = np.asarray(las.xyz)
-    east = xyz[:, 0] > np.median(xyz[:, 0])
-    las.add_extra_dim(laspy.ExtraBytesParams("Checked", "uint8"))
-    las["Checked"] = (east & np.isin(truth, (2, 5, 6))).astype(np.uint8)
-    wrong = ~east
-    las.classification[wrong] = 2  # nobody looked at these
-    las.write(tmp_path / "checked.laz")
-    model = tmp_path / "m.model"
-    words = ["--model", model, "--base", "standard", "--classes", "2,5,6"]
-    code, out, err = run("train", tmp_path / "checked.laz", *words)
-    assert code == 0 and "were checked by a person" in err + out
-    counts = {one["code"]: one["available"] for one in ps.load_model(str(model)).info["classes"]}
-    for code, available in counts.items():
-        assert 0 < available <= np.count_nonzero(east & (truth == code)), code
-
-
 @pytest.mark.pdal
 def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path, run):
     """Where the points have a Reliability, as many of those that nobody looked at as of the most frequent checked class."""

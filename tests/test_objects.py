@@ -12,11 +12,9 @@ from town_truth import true_objects
 import pdal_stages as ps
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.grid import cell_keys
-from pdal_stages.objects.cells import CLASSES, Kind, kind_of_code, object_id
+from pdal_stages.objects.cells import Kind, object_id
 from pdal_stages.objects.crowns import crown_cells
 from pdal_stages.objects.raster_view import fill_gaps
-from pdal_stages.objects.roofs import connected
 
 
 def house(x0, y0, x1, y1, z, step=0.3, code=6):
@@ -65,30 +63,6 @@ def town():
     return ps.make_town(150.0, 6.0, seed=4, progress=False)
 
 
-def test_records_against_a_plain_twin():
-    rng = np.random.default_rng(3)
-    xyz = np.round(rng.uniform(-4, 4, (500, 3)), 3)
-    codes = rng.choice([1, 2, 5, 6, 7, 14, 17], 500).astype(np.uint8)
-    told = np.where(np.arange(500) % 9, rng.uniform(0, 1, 500), np.nan)
-    cells = Cells.from_points(*xyz.T, codes, 0.5, reliability=told)
-    twin: dict[int, list[int]] = {}
-    for n, ((x, y, _), code) in enumerate(zip(xyz, codes, strict=True)):
-        kind = kind_of_code(CLASSES)[code] if code != 1 else Kind.OTHER
-        if code != 7:
-            wide = 1.0 if kind == Kind.GROUND else 0.5
-            key = int(cell_keys(*np.floor([[x / wide], [y / wide]]).astype(int), kind)[0])
-            twin.setdefault(key, []).append(n)
-    assert cells.key.tolist() == sorted(twin)
-    for at, key in enumerate(sorted(twin)):
-        mm = np.rint(xyz[twin[key], 2] * 1000).astype(int)
-        row = {name: int(values[at]) for name, values in cells.columns.items()}
-        assert row["count"] == len(mm) and row["rated"] == np.count_nonzero(
-            ~np.isnan(told[twin[key]])
-        )
-        assert (row["low"], row["high"], row["sum"]) == (mm.min(), mm.max(), mm.sum())
-        assert row["reliability"] == np.nansum(np.rint(told[twin[key]] * 1000))
-
-
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
 def test_records_do_not_depend_on_order_or_parts(seed, parts):
@@ -113,27 +87,6 @@ def test_gaps_of_the_ground_continue_a_slope():
     row[20, 0], row[20, 59] = 1.0, 60.0
     np.testing.assert_allclose(fill_gaps(row, 60)[20], np.arange(1.0, 61.0), atol=1e-9)
     assert np.isnan(fill_gaps(row, 10)[20, 30])
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_connected_against_flooding(seed):
-    rng = np.random.default_rng(seed)
-    mask, z = rng.random((9, 11)) < 0.7, rng.uniform(0, 3, (9, 11))
-    part = connected(mask, 1.0, z)
-    twin = np.full(mask.shape, -1)
-    for start in range(mask.size):
-        todo = [divmod(start, 11)]
-        while todo:
-            r, c = todo.pop()
-            if not mask[r, c] or twin[r, c] >= 0:
-                continue
-            twin[r, c] = start
-            for i, j in ((r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)):
-                if 0 <= i < 9 and 0 <= j < 11 and abs(z[r, c] - z[i, j]) <= 1.0:
-                    todo.append((i, j))
-    names, number = np.unique(twin, return_inverse=True)
-    np.testing.assert_array_equal(part, number.reshape(twin.shape) - (names[0] < 0))
 
 
 def test_a_house_is_measured():
@@ -363,24 +316,6 @@ def test_far_points_cost_nothing():
     assert len(got.tables[Kind.BUILDING]) == 1
     with pytest.raises(StageError, match="too large for the grid"):
         found_in(np.concatenate([xyz, stray * [1e4, 1e4, 1]]), np.r_[codes, more])
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.6, 0.9]))
-def test_boundaries_polygon_against_their_union(seed, share):
-    shapely = pytest.importorskip("shapely")
-    from pdal_stages.objects.outlines import _polygon
-
-    rng = np.random.default_rng(seed)
-    row, column = np.nonzero(rng.random(rng.integers(1, 14, 2)) < share)
-    if row.size:
-        row, column = row - 1_000_000, column + 2_000_000
-        whole = shapely.union_all(shapely.box(column, row, column + 1, row + 1))
-        walked = _polygon(shapely, row, column, 0.0)
-        assert walked.is_valid and walked.equals(whole) and walked.area == row.size
-        parts = [shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= 3])
-                 for p in shapely.get_parts(whole)]  # fmt: skip
-        assert _polygon(shapely, row, column, 3.0).equals(shapely.MultiPolygon(parts))
 
 
 def test_what_is_nowhere_two_meters_wide_is_to_be_checked():

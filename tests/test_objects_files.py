@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import sys
 
 import laspy
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 import pdal_stages as ps
 from pdal_stages import Cells, cli
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.vector import vector
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 from pdal_stages.pipeline.run import Pipeline
 from pdal_stages.synthetic import write_town
@@ -226,15 +224,6 @@ def test_what_cannot_be(folder, tmp_path, target, text, capsys):
     assert not (tmp_path / target).exists()
 
 
-def test_without_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "shapely", None)
-    monkeypatch.setattr(sys, "prefix", "/usr")  # not the environment that scripts/setup made
-    with pytest.raises(
-        StageError, match=r"needs the Python package 'shapely'.*pip install 'pdal-stages\[vector\]'"
-    ):
-        vector("shapely")
-
-
 @pytest.mark.pdal
 def test_layers_are_written_all_or_none_and_nothing_older_is_left(
     folder, tmp_path, capsys, ending="geojson"
@@ -268,11 +257,7 @@ def test_layers_are_written_all_or_none_and_nothing_older_is_left(
 
 
 @pytest.mark.pdal
-def test_classify_of_many_files_with_options_report_and_resume(
-    folder, tmp_path, capsys, monkeypatch
-):
-    from pdal_stages.tiling import objects_from_files as objects
-
+def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path, capsys):
     parts = [str(folder / "parts" / f"{n}.laz") for n in (0, 1)]
     out, html = tmp_path / "out", tmp_path / "run.html"
     target = out / "town.gpkg"
@@ -287,14 +272,8 @@ def test_classify_of_many_files_with_options_report_and_resume(
     assert cli.main([*command, "--writers.objects.tree_hight=6"]) == 1
     assert "tree_height" in capsys.readouterr().err and not list(out.glob("*"))
 
-    def broken(*_, **__):
-        raise StageError("the disk is full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(objects, "write_objects", broken)
-        assert cli.main([*command, *more]) == 1
-    assert "the disk is full" in capsys.readouterr().err
-    assert html.exists() and not target.exists() and len(list(out.glob("*.laz"))) == 2
+    assert cli.main([*command, *more]) == 0
+    target.unlink()
     assert cli.main([*command, *more, "--resume"]) == 0
     assert (
         cli.main(
@@ -331,16 +310,15 @@ def test_frames_in_one_call(folder):
 def test_frames_of_what_cannot_be():
     pytest.importorskip("geopandas")
     xyz = np.zeros((3, 3))
-    with pytest.raises(StageError, match="no point has a class"):
-        ps.object_frames(xyz, np.ones(3, int))
-    with pytest.raises(StageError, match="there is no ground"):
-        ps.object_frames(xyz, np.full(3, 6))
-    with pytest.raises(StageError, match="one row per point"):
-        ps.object_frames(xyz, np.ones(4, int))
-    with pytest.raises(StageError, match="0 to 255"):
-        ps.object_frames(xyz, np.full(3, 300))
-    with pytest.raises(StageError, match="finite"):
-        ps.object_frames(xyz * np.nan, np.full(3, 2))
+    for places, codes, text in (
+        (xyz, np.ones(3, int), "no point has a class"),
+        (xyz, np.full(3, 6), "there is no ground"),
+        (xyz, np.ones(4, int), "one row per point"),
+        (xyz, np.full(3, 300), "0 to 255"),
+        (xyz * np.nan, np.full(3, 2), "finite"),
+    ):
+        with pytest.raises(StageError, match=text):
+            ps.object_frames(places, codes)
     frames = ps.object_frames(xyz, np.full(3, 2))
     assert all(len(frame) == 0 for frame in frames.values())
 

@@ -162,39 +162,6 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     assert all(one["points"] == one["scattered"] for one in shares.values())
 
 
-def test_h17_score_and_report(town, monkeypatch):
-    monkeypatch.setattr(h17_oakland, "COUNT", 50)
-    monkeypatch.setattr(h17_oakland, "TREES", 5)
-    monkeypatch.setattr(h17_oakland, "CURVE", (0.03,))
-    codes = np.array(list(h17_oakland.CLASSES))
-    labels = codes[np.searchsorted([1, 2, 5, 7, 8], town.labels) % 5]
-    cloud = clouds.with_height(clouds.Cloud("town", town.xyz, labels))
-    part = h17_oakland.compute([cloud], kit.Cache(None), 1)
-    runs = []
-    for name in h17_oakland.TOKENS:
-        for height in h17_oakland.HEIGHTS:
-            run = {"name": name, "seed": 0, "depth": None, "height": height, "threshold": 0.03}
-            runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
-    assert np.sum(runs[0]["clouds"], axis=0).tolist() == runs[0]["matrix"]
-    for name in (h17_oakland.BY_DIMENSIONALITY, h17_oakland.V_C_BY_DIMENSIONALITY):
-        run = {"name": name, "seed": 0, "depth": None, "height": "range", "threshold": 0.03}
-        runs.append({**run, **h17_oakland.score(part, part, threads=1, **run)})
-    shares = {
-        "pooled": h17_oakland.shares(*h17_oakland.pooled(part, part), 0.03),
-        "test": h17_oakland.shares(part.labels, part.curvature, 0.03),
-    }
-    text = h17_oakland.report(runs, {"train": 0.03, "test": 0.03, "pooled": 0.03, "shares": shares})
-    lost, wire = h17_oakland.ground_lost(runs[0])
-    assert lost >= wire >= 0 and lost == (1 - runs[0]["recall"]["2"] / 100) * (labels == 2).sum()
-    assert f"{runs[0]['mcp']:.2f}" in text
-    # Results that are taken over lack the clouds' matrices: their averages are kept, or the table is left out.
-    found = {"train": 0.03, "test": 0.03, "pooled": 0.03, "shares": shares}
-    kept = [{k: v for k, v in run.items() if k not in kit.BULKY} for run in runs]
-    assert h17_oakland.report(kept, found) == text and "Averaged over the test clouds" in text
-    older = [{k: v for k, v in run.items() if k != "over_clouds"} for run in kept]
-    assert "Averaged" not in h17_oakland.report(older, found)
-
-
 def test_b16_command_on_pts_resumes(folder, tmp_path, monkeypatch, capsys):
     """The command for clouds that cannot be had, on the stand-in; a second run does nothing again."""
     monkeypatch.setattr(b16_experiments, "COUNT", 50)

@@ -12,7 +12,6 @@ from PIL import Image
 
 from pdal_stages.base.asprs import class_color
 from pdal_stages.base.errors import StageError
-from pdal_stages.reports import pictures
 from pdal_stages.reports.pictures import (
     BACKGROUND,
     CLASS_COLORS,
@@ -30,12 +29,6 @@ from pdal_stages.reports.pictures import (
 
 def has_color(image: np.ndarray, color) -> bool:
     return bool((image.reshape(-1, 3) == np.array(color)).all(axis=1).any())
-
-
-@pytest.fixture()
-def even_light(monkeypatch):
-    """No shading: colors come out as they are."""
-    monkeypatch.setattr(pictures, "shading", lambda s: np.ones(s.z.shape))
 
 
 def top_view(x, y, z, classes, width):
@@ -148,15 +141,17 @@ def test_errors_are_red_even_under_a_roof():
     assert not has_color(verdict(s, *xyz, np.zeros_like(wrong), np.ones_like(wrong)), WRONG)
 
 
-def test_triptych(even_light):
+def test_triptych():
     x, y, z = block(60)
+    light = shading(surface(x, y, z, 160)).flat[0]  # the same everywhere on level ground
     truth = np.where(x > 15, 6, 2)
     predicted = truth.copy()
     predicted[(x > 20) & (y > 20)] = 5
     image = triptych(x, y, z, predicted, truth, width=500)
     assert abs(image.shape[1] - 500) <= 3
-    assert all(has_color(image, color) for color in (*map(class_color, (2, 5, 6)), RIGHT, WRONG))
-    assert not has_color(triptych(x, y, z, predicted, width=500), WRONG)
+    colors = np.round(np.array([*map(class_color, (2, 5, 6)), RIGHT, WRONG]) * light)
+    assert all(has_color(image, color) for color in colors)
+    assert not has_color(triptych(x, y, z, predicted, width=500), colors[-1])
 
 
 def test_what_cannot_be_drawn_is_told():

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdal_stages.base.errors import StageError
 from pdal_stages.review import review_files
 from pdal_stages.review.expected_errors import RULES, ReviewCells, find_patches
 from pdal_stages.review.review_files import Review, styles
@@ -141,18 +140,6 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
     assert np.isclose(
         json.loads((tmp_path / "w.json").read_text())["expected"], figures["expected"]
     )
-
-
-@pytest.mark.pdal
-@pytest.mark.parametrize("last", ["review_page", "write_layers"])
-def test_all_files_are_written_or_none(folder, tmp_path, monkeypatch, run, last):
-    def full(*_):
-        raise StageError("no room")
-
-    monkeypatch.setattr(review_files, last, full)
-    out = [tmp_path / f"r.{ending}" for ending in ("gpkg", "json", "html")]
-    code, _, err = run("review", folder / "whole.laz", out[0], "--json", out[1], "--html", out[2])
-    assert code == 1 and "no room" in err and not list(tmp_path.iterdir())
 
 
 @pytest.mark.pdal

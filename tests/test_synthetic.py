@@ -18,8 +18,8 @@ from pdal_stages.classifier.model import load_model
 from pdal_stages.stages.registry import stage_type, stage_types
 from pdal_stages.synthetic import Town, make_town, write_town
 from pdal_stages.synthetic.demo import pipelines
-from pdal_stages.synthetic.districts import BUILDING, Finish, Footprint, Site, leaves
-from pdal_stages.synthetic.ray_casting import COUNT, FIRST, build_scene, first_hit
+from pdal_stages.synthetic.districts import Footprint, Site, leaves
+from pdal_stages.synthetic.ray_casting import build_scene, first_hit
 from pdal_stages.synthetic.townplan import plan_town
 
 COLUMNS = [f.name for f in dataclasses.fields(Town)][:-2]
@@ -92,22 +92,16 @@ def test_ground_lies_on_the_ground_and_noise_moves_it(town):
 
 def test_labels_and_heights_agree(town):
     h, c = town.height_above_ground, town.classification
-    assert set(np.unique(c)) == {1, 2, 3, 4, 5, 6, 9, 14, 15, 17}
+    west = town.x < np.median(town.x)
+    for half in (west, ~west):  # so that training on one half and classifying the other is fair
+        codes, counts = np.unique(c[half], return_counts=True)
+        assert set(codes) == {1, 2, 3, 4, 5, 6, 9, 14, 15, 17} and counts.min() >= 30
     assert (h[c == 3] > -0.01).all() and (h[c == 3] < 0.5).all()
     assert ((h[c == 4] >= 0.5) & (h[c == 4] < 2.0)).all()
     assert (h[c == 5] >= 2.0).all() and h[c == 5].max() < 32
     assert np.median(h[c == 6]) > 4 and 12 < h[c == 6].max() < 45
     assert h[c == 14].min() > 3 and 5 < h[c == 15].max() < 12
     assert (h[c == 17] > -0.2).all() and (h[c == 17] < 2.5).all()
-
-
-def test_both_halves_hold_every_class(town):
-    """Training on one half and classifying the other is a fair task."""
-    t = town
-    west = t.x < np.median(t.x)
-    for code in (1, 2, 3, 4, 5, 6, 9, 14, 15, 17):
-        for half in (west, ~west):
-            assert (t.classification[half] == code).sum() >= 30, code
 
 
 def test_beams_pass_canopies_and_meet_walls(town):
@@ -129,45 +123,9 @@ def test_beams_pass_canopies_and_meet_walls(town):
 # ---- the ray caster against a slow, obvious one ------------------------------------------------------------
 
 
-def inside(scene, n, p):
-    """Which of the places p (m, 3) lie inside thing n."""
-    first, count = scene.solids[n, [FIRST, COUNT]].astype(int)
-    if count:
-        planes = scene.planes[first : first + count]
-        return (p @ planes[:, :3].T <= planes[:, 3]).all(axis=1)
-    low, high = scene.solids[n, :3], scene.solids[n, 3:6]
-    return (((2 * p - low - high) / (high - low)) ** 2).sum(axis=1) <= 1
-
-
 def scene_of(site: Site):
     low = np.array([site.u0, site.v0])
     return build_scene([(np.array(site.solids), np.array(site.planes))], low - 40, low + 80)
-
-
-def test_first_hit_equals_marching_through_all_things():
-    rng, site = np.random.default_rng(4), Site(plan_town(1), 0, 0)
-    for _ in range(25):
-        a, b, z = *rng.uniform(0, 30, 2), rng.uniform(0, 10)
-        half, up = rng.uniform(0.3, 4), rng.uniform(0.5, 6)
-        cuts = [(0, 1.0, z + 4), (0.5, 0, z + 3)] if rng.random() < 0.5 else ()
-        base = Footprint(a, b, rng.uniform(0, 6), half, rng.uniform(0.3, 2))
-        site.box(base, z, z + up, Finish(BUILDING, "tile", "tile"), cuts)
-        site.ball((*rng.uniform(0, 30, 2), rng.uniform(2, 12)), rng.uniform(0.5, 3, 3), 0.0)
-        site.bar(rng.uniform(0, 15, 3), rng.uniform(5, 20, 3), 0.15, 14, "metal")
-    scene, met = scene_of(site), 0
-    tested = np.full(len(scene.solids), -1)
-    for beam in range(40):
-        way, tilt = rng.uniform(0, 2 * math.pi), rng.uniform(0, math.tan(math.radians(35)))
-        d = np.array([tilt * math.cos(way), tilt * math.sin(way), -1.0])
-        d /= np.linalg.norm(d)
-        o = np.array([site.u0 + rng.uniform(0, 30), site.v0 + rng.uniform(0, 30), 0.0]) - d * 60.0
-        t = np.arange(20.0, 60.0, 0.004)
-        hits = [inside(scene, n, o + t[:, None] * d) for n in range(len(scene.solids))]
-        slow = min((t[hit.argmax()] for hit in hits if hit.any()), default=60.0)
-        fast, index, _ = first_hit(scene, (*o, *d), 60.0, tested, beam, rng)
-        assert fast == pytest.approx(slow, abs=0.006)
-        met += index >= 0
-    assert 12 < met < 40
 
 
 @pytest.mark.parametrize("extinction", [0.3, 1.0])

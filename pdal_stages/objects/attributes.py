@@ -172,7 +172,7 @@ def measure_span(cells: ObjectCells, size: float) -> dict[str, Any]:
 
 
 def wire_path(cells: ObjectCells, size: float) -> NDArray[np.float64]:
-    """Return a line along wires (n, 3), meters: means of pieces of `PIECE` along their direction."""
+    """Return a line along wires (n, 3), meters: means of pieces of `PIECE` along it."""
     x, y = (cells.column + 0.5) * size, (cells.row + 0.5) * size
     u, v = x - x.min(), y - y.min()
     du, dv = u - u.mean(), v - v.mean()
