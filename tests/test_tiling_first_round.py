@@ -20,7 +20,6 @@ from pdal_stages.terrain.ground_blocks import (
     reach_of_block,
 )
 from pdal_stages.terrain.smrf import FilterOptions
-from pdal_stages.tiling import run_tile as tile
 from pdal_stages.tiling import tiled_run as run
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
@@ -101,42 +100,39 @@ def test_where_and_units_reach_the_first_round(tmp_path, survey):
         assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
 
 
-def break_a_tile(patch):
-    """One tile fails in its own turn, when the rounds before are done."""
-    real = tile.load_first_round
+def failing_in(patch, *jobs):
+    """Let some jobs fail, given as round, column and row; return a list of those that are begun."""
+    real, begun = run.run_tile, []
 
-    def failing(context, at, *rest):
-        if at == (1, 1):
+    def run_tile(context, number, at, *rest):
+        begun.append((number, *at))
+        if begun[-1] in jobs:
             raise ps.StageError("no luck")
-        return real(context, at, *rest)
+        return real(context, number, at, *rest)
 
-    patch.setattr(tile, "load_first_round", failing)
+    patch.setattr(run, "run_tile", run_tile)
+    return begun
 
 
 @pytest.mark.pdal
 def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
     """And removes what is left of tiles that have no points any more; a damaged file is made again."""
-    made, real = [], run.run_first_round
-
-    def noted(context, at, *rest):
-        made.append(at)
-        return real(context, at, *rest)
-
-    monkeypatch.setattr(run, "run_first_round", noted)
     folder = tmp_path / "out"
     with monkeypatch.context() as patch:
-        break_a_tile(patch)
+        begun = failing_in(patch, (1, 1, 1))
         assert len(in_tiles(survey, [HEIGHTS], folder).failures) >= 1
-    assert len(made) == len(set(made)) == 9
+    assert sorted(job for job in begun if job[0] == 0) == sorted(
+        (0, i, j) for i in range(3) for j in range(3)
+    )
     left = folder / ".pdal-stages" / "kept"
-    assert len(list(left.glob("*.first.npz"))) == 9
-    (left / "0_0.first.npz").unlink()
-    np.savez(left / "-160_0.first.npz", around=np.array([[-1.0, 100.0, -500.0]]))
-    with open(left / "320_320.first.npz", "r+b") as file:
+    assert len(list(left.glob("*.round0.npz"))) == 9
+    (left / "0_0.round0.npz").unlink()
+    np.savez(left / "-160_0.round0.npz", around=np.array([[-1.0, 100.0, -500.0]]))
+    with open(left / "320_320.round0.npz", "r+b") as file:
         file.truncate(100)
-    made.clear()
+    begun = failing_in(monkeypatch)
     assert not in_tiles(survey, [HEIGHTS], folder, resume=True).failures
-    assert made == [(0, 0), (2, 2)]
+    assert [job for job in begun if job[0] == 0] == [(0, 0, 0), (0, 2, 2)]
     whole = np.concatenate(ps.run_pipeline([*survey, HEIGHTS]).arrays)
     assert np.array_equal(of_files(folder, "HeightAboveGround"), whole["HeightAboveGround"])
 
@@ -145,19 +141,12 @@ def test_resume_makes_what_is_missing_alone(tmp_path, survey, monkeypatch):
 def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(
     tmp_path, survey, monkeypatch
 ):
-    real, luckless = run.run_first_round, [(0, 0)]
-
-    def failing(context, at, *rest):
-        if at in luckless:
-            raise ps.StageError("no luck")
-        return real(context, at, *rest)
-
-    monkeypatch.setattr(run, "run_first_round", failing)
+    failing_in(monkeypatch, (0, 0, 0))
     small = {**HEIGHTS, "window": 1, "openings": []}
     tiles = in_tiles(survey, [small], tmp_path / "out").tiles
     failed = {job.tile for job in tiles if job.state == "failed"}
     assert (0, 0) in failed and all("no luck" in job.reason for job in tiles if job.tile in failed)
-    luckless += [job.tile for job in tiles]
+    failing_in(monkeypatch, *((0, *job.tile) for job in tiles))
     assert all(
         "no luck" in job.reason for job in in_tiles(survey, [small], tmp_path / "other").tiles
     )

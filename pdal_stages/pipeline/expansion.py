@@ -44,10 +44,13 @@ class Expanded:
     warnings: list[str] = field(default_factory=list)
 
 
-def expand(source: PipelineSource, whole: bool = True) -> Expanded:
+def expand(
+    source: PipelineSource, whole: bool = True, ready: Sequence[ExpandedStage] = ()
+) -> Expanded:
     """Expand a pipeline.
 
-    Not `whole`: it will be run in tiles, which separate flags from classes themselves.
+    Not `whole`: it will be run in tiles, which separate flags from classes themselves. `ready` are
+    its stages of ours, in order, where an earlier pipeline with the same stages has made them.
     """
     stages = copy.deepcopy(source.stages)
     places = [source.where(number) for number in range(len(stages))]
@@ -71,13 +74,19 @@ def expand(source: PipelineSource, whole: bool = True) -> Expanded:
                     merge |= {"inputs": stage["inputs"], "tag": f"pdal_stages_merge_{index}"}
                     stage["inputs"] = [merge["tag"]]
                 out.stages.append(merge)
-            derived = stage_type(stage["type"]).from_pipeline(stage, stages[:index])
-            expanded = expand_stage({**derived, **stage}, index, len(out.stages))
+            if ready:
+                known = ready[len(out.ours)]
+                expanded = expand_stage(stage, index, len(out.stages), known.stage)
+                expanded.context = known.context
+            else:
+                derived = stage_type(stage["type"]).from_pipeline(stage, stages[:index])
+                expanded = expand_stage({**derived, **stage}, index, len(out.stages))
         except StageError as error:
             raise error.prefixed(places[index]) from None
         out.ours.append(expanded)
         out.stages.append(expanded.plain)
-    _place_upstream(out)
+    if not ready:
+        _place_upstream(out)
     check_writers(out.stages, out.ours)
     return out
 
@@ -281,9 +290,11 @@ def stage_files(stage: Stage) -> list[str]:
     return [*files, *stage.inputs()]
 
 
-def expand_stage(as_written: dict[str, Any], number: int = 0, index: int = 0) -> ExpandedStage:
-    """Check one stage of ours, and return it with the ``filters.python`` that stands for it."""
-    stage = stage_from(as_written)
+def expand_stage(
+    as_written: dict[str, Any], number: int = 0, index: int = 0, stage: Stage | None = None
+) -> ExpandedStage:
+    """Return a stage of ours, checked, and the ``filters.python`` that stands for it."""
+    stage = stage or stage_from(as_written)
     options = {k: v for k, v in as_written.items() if k not in ("type", *PDAL_OWN)}
     label = f"pdal_stages_{stage.type.replace('.', '_')}_{uuid.uuid4().hex[:12]}"
     arguments = {"stage": stage.type, "label": label, "options": options}

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -47,6 +47,8 @@ class Pipeline:
         Options set from outside (see :mod:`pdal_stages.pipeline.json_source`).
     whole : bool
         False: only to be run in tiles.
+    ready : sequence of ExpandedStage
+        Our stages, in order, where an earlier pipeline with the same stages has made them.
 
     Raises
     ------
@@ -67,6 +69,7 @@ class Pipeline:
         overrides: Iterable[Override] = (),
         *,
         whole: bool = True,
+        ready: Sequence[runtime.ExpandedStage] = (),
     ) -> None:
         read = source if isinstance(source, PipelineSource) else read_pipeline(source)
         overrides = list(overrides)
@@ -74,7 +77,7 @@ class Pipeline:
         stages = apply_overrides(read.stages, [o for o in overrides if o.by_tag])
         stages = apply_overrides(pdal_env.with_types(stages, read.where), overrides)
         self.source = PipelineSource(stages, read.lines, read.name)
-        self.expanded: Expanded = expand(self.source, whole)
+        self.expanded: Expanded = expand(self.source, whole, ready)
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
         self.log_lines: list[str] = []

@@ -177,5 +177,6 @@ class ClassifyTask:
             outputs = [Output(name) for name in self.outputs if Path(name).parent.is_dir()]
             read = [*self.inputs, *self.files, *pipeline.inputs()]
             check_outputs([*outputs, *self.extra_files], read)
-            source = pipeline.source
-            return run_plan(plan, self.options, dry_run=dry_run, finished=finished, source=source)
+            return run_plan(
+                plan, self.options, dry_run=dry_run, finished=finished, pipeline=pipeline
+            )

@@ -247,7 +247,7 @@ class Survey:
         self.density = Density.measure(self.extents.values())
         #: Memory of a worker for the rounds before the tiles.
         self.block_bytes = (
-            block_bytes(plan.first.blocks, self.density.area * self.unit**2) if plan.first else 0.0
+            block_bytes(plan.blocks, self.density.area * self.unit**2) if plan.blocks else 0.0
         )
         sized = replace(options, tile=earlier["tile"]) if earlier else options
         self.options, self.grid = choose_tiles(
@@ -256,9 +256,9 @@ class Survey:
         if earlier:
             self.grid = TileGrid(self.grid.size, earlier["origin"])
         square = 1
-        if plan.first is not None:
-            first_halo = plan.first.halo_m / self.unit
-            square = tiles_per_square(self.options, self.density, self.grid.size, first_halo)
+        if len(plan.rounds) > 1:
+            halo = max(part.halo_m for part in plan.rounds[:-1]) / self.unit
+            square = tiles_per_square(self.options, self.density, self.grid.size, halo)
         self.squares = self.grid.scaled(earlier["square"] if earlier else square)
 
     def _read_headers(self) -> None:

@@ -33,7 +33,7 @@ class Job:
     source: InputSource | None = None  #: the input that an output is of
     #: files of the writers; None for a tile whose points go into outputs of input files
     outputs: list[str] | None = None
-    jobs: list[Job] = field(default_factory=list)  #: the tiles that an output is assembled from
+    jobs: list[Job] = field(default_factory=list)  #: those that it needs: an output its tiles
     mark: str = ""  #: fingerprint of everything that affects its result
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier
     #: run) or ``failed``.
@@ -135,13 +135,16 @@ class TiledRun:
         }
 
 
-def summarize(tiles: list[Job], cpu_seconds: float, seconds: float) -> dict[str, Any]:
-    """Return the figures of all tiles together, for :attr:`TiledRun.summary`."""
+def summarize(
+    tiles: list[Job], squares: list[Job], cpu_seconds: float, seconds: float
+) -> dict[str, Any]:
+    """Return the figures of all tiles and squares of rounds, for :attr:`TiledRun.summary`."""
     worked = [job.record for job in tiles if job.state == "done"]
     classes: Counter[str] = Counter()
     left_alone: Counter[str] = Counter()
     for job in tiles:
         classes.update(job.record.get("classes") or {})
+    for job in [*tiles, *squares]:
         left_alone.update(job.record.get("left_alone") or {})
     points, read, dropped = (
         sum(record.get(key, 0) for record in worked) for key in ("points", "read", "dropped")

@@ -1,12 +1,10 @@
-"""From a pipeline to the plan of each tile: readers, a head that sees neighbors, a tail that
-writes.
-"""
+"""Plan a pipeline in tiles: readers, a head that sees neighbors, a tail that writes."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +18,15 @@ from ..pipeline.spatial_reference import MOVING
 from ..stages.base import Blocks, Stage, first_round_of
 from .tile_grid import Box, TileGrid
 
-#: Dimensions that follow a point through a tile's pipeline.
-ROW, INPUT, OUTSIDE = "PdalStagesRow", "PdalStagesInput", "PdalStagesOutside"
+#: Dimension that follows a point through a tile's pipeline: its row in the piece of its input.
+ROW = "PdalStagesRow"
+#: The number of the piece.
+INPUT = "PdalStagesInput"
+#: Meters outside the tile; negative inside.
+OUTSIDE = "PdalStagesOutside"
+#: Meters; stages that look farther see saved results of the stages before them, which would
+#: otherwise be computed again in a wide halo. The shipped model looks 48, wires 95, bridges 319.
+_FAR_M = 64.0
 #: PDAL's filters that process each point by itself.
 _PER_POINT = (
     "assign colorization crop expression ferry hag_dem info merge mongo mongoexpression overlay "
@@ -37,31 +42,33 @@ _GLOBAL = (
 
 
 @dataclass(frozen=True)
-class FirstRound:
-    """The first round, before the tiles, for a far-reaching stage: see :mod:`.first_round`."""
+class Round:
+    """Steps of the head that run on all tiles, or larger squares, before later steps do."""
 
-    at: int  #: index of the stage in the head
-    halo_m: float  #: halo of the stages before it
-    blocks: Blocks
-    #: Dimensions changed by the stages before it, saved for the tiles, which then skip these
-    #: stages; None where they must run again in each tile.
-    kept: list[str] | None
+    begin: int  #: index of its first step in the head
+    end: int  #: index after its last step
+    #: Of each step, meters outside the tile within which later ones of the round use its results.
+    used_m: list[float]
+    #: Of each, how far around the points that it reads they must lie for the steps before it to be
+    #: right.
+    upstream_m: list[float]
+    halo_m: float  #: of each tile
+    #: Dimensions that the steps before `end` change, saved for the next round. Empty: there are
+    #: none, or the next round runs these steps again.
+    kept: list[str] = field(default_factory=list)
+    #: Of the far-reaching stage at `end`: squares that are computed of all points.
+    blocks: Blocks | None = None
 
 
 @dataclass(frozen=True)
 class TilePlan:
     """The plan of a tiled run."""
 
-    readers: list[dict[str, Any]]  #: as given
+    readers: list[dict[str, Any]]  #: as written
     head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its halo
-    #: Of each stage of the head, meters outside the tile within which later stages use its results.
-    used_m: list[float]
-    #: Of each, how far around the points that it reads they must lie for stages before it to be
-    #: right.
-    upstream_m: list[float]
+    rounds: list[Round]  #: the head in parts; the last one runs on the tiles
     #: Stages that process single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
-    halo_m: float  #: of each tile, meters
     sees_m: float  #: meters around a tile within which points may matter
     #: Dimensions that the head changes; None where unknown because of PDAL's filters in it.
     creates: list[str] | None
@@ -70,7 +77,6 @@ class TilePlan:
     name: str  #: the pipeline's file, or another name of its source
     #: Created dimensions that LAS files get besides the input's own; None leaves it to the writer.
     extra_dims: dict[str, str] | None = None
-    first: FirstRound | None = None  #: the first round, where there is one
     #: Called with each tile's own results, the outputs and the temporary folder, in place of the
     #: tail; returns a record of what was written.
     takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
@@ -80,39 +86,59 @@ class TilePlan:
 
     @property
     def writers(self) -> list[dict[str, Any]]:
+        """Return the stages that write files."""
         return [s for s in self.tail if s["type"].startswith("writers.")]
+
+    @property
+    def halo_m(self) -> float:
+        """Return the halo of a tile in meters."""
+        return self.rounds[-1].halo_m
+
+    @property
+    def blocks(self) -> Blocks | None:
+        """Return the blocks of the far-reaching stage, if there is one."""
+        return next((part.blocks for part in self.rounds if part.blocks), None)
+
+    def for_one_tile(self) -> TilePlan:
+        """Return the plan for inputs that a single tile holds: nothing lies around it."""
+        count = len(self.head)
+        return replace(self, rounds=[Round(0, count, [0.0] * count, [0.0] * count, self.halo_m)])
 
 
 @dataclass(frozen=True)
 class RunContext:
-    """What all tiles of a run have in common."""
+    """Facts that all tasks of a run have in common."""
 
     plan: TilePlan
     grid: TileGrid
-    squares: TileGrid  #: of the first round
+    squares: TileGrid  #: of the rounds before the last
     unit: float  #: meters per unit of the coordinates
     bounds: Box  #: of all inputs
     threads: int
     most_points: int  #: a tile is not read with a wider halo that holds more
     scratch: str  #: folder for temporary files
-    rasters: str = ""  #: folder with the results of the first round; empty where tiles do without
+    kept: str  #: folder with the results of rounds
+
+    def grid_of(self, number: int) -> TileGrid:
+        """Return the grid that a round runs on."""
+        return self.grid if number + 1 == len(self.plan.rounds) else self.squares
 
 
 @dataclass(frozen=True)
 class _Step:
     """One stage of the pipeline."""
 
-    given: dict[str, Any]  #: an object with a type
+    options: dict[str, Any]  #: as written, with the type
     where: str  #: its line or number, for messages
     ours: Stage | None
 
     @property
     def type(self) -> str:
-        return self.given["type"]
+        return self.options["type"]
 
     @property
     def rank(self) -> int:
-        """0 for readers, 1 for filters and all of ours, 2 for writers."""
+        """Return 0 for readers, 1 for filters and all of ours, 2 for writers."""
         return (
             {"readers": 0, "writers": 2}.get(self.type.partition(".")[0], 1)
             if self.ours is None
@@ -124,31 +150,29 @@ class _Step:
         return self.ours is not None or self.type.removeprefix("filters.") not in _PER_POINT.split()
 
     def sees_results_of(self, earlier: _Step) -> bool:
-        """Return whether results of an earlier step at neighbors can change a point's; PDAL's do
-        not say.
-        """
+        """Return whether an earlier step's results at neighbors can change a point's."""
         return self.ours is None or earlier.ours is None or self.ours.sees_results_of(earlier.ours)
 
     def reach(self, buffer: float | None) -> float:
-        """Meters around a point within which others affect its result."""
+        """Return meters around a point within which others affect its result."""
         if self.ours is not None:
             return self.ours.halo_m()
         return float(buffer or 0.0) if self.sees_neighbors else 0.0
 
 
 def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
-    """Check that a pipeline can be run in tiles, and plan it; `buffer`: how far PDAL's filters
-    look, meters.
+    """Check that a pipeline can be run in tiles, and plan it.
 
-    PipelineError or OptionError, with the reason and the cure, where tiles cannot give its result.
+    `buffer` tells how far PDAL's filters look, in meters. PipelineError or OptionError, with the
+    reason and the cure, where tiles cannot give its result.
     """
     source = pipeline.source
     ours = {expanded.number: expanded for expanded in pipeline.expanded.ours}
     steps = []
     for index, stage in enumerate(source.stages):
-        made = ours.get(index)
-        given = dict(stage if made is None else made.as_written)
-        steps.append(_Step(given, source.where(index), None if made is None else made.stage))
+        expanded = ours.get(index)
+        options = dict(expanded.as_written if expanded else stage)
+        steps.append(_Step(options, source.where(index), expanded.stage if expanded else None))
     _check_linear(steps)
     readers, filters, writers = ([s for s in steps if s.rank == rank] for rank in (0, 1, 2))
     _check_ends(readers, filters, writers)
@@ -157,25 +181,16 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         _check_local(step, number < end, buffer)
     head, tail = filters[:end], filters[end:]
     reaches = [step.reach(buffer) for step in head]
-    _, sees_m = _distances(head, reaches)  # before _first_round reduces some
-    first = _first_round(readers, head, reaches)
-    used_m, halo_m = _distances(head, reaches)
-    upstream_m: list[float] = []
-    for n, step in enumerate(head):
-        seen = [k for k in range(n) if step.sees_results_of(head[k])]
-        upstream_m.append(max((reaches[k] + upstream_m[k] for k in seen), default=0.0))
+    sees_m = _round(head, reaches, 0, end).halo_m
     stages = [step.ours for step in head if step.ours is not None]
     makes = {name: kind for stage in stages for name, kind in stage.creates().items()}
     foreign = any(step.ours is None and step.type != "filters.merge" for step in head)
     return TilePlan(
-        readers=[step.given for step in readers],
+        readers=[step.options for step in readers],
         head=[_for_workers(step) for step in head],
-        used_m=used_m,
-        upstream_m=upstream_m,
-        tail=[step.given for step in [*tail, *writers]],
-        halo_m=halo_m,
+        rounds=_rounds(readers, head, reaches),
+        tail=[step.options for step in [*tail, *writers]],
         sees_m=sees_m,
-        first=first,
         creates=None if foreign else list(makes),
         makes=makes,
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
@@ -185,7 +200,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
 
 
 def readers_of(files: Sequence[str]) -> list[dict[str, Any]]:
-    """A reader for each kind of input, with all its files."""
+    """Return a reader for each kind of input, with all its files."""
     readers: list[dict[str, Any]] = []
     # PDAL reads extra dimensions of LAS 1.0-1.3 only with this option.
     for kind, more in (("readers.las", {"use_eb_vlr": True}), ("readers.ept", {})):
@@ -200,7 +215,7 @@ def plan_of_files(
     overrides: Iterable[Override],
     buffer: float | None = None,
 ) -> tuple[TilePlan, Pipeline]:
-    """The plan of stages after readers of files; and the pipeline with one input of each kind."""
+    """Plan stages after readers of files; return the pipeline with an input of each kind, too."""
     readers = readers_of(files)
     heads = [{**reader, "filename": reader["filename"][0]} for reader in readers]
     pipeline = Pipeline([*heads, *stages], overrides, whole=False)
@@ -210,49 +225,54 @@ def plan_of_files(
     return plan, pipeline
 
 
-def _distances(head: list[_Step], reaches: list[float]) -> tuple[list[float], float]:
-    """Return how far outside a tile results of each step are used, and how wide the halo is;
-    meters.
+def _round(head: list[_Step], reaches: list[float], begin: int, end: int, **facts: Any) -> Round:
+    """Return a round of some steps that look as far as `reaches` (meters) tell."""
+    steps, reaches = head[begin:end], reaches[begin:end]
+    used, upstream = [0.0] * len(steps), [0.0] * len(steps)
+    for n, step in enumerate(steps):
+        seen = [k for k in range(n) if step.sees_results_of(steps[k])]
+        upstream[n] = max((reaches[k] + upstream[k] for k in seen), default=0.0)
+    for n in range(len(steps) - 1, -1, -1):
+        for m in range(n + 1, len(steps)):
+            reach = reaches[m] if steps[m].sees_results_of(steps[n]) else 0.0
+            used[n] = max(used[n], used[m] + reach)
+    halo = max((u + reach for u, reach in zip(used, reaches, strict=True)), default=0.0)
+    return Round(begin, end, used, upstream, halo, **facts)
+
+
+def _rounds(readers: list[_Step], head: list[_Step], reaches: list[float]) -> list[Round]:
+    """Cut the head before stages that look far: they see saved results of those before.
+
+    Blocks serve the first far-reaching stage, which then needs no halo.
     """
-    used = [0.0] * len(head)
-    for n in range(len(head) - 1, -1, -1):
-        for m in range(n + 1, len(head)):
-            around = reaches[m] if head[m].sees_results_of(head[n]) else 0.0
-            used[n] = max(used[n], used[m] + around)
-    return used, max((u + reach for u, reach in zip(used, reaches, strict=True)), default=0.0)
-
-
-def _first_round(
-    readers: list[_Step], head: list[_Step], reaches: list[float]
-) -> FirstRound | None:
-    """Find the far-reaching stage whose raster is computed first; it then needs no halo."""
+    rounds: list[Round] = []
+    begin, open_ended = 0, False
     for at, step in enumerate(head):
         blocks = first_round_of(step.ours)
+        if open_ended or any(part.blocks for part in rounds):
+            blocks = None
+        kept = _kept(readers, head[:at])
+        if blocks is not None or (kept is not None and at > begin and reaches[at] > _FAR_M):
+            rounds.append(_round(head, reaches, begin, at, kept=kept or [], blocks=blocks))
+            begin = begin if kept is None else at
         if blocks is not None:
-            kept = _kept(readers, head[:at])
-            found = FirstRound(at, sum(reaches[:at]), blocks, kept)
-            reaches[at] = 0.0
-            if kept is not None:
-                reaches[:at] = [0.0] * at
-            return found
-        if step.ours is not None and step.ours.open_ended:
-            break
-    return None
+            reaches = [*reaches[:at], 0.0, *reaches[at + 1 :]]
+        open_ended = open_ended or (step.ours is not None and step.ours.open_ended)
+    return [*rounds, _round(head, reaches, begin, len(head))]
 
 
 def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:
-    """The dimensions that stages change, where saving these suffices."""
+    """Return the dimensions that stages change, if saving these is enough; else None."""
     if any(step.ours is None and step.type != "filters.merge" for step in before):
         return None  # which may drop points
     if before and any(step.type == "readers.ept" for step in readers):
         return None  # EPT points have no fixed numbers
-    made = {name for step in before if step.ours is not None for name in step.ours.creates()}
-    return sorted(made) if made <= {"Classification"} else None
+    return sorted({name for step in before if step.ours for name in step.ours.creates()})
 
 
 def _check_linear(steps: list[_Step]) -> None:
     """Refuse pipelines that branch; in a linear one, `inputs` are redundant and removed."""
-    readers = {str(step.given.get("tag")) for step in steps if step.rank == 0}
+    readers = {str(step.options.get("tag")) for step in steps if step.rank == 0}
     for number, step in enumerate(steps):
         before = steps[number - 1] if number else None
         if before and step.rank < before.rank:
@@ -261,10 +281,10 @@ def _check_linear(steps: list[_Step]) -> None:
                 where=step.where,
                 found=f"{step.type} after {before.type}",
             )
-        wanted = step.given.pop("inputs", None)
+        wanted = step.options.pop("inputs", None)
         if wanted is not None and before and step.rank:
             names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))
-            if names not in (readers, {str(before.given.get("tag"))}):
+            if names not in (readers, {str(before.options.get("tag"))}):
                 raise PipelineError(
                     "a pipeline in tiles is linear; this stage takes only some of the points "
                     "before it",
@@ -283,7 +303,7 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
         cure = "End it with a file name, e.g. classified_#.laz"
         raise PipelineError("the pipeline has no writer", cure=cure)
     for step in writers:
-        if not isinstance(step.given.get("filename"), str) or "://" in step.given["filename"]:
+        if not isinstance(step.options.get("filename"), str) or "://" in step.options["filename"]:
             raise PipelineError("in tiles, writers write local files", where=step.type)
         if step.type == "writers.gdal":
             raise PipelineError(
@@ -294,11 +314,11 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
             )
     for step in readers:
         for name in ("count", "start", "bounds", "polygon", "resolution"):
-            if name in step.given:
+            if name in step.options:
                 raise PipelineError(
                     f"option '{name}' of a reader cannot be combined with --tile",
                     where=step.type,
-                    found=step.given[name],
+                    found=step.options[name],
                     cure="Cut the input first, with pdal translate",
                 )
 
@@ -328,11 +348,11 @@ def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
 
 
 def _for_workers(step: _Step) -> dict[str, Any]:
-    """A stage of the head with absolute paths, which every worker finds.
+    """Return a stage of the head with absolute paths, which every worker finds.
 
     A shipped model keeps its name, as its path differs between hosts.
     """
-    stage, ours = dict(step.given), step.ours
+    stage, ours = dict(step.options), step.ours
     if ours is not None:
         for option in ours.all_options():
             name = stage.get(option.name)
@@ -346,19 +366,22 @@ def _for_workers(step: _Step) -> dict[str, Any]:
 def outputs_for(
     plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None
 ) -> list[list[str]]:
-    """For every input, or every tile by name, the output of each writer; StageError where it cannot
-    be written.
+    """Return the output of each writer for every input, or every tile by name.
+
+    StageError where one cannot be written.
     """
-    found = []
+    paths_of_writers = []
     for writer in plan.writers:
         name = os.path.abspath(writer["filename"])
-        found.append(outputs_of(inputs, name) if tiles is None else named_outputs(name, tiles))
+        paths_of_writers.append(
+            outputs_of(inputs, name) if tiles is None else named_outputs(name, tiles)
+        )
     kinds = [LAS if writes_las(writer) else "" for writer in plan.writers]
     every = [
         Output(path, "output", kind)
-        for kind, paths in zip(kinds, found, strict=True)
+        for kind, paths in zip(kinds, paths_of_writers, strict=True)
         for path in paths
     ]
     # Missing folders will be created; a dry run checks the others.
     check_outputs([output for output in every if Path(output.path).parent.is_dir()], inputs)
-    return [list(each) for each in zip(*found, strict=True)]
+    return [list(each) for each in zip(*paths_of_writers, strict=True)]

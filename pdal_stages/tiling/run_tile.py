@@ -1,12 +1,10 @@
-"""A tile: its points with a halo go through the head of the pipeline, and the results of its own
-points are saved.
-"""
+"""Run a tile: its points with a halo go through stages, and results of its own are saved."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -18,17 +16,24 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
 from ..pipeline.las_output import REPLACED, check_writers
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import Callbacks, ExpandedStage, Function, points_of
+from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
-from ..stages.base import WHOLE_CLOUD, first_round_of
+from ..stages.base import WHOLE_CLOUD
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
 from ..stages.registry import stage_types
 from .checkpoint import save_arrays, written
-from .first_round import ChangedValues, FirstRoundResults, load_first_round, stage_of
 from .inputs import IndexedSource
 from .plan import INPUT, OUTSIDE, ROW, RunContext
+from .rounds import (
+    ChangedValues,
+    far_reaching,
+    load_blocks,
+    load_changes,
+    ready_stages,
+    with_threads,
+)
 from .sorted_points import Piece, cut_all
-from .tile_grid import inside
+from .tile_grid import Box, inside
 from .write_outputs import (
     NewValues,
     PieceResults,
@@ -44,85 +49,106 @@ _MARKS = (ROW, INPUT, OUTSIDE)
 
 
 class HeadResult(NamedTuple):
-    """What the head of a pipeline did with a tile."""
+    """Results of a round for a tile."""
 
     results: list[PieceResults]
     halo_needed_m: float = 0.0
     messages: Sequence[str] = ()  #: warnings and notes
     left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.jobs`
+    reduced: Sequence[dict[str, NDArray]] = ()  #: what blocks need of its own points
 
 
 @dataclass
 class _HeadRun:
-    """One run of the head on a tile and what was read around it."""
+    """One run of a round on a tile and what was read around it."""
 
     context: RunContext
+    number: int  #: of the round
     tile: tuple[int, int]
     pieces: list[Piece]
+    halo_m: float  #: within which they were read
     complete: bool  #: all points of the inputs were read, so none lies farther away
-    earlier: FirstRoundResults | None = None
     callbacks: Callbacks = field(default_factory=Callbacks)
     needs_m: list[float] = field(default_factory=lambda: [0.0])  #: halos that stages need
     #: Dimensions of the tile's own points alone, to save memory; one for each view.
     views: list[dict[str, NDArray]] = field(default_factory=list)
+    reduced: list[dict[str, NDArray]] = field(default_factory=list)  #: one for each view
+    #: Place in the pipeline of our stages -> step of the head.
+    steps: dict[int, int] = field(default_factory=dict)
     expanded: dict[int, ExpandedStage] = field(default_factory=dict)  #: by place in the pipeline
-    #: Place in the pipeline -> how far outside results of a stage are used, and how far around its
-    #: own input matters.
-    distances_m: dict[int, tuple[float, float]] = field(default_factory=dict)
 
-    def run(self, last: Function | None = None) -> HeadResult:
-        """Run the head; `last` gets its result."""
-        plan = self.context.plan
-        pipeline = Pipeline(self._stages(last), whole=False)
+    def run(self) -> HeadResult:
+        """Run the steps of the round."""
+        plan, ready = self.context.plan, ready_stages(self.context)
+        part, stages = plan.rounds[self.number], self._stages()
+        ours = [stage for stage in ready[part.begin : part.end] if stage is not None]
+        pipeline = Pipeline(stages, whole=False, ready=ours)
         self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
-        check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
+        if self._is_last:  # class codes of earlier rounds may still be changed
+            check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
         for number, stage in self.expanded.items():
-            stage.update_context(outside=OUTSIDE, used_m=self.distances_m[number][0])
-        if self.earlier is not None:  # of the first one alone
-            needs_rounds = (
-                s for s in self.expanded.values() if first_round_of(s.stage) is not None
-            )
-            next(needs_rounds).update_context(blocks=self.earlier.blocks)
+            used_m = part.used_m[self.steps[number] - part.begin]
+            stage.update_context(outside=OUTSIDE, used_m=used_m)
+        earlier = plan.rounds[self.number - 1] if self.number else None
+        if earlier is not None and earlier.blocks is not None:
+            far = next(n for n, step in self.steps.items() if step == earlier.end)
+            blocks = load_blocks(self.context, self._box(), self.halo_m)
+            self.expanded[far].update_context(blocks=blocks)
         pipeline.execute(arrays=False)
         if not self.complete:
             for number, stage in self.expanded.items():
-                reaches = [report.reach for report in stage.reports if report.beyond_halo]
-                self.needs_m += [sum(self.distances_m[number]) + reach for reach in reaches]
+                step = self.steps[number] - part.begin
+                distance_m = part.used_m[step] + part.upstream_m[step]
+                self.needs_m += [distance_m + r.reach for r in stage.reports if r.beyond_halo]
         messages = _messages(pipeline, self.context.scratch)
-        results = _collect(self.views, self.pieces)
-        return HeadResult(results, max(self.needs_m), messages, pipeline.left_alone)
+        return HeadResult(
+            _collect(self.views, self.pieces),
+            max(self.needs_m),
+            messages,
+            pipeline.left_alone,
+            self.reduced,
+        )
 
-    def _stages(self, last: Function | None) -> list[dict[str, Any]]:
-        """Return the pipeline: readers, the head, and functions that take its result."""
-        plan, first = self.context.plan, self.context.plan.first
-        begin, changed = 0, [ChangedValues()] * len(self.pieces)
-        if self.earlier is not None and first is not None and first.kept is not None:
-            begin, changed = first.at, self.earlier.changed
+    @property
+    def _is_last(self) -> bool:
+        return self.number + 1 == len(self.context.plan.rounds)
+
+    def _box(self, halo_units: float = 0.0) -> Box:
+        return self.context.grid_of(self.number).box(self.tile, halo_units)
+
+    def _stages(self) -> list[dict[str, Any]]:
+        """Return the pipeline: readers, the steps, and functions that take their results."""
+        plan, context = self.context.plan, self.context
+        part, changed = plan.rounds[self.number], [ChangedValues()] * len(self.pieces)
+        if self.number and plan.rounds[self.number - 1].kept:
+            box = self._box(self.halo_m / context.unit)
+            changed = load_changes(context, self.number - 1, box, self.pieces)
         marked = [
-            _marked(number, piece, self.context.unit, changed[number])
+            _marked(number, piece, context.unit, changed[number])
             for number, piece in enumerate(self.pieces)
         ]
         flags = [flags_in_classes(piece.path) for piece in self.pieces]
         readers = [{**piece.reader, "filename": piece.path} for piece in self.pieces]
         mixed = flags if len(set(flags)) > 1 else []
         stages, last_read = read_with(self.callbacks, readers, marked, mixed)
-        apart = len(self.pieces) > 1 and begin < len(plan.head) and not _merges(plan.head[begin])
+        steps = plan.head[part.begin : part.end]
+        apart = len(self.pieces) > 1 and bool(steps) and not _merges(steps[0])
         if apart:  # PDAL's own filters see one file at a time, until a stage merges them
             stages.append({"type": "filters.groupby", "dimension": INPUT, "inputs": [last_read]})
             last_read = stages[-1]["tag"] = "apart"
         head_begins = len(stages)
-        for number, step in enumerate(plan.head[begin:], begin):
+        for number, step in enumerate(steps, part.begin):
             if apart and _merges(step):
                 stages.append({"type": "filters.merge"})
                 apart = False
             place = len(stages)
-            self.distances_m[place] = plan.used_m[number], plan.upstream_m[number]
-            stages.append(_with_threads(step, self.context.threads))
+            stages.append(with_threads(step, context.threads))
             kind = stage_types().get(step["type"])
-            if kind is not None and kind.open_ended and not self.complete:
-                stages.append(self.callbacks.filter(partial(self._measure_reach, place)))
-        functions = [self._take] if last is None else [self._take, last]
-        stages += [self.callbacks.filter(function) for function in functions]
+            if kind is not None:
+                self.steps[place] = number
+                if kind.open_ended and not self.complete:
+                    stages.append(self.callbacks.filter(partial(self._measure_reach, place)))
+        stages.append(self.callbacks.filter(self._take))
         stages[head_begins]["inputs"] = [last_read]
         return stages
 
@@ -132,16 +158,30 @@ class _HeadRun:
         """Ask an open-ended stage which halo it needs."""
         expanded = self.expanded[place]
         points = points_of(expanded.stage, expanded.context, module, ins)
-        box = [side * points.units.horizontal for side in self.context.grid.box(self.tile)]
+        box = [side * points.units.horizontal for side in self._box()]
         self.needs_m.append(expanded.stage.reach_of(points, expanded.context, box))
 
     def _take(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        """Take the results of the tile's own points."""
-        creates = self.context.plan.creates
-        wanted = ins if creates is None else creates
-        names = [name for name in wanted if name in ins and name not in _MARKS]
+        """Take the results of the tile's own points, and reduce these for blocks."""
+        part = self.context.plan.rounds[self.number]
+        wanted = self.context.plan.creates if self._is_last else part.kept
+        names = [name for name in (ins if wanted is None else wanted) if name in ins]
         rows = np.flatnonzero(ins[OUTSIDE] < 0)
-        self.views.append({name: ins[name][rows] for name in (ROW, INPUT, *names)})
+        marks = [ROW, INPUT, *(name for name in names if name not in _MARKS)]
+        self.views.append({name: ins[name][rows] for name in marks})
+        if part.blocks is not None and len(rows):
+            stage = far_reaching(self.context)
+            arrays = {name: values[rows] for name, values in ins.items()}
+            points = points_of(stage, WHOLE_CLOUD, module, arrays)
+            self.reduced.append(stage.reduce_points(points))
+
+
+def _joined(parts: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+    """Return the arrays of all views together, by name."""
+    return {
+        name: np.concatenate([part[name] for part in parts if name in part])
+        for name in {name for part in parts for name in part}
+    }
 
 
 def _merges(stage: Mapping[str, Any]) -> bool:
@@ -150,9 +190,7 @@ def _merges(stage: Mapping[str, Any]) -> bool:
 
 
 def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
-    """Messages of a tile, worded the same for every tile, as a run repeats them once; none about
-    files in `scratch`.
-    """
+    """Return messages of a tile, the same words for every tile; none about files in `scratch`."""
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
         about_piece = text.startswith((scratch, REPLACED)) or NO_REFERENCE in text
@@ -173,14 +211,6 @@ def _marked(number: int, piece: Piece, unit: float, changed: ChangedValues) -> N
     }
     every = {name: (None, values) for name, values in marks.items()}
     return NewValues(np.ones(count, bool), every | changed)
-
-
-def _with_threads(step: dict[str, Any], threads: int) -> dict[str, Any]:
-    """Return a stage that uses no more threads than its worker has."""
-    if step["type"] not in stage_types():
-        return dict(step)
-    wanted = int(step.get("threads") or 0)
-    return {**step, "threads": min(wanted, threads) if wanted else threads}
 
 
 def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[PieceResults]:
@@ -207,79 +237,31 @@ def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[Piece
     return results
 
 
-# ---- tasks of workers ------------------------------------------------------------------------------
-
-
-def run_first_round(
-    context: RunContext, square: tuple[int, int], sources: Sequence[IndexedSource], target: str
-) -> dict[str, Any]:
-    """Save what blocks need of a square's own points, and changes by earlier stages.
-
-    Parameters
-    ----------
-    context : RunContext
-    square : (int, int)
-        Column and row in the grid of squares.
-    sources : sequence of IndexedSource
-        Inputs that may have points in the square or its halo.
-    target : str
-        The file to write.
-
-    Returns
-    -------
-    dict
-        The record of the job.
-    """
-    first = context.plan.first
-    assert first is not None
-    stage, left = stage_of(context.plan), [{"around": np.empty((0, 4))}]
-
-    def leave(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-        inside = ins[OUTSIDE] < 0
-        if inside.any():
-            arrays = {name: values[inside] for name, values in ins.items()}
-            left.append(stage.reduce_points(points_of(stage, WHOLE_CLOUD, module, arrays)))
-
-    # Class codes that do not fit the writers may still be changed by the stages after these: no
-    # tail.
-    head = context.plan.head[: first.at]
-    before = replace(context.plan, head=head, tail=[], creates=first.kept or [], first=None)
-    context = replace(context, plan=before, grid=context.squares)
-    result = HeadResult([])
-    folder = TemporaryDirectory(prefix="first-", dir=context.scratch, ignore_cleanup_errors=True)
-    with folder as name:
-        pieces = cut_all(context.grid, square, sources, first.halo_m / context.unit, name)
-        if pieces:
-            result = _HeadRun(context, square, pieces, complete=True).run(leave)
-    arrays = {
-        name: np.concatenate([part[name] for part in left if name in part])
-        for name in {name for part in left for name in part}
-    }
-    if first.kept:
-        arrays |= arrays_of(result.results)
-    save_arrays(target, arrays)
-    return {"outputs": written([target]), "messages": result.messages}
+# ---- the task of a worker ------------------------------------------------------------------------
 
 
 def run_tile(
     context: RunContext,
+    number: int,
     tile: tuple[int, int],
     sources: Sequence[IndexedSource],
     complete_m: float,
-    result: str,
-    outputs: list[str] | None,
+    target: str,
+    outputs: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Run the head on a tile; save the results or write the outputs.
+    """Run a round on a tile, or on a larger square; save the results or write the outputs.
 
     Parameters
     ----------
     context : RunContext
+    number : int
+        Number of the round.
     tile : (int, int)
-        Column and row.
+        Column and row in the grid of the round.
     sources : sequence of IndexedSource
         All inputs within `complete_m` meters around the tile.
     complete_m : float
-    result : str
+    target : str
         The file for the results, where tiles are not outputs.
     outputs : list of str, optional
         The files of the writers, where tiles are outputs.
@@ -289,48 +271,52 @@ def run_tile(
     dict
         The record of the job.
     """
-    folder = TemporaryDirectory(prefix="tile-", dir=context.scratch, ignore_cleanup_errors=True)
-    with folder as name:
-        results, record = _run_with_halo(context, tile, sources, complete_m, name)
+    with TemporaryDirectory(dir=context.scratch, ignore_cleanup_errors=True) as folder:
+        head, record = _run_with_halo(context, number, tile, sources, complete_m, folder)
         if outputs is not None:
-            output = write_tile(results, context.plan, outputs, context.scratch)
+            output = write_tile(head.results, context.plan, outputs, context.scratch)
             messages = [*record["messages"], *output.get("messages", [])]
             return record | output | {"messages": messages}
-        save_arrays(result, arrays_of(results))
-    return record | {"outputs": written([result])}
+        part, arrays = context.plan.rounds[number], arrays_of(head.results)
+        if number + 1 < len(context.plan.rounds):
+            arrays = arrays if part.kept else {}
+        if part.blocks is not None:
+            arrays |= _joined([{"around": np.empty((0, 4))}, *head.reduced])
+        save_arrays(target, arrays)
+        return record | {"outputs": written([target])}
 
 
 def _run_with_halo(
     context: RunContext,
+    number: int,
     tile: tuple[int, int],
     sources: Sequence[IndexedSource],
     complete_m: float,
     folder: str,
-) -> tuple[list[PieceResults], dict[str, Any]]:
-    """Run the head with a sufficient halo; return results and a record.
+) -> tuple[HeadResult, dict[str, Any]]:
+    """Run a round with a sufficient halo; return results and a record.
 
     It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and
     whether that was too ``short``.
     """
-    grid, least_m = context.grid, context.plan.halo_m
-    side_m, halo_m, short = grid.size * context.unit, least_m, False
+    grid, part = context.grid_of(number), context.plan.rounds[number]
+    side_m, halo_m, short = grid.size * context.unit, part.halo_m, False
     head: HeadResult | None = None
     for attempt in range(_MOST_WIDENINGS + 1):
         pieces = cut_all(grid, tile, sources, halo_m / context.unit, folder)
         read = sum(len(piece.index) for piece in pieces)
         points = sum(len(piece.own_rows) for piece in pieces)
-        if not points or not context.plan.head:
+        if not points or (not context.plan.head and part.blocks is None):
             head = HeadResult([PieceResults(piece, piece.own_rows, {}) for piece in pieces])
             break
         complete = inside(context.bounds, grid.box(tile, halo_m / context.unit))
-        earlier = load_first_round(context, tile, halo_m, pieces) if context.rasters else None
         try:
-            head = _HeadRun(context, tile, pieces, complete, earlier).run()
+            head = _HeadRun(context, number, tile, pieces, halo_m, complete).run()
             needed_m = head.halo_needed_m
         except NoTerrainError:
             if complete:
                 raise
-            head, needed_m = None, side_m + 2 * least_m  # look farther away
+            head, needed_m = None, side_m + 2 * part.halo_m  # look farther away
         if complete or needed_m <= halo_m:
             break
         short = True
@@ -346,12 +332,12 @@ def _run_with_halo(
         )
     classes = [np.zeros(0, np.uint8)]
     classes += [r.values["Classification"] for r in head.results if "Classification" in r.values]
-    return head.results, {
+    return head, {
         "points": points,
         "read": read,
         "halo_m": halo_m,
         "short": short,
-        "widened": halo_m > least_m,
+        "widened": halo_m > part.halo_m,
         "dropped": points - sum(len(result.rows) for result in head.results),
         "classes": class_counts(np.concatenate(classes)),
         "messages": head.messages,

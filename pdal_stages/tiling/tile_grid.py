@@ -68,12 +68,12 @@ class TileGrid:
         return [(i, j) for j in range(y0, y1 + 1) for i in range(x0, x1 + 1)]
 
 
-def check_number(tiles: int, found: str) -> None:
+def check_number(tiles: int, place: str) -> None:
     """Refuse more tiles than a run may have."""
     if tiles > MOST_TILES:
         raise StageError(
             f"more than {MOST_TILES:,} tiles",
-            found=found,
+            found=place,
             cure="Take larger tiles, or repair the bounding box in the header",
         )
 

@@ -1,6 +1,4 @@
-"""A tiled run: reading the inputs, the first round, tiles, and outputs that are assembled from
-them.
-"""
+"""Run a plan in tiles: read the inputs, run rounds and tiles, assemble outputs from them."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +19,12 @@ from ..base.jit import count_cached_kernels
 from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
-from ..pipeline.json_source import Override, PipelineSource
+from ..pipeline.json_source import Override
 from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .checkpoint import Store, fingerprint
-from .first_round import block_name, blocks_around, make_block, square_name
-from .inputs import CloudIndex, IndexedSource, Survey
+from .inputs import CloudIndex, Survey
 from .jobs import (
     InterruptedRun,
     Job,
@@ -38,15 +35,20 @@ from .jobs import (
 )
 from .options import TilingOptions, worker_bytes
 from .plan import RunContext, TilePlan, make_plan, outputs_for
-from .run_tile import run_first_round, run_tile
+from .rounds import block_name, blocks_near, make_block, square_name
+from .run_tile import run_tile
 from .sorted_points import TEMPORARY, is_intact, sort_points
+from .tile_grid import Box, TileGrid
 from .write_outputs import write_file
 
 #: A run stops when this many tiles failed for the same reason and none succeeded.
 _HOPELESS = 10
-#: Bytes on disk for a point until its output is written; in the first round, for a point and for a
-#: raster cell.
-_KEPT, _KEPT_BEFORE, _KEPT_OF_CELL = 60, 33, 112
+#: Bytes on disk for the results of a point until its output is written.
+_KEPT = 60
+#: Bytes on disk for a point until the far-reaching stage has run.
+_KEPT_BEFORE = 33
+#: Bytes on disk for a cell of the raster of that stage.
+_KEPT_OF_CELL = 112
 
 
 def run_tiled(
@@ -89,7 +91,7 @@ def run_tiled(
     chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
     pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
     plan = make_plan(pipeline, chosen.buffer)
-    return run_plan(plan, chosen, dry_run=dry_run, progress=progress, source=pipeline.source)
+    return run_plan(plan, chosen, dry_run=dry_run, progress=progress, pipeline=pipeline)
 
 
 def run_plan(
@@ -99,11 +101,12 @@ def run_plan(
     dry_run: bool = False,
     progress: bool | None = None,
     finished: Callable[[Job], None] | None = None,
-    source: PipelineSource | None = None,
+    pipeline: Pipeline | None = None,
 ) -> TiledRun:
-    """Run a plan; see :func:`run_tiled`. `finished` is called with every output that was written.
+    """Run a plan; see :func:`run_tiled`.
 
-    `source`: the user's pipeline, which is first validated on one input.
+    `finished` is called with every output that was written. `pipeline` is first validated on one
+    input.
     """
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
@@ -112,8 +115,8 @@ def run_plan(
     survey = Survey(plan, chosen, known if "square" in known else None)
     if survey.per == "tile":  # whose outputs have points of all readers
         files_with_flags_to_split([*plan.readers, *plan.tail])
-    if source is not None:
-        _try_on_an_input(source, survey, len(plan.readers))
+    if pipeline is not None:
+        _try_on_an_input(pipeline, survey, len(plan.readers))
     if dry_run:
         return estimate(plan, survey)
     if not folder.is_dir():
@@ -139,28 +142,21 @@ def run_plan(
                     run.read_inputs(run.inputs_of_waiting())
                 interrupted = True
                 with contextlib.suppress(KeyboardInterrupt):
-                    run.make_ground()
+                    run.make_rounds()
                     run.make_outputs(finished)
                     run.forget()
                     interrupted = False
         finally:
             for each in (*folders, store.kept):
                 sweep(each)  # left by workers that were killed
-    summary = survey.figures(plan) | {
-        "workers": workers.slots,
-        "threads_per_worker": workers.threads,
-    }
-    summary |= summarize(run.tiles, run.cpu_seconds, time.monotonic() - started)
-    summary["peak_mb_of_a_worker"] = run.peak_mb
-    messages = survey.messages + messages_of(run.tiles, run.messages_before, chosen.most_points)
-    found = TiledRun(run.tiles, run.outputs, survey.unreadable, survey.changed(), messages, summary)
+    result = run.result(time.monotonic() - started)
     if interrupted:
-        raise InterruptedRun(found)
-    return found
+        raise InterruptedRun(result)
+    return result
 
 
 def _workers(options: TilingOptions, folder: str) -> Any:
-    """The workers of a run whose working folder is `folder`."""
+    """Return the workers of a run whose working folder is `folder`."""
     if options.scheduler:
         from .dask_workers import Cluster
 
@@ -169,10 +165,9 @@ def _workers(options: TilingOptions, folder: str) -> Any:
     return WorkerProcesses(workers, threads) if workers else ThisProcess(threads)
 
 
-def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> None:
-    """Let PDAL prepare the pipeline on one input, so that missing dimensions and unknown options
-    fail before any tile.
-    """
+def _try_on_an_input(pipeline: Pipeline, survey: Survey, readers: int) -> None:
+    """Let PDAL prepare the pipeline on one input: what is wrong fails before any tile."""
+    source = pipeline.source
     inputs = [s for s in survey.sources if s.path not in survey.unreadable and s.kind == "las"]
     if not inputs:
         return
@@ -180,7 +175,8 @@ def _try_on_an_input(source: PipelineSource, survey: Survey, readers: int) -> No
     tags = [stage.get("tag") for stage in source.stages[:readers]]
     stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
     with contextlib.suppress(DependencyError):  # the program pdal is not there to ask
-        Pipeline(replace(source, stages=[*stages, *source.stages[readers:]]), whole=False).prepare()
+        trial = replace(source, stages=[*stages, *source.stages[readers:]])
+        Pipeline(trial, whole=False, ready=pipeline.expanded.ours).prepare()
 
 
 class _Run:
@@ -189,29 +185,40 @@ class _Run:
     def __init__(
         self, plan: TilePlan, survey: Survey, store: Store, workers: Any, show: bool | None
     ) -> None:
-        self.plan, self.survey, self.store, self.workers, self.show = (
-            plan,
-            survey,
-            store,
-            workers,
-            show,
-        )
+        self.plan, self.survey, self.store = plan, survey, store
+        self.workers, self.show = workers, show
         self.tiles: list[Job] = []  #: with points of their own, row by row
+        self.squares: list[Job] = []  #: of the rounds before the last
         self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
         self.cpu_seconds = 0.0  #: of tasks, including failed ones
         self.peak_mb = 0.0  #: peak memory of a process
         self.messages_before: list[list[str]] = []  #: warnings and notes of the first round
         #: How far around a tile, in units of the coordinates, inputs are available: its halo may
         #: have to grow.
-        self.farthest = max(4 * survey.halo_units, survey.halo_units + survey.grid.size)
+        halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
+        self.farthest = max(4 * survey.halo_units, halo_units + survey.grid.size)
+
+    def result(self, seconds: float) -> TiledRun:
+        """Return what was done in a time."""
+        survey = self.survey
+        summary = survey.figures(self.plan) | {
+            "workers": self.workers.slots,
+            "threads_per_worker": self.workers.threads,
+            **summarize(self.tiles, self.squares, self.cpu_seconds, seconds),
+            "peak_mb_of_a_worker": self.peak_mb,
+        }
+        most = survey.options.most_points
+        messages = survey.messages + messages_of(self.tiles, self.messages_before, most)
+        changed = survey.changed()
+        return TiledRun(self.tiles, self.outputs, survey.unreadable, changed, messages, summary)
 
     def _do(
         self, what: str, waiting: deque[Job], task_of: Callable[[Job], Callable[[], Any]]
     ) -> Iterator[Job]:
-        """Run jobs as workers become free, save their records, and yield each; outputs may be added
-        after every one.
+        """Run jobs as workers become free, save their records, and yield each.
 
-        StageError where the first ones all fail for the same reason.
+        Outputs may be added after every one. StageError where the first ones all fail for the same
+        reason.
         """
         for job in waiting:
             self.store.forget(job.name)
@@ -243,7 +250,7 @@ class _Run:
                         found=failures[0],
                     )
 
-    # ---- inputs ----------------------------------------------------------------------------------------------
+    # ---- inputs ----------------------------------------------------------------------------------
 
     def read_inputs(self, needed: Collection[str] | None = None) -> None:
         """Read LAS and LAZ files once, sort their points by location, and save their index.
@@ -286,15 +293,14 @@ class _Run:
         survey.place()
 
     def inputs_of_waiting(self) -> set[str]:
-        """Inputs whose points are read by waiting tiles."""
-        far = self.farthest
-        if first := self.plan.first:
-            far += (self.plan.sees_m + first.blocks.side + first.blocks.reach) / self.survey.unit
-            far += self.survey.squares.size
+        """Return the inputs whose points waiting tiles and their rounds read."""
+        far = len(self.plan.rounds) * (self.farthest + self.survey.squares.size)
+        if blocks := self.plan.blocks:
+            far += (self.plan.sees_m + blocks.side + blocks.reach) / self.survey.unit
         waiting = [job.tile for job in self.tiles if job.state == "waiting"]
         return {source.path for tile in waiting for source in self.survey.near(tile, far)}
 
-    # ---- tiles and outputs -----------------------------------------------------------------------------------
+    # ---- tiles and outputs -----------------------------------------------------------------------
 
     def find_jobs(self) -> None:
         """Find all tiles and outputs; those with unreadable inputs fail.
@@ -319,6 +325,8 @@ class _Run:
             if bad := [s.path for s in survey.near(tile, sees) if s.path in survey.unreadable]:
                 job.fail(f"an input here cannot be read: {bad[0]}", bad[0])
             self.tiles.append(job)
+        if len(self.tiles) == 1:
+            self.plan = plan.for_one_tile()
         if survey.per == "tile":
             named = outputs_for(plan, survey.paths, [job.name for job in self.tiles])
             for job, paths in zip(self.tiles, named, strict=True):
@@ -349,30 +357,32 @@ class _Run:
                 )
 
     def _unkept(self, jobs: Iterable[Job]) -> deque[Job]:
-        """The waiting jobs that no earlier run has finished."""
+        """Return the waiting jobs that no earlier run has finished."""
         waiting = deque(job for job in jobs if job.state == "waiting")
         for job in waiting:
             if known := self.store.finished(job.name, job.mark):
                 job.state, job.record = "kept", known
         return deque(job for job in waiting if job.state == "waiting")
 
+    @cached_property
     def _context(self) -> RunContext:
-        """The context of all tiles."""
+        """Return the context of all tasks."""
         survey, most = self.survey, self.survey.options.most_points
         if survey.density.points <= most:
             most = 1 << 62  # all points fit, however wide the halo
         plan = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
-        threads, scratch = self.workers.threads, str(self.store.scratch)
-        grids = survey.grid, survey.squares
-        return RunContext(plan, *grids, survey.unit, survey.bounds, threads, most, scratch)
+        grids, store = (survey.grid, survey.squares), self.store
+        folders = str(store.scratch), str(store.kept)
+        return RunContext(
+            plan, *grids, survey.unit, survey.bounds, self.workers.threads, most, *folders
+        )
 
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
-        """Run all waiting tiles, and outputs as soon as their last tile is done. `finished` is
-        called with outputs.
+        """Run all waiting tiles, and outputs as soon as their last tile is done.
+
+        `finished` is called with outputs.
         """
-        survey, store, context = self.survey, self.store, self._context()
-        if self.plan.first is not None and len(self.tiles) > 1:
-            context = replace(context, rasters=str(store.kept))
+        context, store = self._context, self.store
         waiting = deque(job for job in self.tiles if job.state == "waiting")
         users: dict[str, list[Job]] = {}
         for out in self.outputs:
@@ -381,31 +391,31 @@ class _Run:
                 users.setdefault(job.name, []).append(out)
 
         def task_of(job: Job) -> Callable[[], Any]:
-            if job.source is not None:
-                results = [store.path(each.name) for each in job.jobs]
-                assert job.outputs is not None
-                plan, scratch = context.plan, context.scratch
-                return partial(
-                    write_file, plan, job.source, job.points, results, job.outputs, scratch
-                )
-            sources = survey.near(job.tile, self.farthest)
-            complete = (
-                math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
-            )
-            given = survey.readable(sources)
-            result = store.path(job.name)
-            return partial(run_tile, context, job.tile, given, complete, result, job.outputs)
+            if job.source is None:
+                return self._tile_task(len(self.plan.rounds) - 1, job)
+            results = [store.path(each.name) for each in job.jobs]
+            assert job.outputs is not None
+            plan, scratch = context.plan, context.scratch
+            return partial(write_file, plan, job.source, job.points, results, job.outputs, scratch)
 
         for job in self._do("tiles", waiting, task_of):
-            if (
-                finished is not None
-                and job.state == "done"
-                and job.outputs
-                and job.record["outputs"]
-            ):
+            written = job.state == "done" and job.outputs and job.record["outputs"]
+            if finished is not None and written:
                 finished(job)
             for out in users.get(job.name, ()):
                 _make_ready(out, waiting)
+
+    def _tile_task(self, number: int, job: Job) -> Callable[[], Any]:
+        """Return the task that runs a round on a tile or square."""
+        survey = self.survey
+        box = self._context.grid_of(number).box(job.tile, self.farthest)
+        sources = survey.near_box(box)
+        complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
+        target = self.store.path(job.name)
+        indexed = survey.readable(sources)
+        return partial(
+            run_tile, self._context, number, job.tile, indexed, complete, target, job.outputs
+        )
 
     def forget(self) -> None:
         """Remove files that no job needs any more."""
@@ -413,85 +423,115 @@ class _Run:
             f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs
         }
         if any(job.state == "failed" for job in self.tiles):
-            needed |= {
-                path.name for path in self.store.kept.glob("*.[bf]*.npz")
-            }  # blocks and first rounds
+            for pattern in ("*.block.npz", "*.round*.npz"):
+                needed |= {path.name for path in self.store.kept.glob(pattern)}
         self.store.remove(".npz", needed)
         self.store.remove(".points")
 
-    # ---- the first round, before the tiles ---------------------------------------------------------------------------
+    # ---- rounds before the last ------------------------------------------------------------------
 
-    def make_ground(self) -> None:
-        """Make what waiting tiles need and an earlier run has not left; jobs that depend on failed
-        ones fail, too.
+    def make_rounds(self) -> None:
+        """Run the rounds that waiting tiles need and an earlier run has not left.
+
+        Jobs that depend on failed ones fail, too.
         """
-        first, survey, store = self.plan.first, self.survey, self.store
-        if first is None or len(self.tiles) == 1:
-            return
-        unit, context, squares = survey.unit, self._context(), survey.squares
-        by_tile = {job.tile: job for job in self.tiles}
-        points: Counter[tuple[int, int]] = Counter()  # of squares
-        factor = round(squares.size / survey.grid.size)
-        for (i, j), job in by_tile.items():
-            points[i // factor, j // factor] += job.points
-        boxes = {tile: survey.grid.box(tile) for tile in by_tile}
-        spill = first.blocks.spill
-        places = {b for box in boxes.values() for b in blocks_around(context, box, spill)}
-        # Blocks and tiles left by an earlier run with other inputs must not be used.
-        store.remove(".block.npz", [f"{block_name(block)}.npz" for block in places])
-        store.remove(".first.npz", [f"{square_name(squares, each)}.npz" for each in points])
-        around = self.farthest * unit + first.blocks.margin
-        wanted = {
-            job.name: places.intersection(blocks_around(context, boxes[tile], around))
-            for tile, job in by_tile.items()
-            if job.state == "waiting"
-        }
-        near: dict[tuple[int, int], list[tuple[int, int]]] = {
-            b: [] for b in sorted(set().union(*wanted.values()))
-        }
-        for square in points:
-            box = squares.box(square)
-            for block in near.keys() & blocks_around(context, box, first.blocks.reach):
-                near[block].append(square)
-        head = self.plan.head[: first.at + 1]
-        common = [
-            build(),
-            head,
-            survey.stamps_of(head),
-            survey.layout,
-            first.halo_m,
-            unit,
-            first.kept,
-        ]
+        waiting = [job for job in self.tiles if job.state == "waiting"]
+        users = waiting
+        layers: list[tuple[list[Job], list[Job]]] = []
+        for number in reversed(range(len(self.plan.rounds) - 1)):
+            layers.insert(0, self._layer(number, users))
+            users = layers[0][0]
+        for number, (squares, blocks) in enumerate(layers):
+            for job in squares:
+                job.fail_with(job.jobs)
+            label = "lowest points of cells" if blocks else f"round {number + 1}"
+            task_of = partial(self._tile_task, number)
+            for job in self._do(label, self._unkept(squares), task_of):
+                self.messages_before.append(job.record.get("messages", []))
+            for job in blocks:
+                job.fail_with(job.jobs)
+            for _ in self._do("ground by blocks", self._unkept(blocks), self._block_task):
+                pass
+            self.squares += self._known_squares(number, squares)
+        for job in waiting:
+            job.fail_with(job.jobs)
 
-        def sources(square: tuple[int, int]) -> list[IndexedSource]:
-            return survey.readable(survey.near_box(squares.box(square, first.halo_m / unit)))
-
-        def first_task(job: Job) -> Callable[[], Any]:
-            return partial(
-                run_first_round, context, job.tile, sources(job.tile), store.path(job.name)
-            )
-
-        firsts: dict[tuple[int, int], Job] = {}
-        for square in sorted({square for each in near.values() for square in each}):
-            mark = fingerprint(common, square, survey.seen([s for s, _ in sources(square)]))
-            firsts[square] = Job(square_name(squares, square), points[square], square, mark=mark)
-        for job in self._do("lowest points of cells", self._unkept(firsts.values()), first_task):
-            self.messages_before.append(job.record.get("messages", []))
-
-        def block_task(job: Job) -> Callable[[], Any]:
-            left = [store.path(firsts[square].name) for square in near[job.tile]]
-            return partial(make_block, context.plan, job.tile, left, store.path(job.name))
-
-        blocks: dict[tuple[int, int], Job] = {}
-        for block, around_it in near.items():
-            mark = fingerprint(common, block, [firsts[square].mark for square in around_it])
-            job = blocks[block] = Job(block_name(block), 1, block, mark=mark)
-            job.fail_with(firsts[square] for square in around_it)
-        for _ in self._do("ground by blocks", self._unkept(blocks.values()), block_task):
-            pass
+    @cached_property
+    def _points_of_squares(self) -> dict[tuple[int, int], int]:
+        """Return the squares that have points, and how many."""
+        points: Counter[tuple[int, int]] = Counter()
+        factor = round(self.survey.squares.size / self.survey.grid.size)
         for job in self.tiles:
-            job.fail_with(blocks[block] for block in sorted(wanted.get(job.name, ())))
+            points[job.tile[0] // factor, job.tile[1] // factor] += job.points
+        return points
+
+    def _layer(self, number: int, users: list[Job]) -> tuple[list[Job], list[Job]]:
+        """Return jobs for the squares of a round, and for blocks, that `users` need (their jobs).
+
+        What an earlier run with other inputs left is removed.
+        """
+        context, survey, part = self._context, self.survey, self.plan.rounds[number]
+        grid, every, unit = context.grid_of(number + 1), self._points_of_squares, survey.unit
+        names = {square: f"{square_name(context, number, square)}.npz" for square in every}
+        self.store.remove(f".round{number}.npz", names.values())
+        squares: dict[tuple[int, int], Job] = {}
+        blocks: dict[tuple[int, int], Job] = {}
+
+        def squares_in(box: Box) -> list[Job]:
+            places = sorted(every.keys() & survey.squares.covering(box))
+            for place in places:
+                squares[place] = squares.get(place) or self._square_job(number, place)
+            return [squares[place] for place in places]
+
+        for job in users:
+            box = grid.box(job.tile, self.farthest)
+            job.jobs = squares_in(box) if part.kept else []
+        if part.blocks is None:
+            return list(squares.values()), []
+        boxes = [survey.grid.box(job.tile) for job in self.tiles]
+        places = {b for box in boxes for b in blocks_near(context, box, part.blocks.spill)}
+        self.store.remove(".block.npz", [f"{block_name(place)}.npz" for place in places])
+        distance_m = self.farthest * unit + part.blocks.margin
+        for job in users:
+            near = blocks_near(context, grid.box(job.tile), distance_m)
+            for place in sorted(places.intersection(near)):
+                if place not in blocks:
+                    # One meter more, as the box may be rounded.
+                    box_m = TileGrid(part.blocks.side).box(place, part.blocks.reach + 1.0)
+                    x0, y0, x1, y1 = (side / unit for side in box_m)
+                    needed = squares_in((x0, y0, x1, y1))
+                    mark = fingerprint(place, part.blocks, [each.mark for each in needed])
+                    blocks[place] = Job(block_name(place), 1, place, jobs=needed, mark=mark)
+                job.jobs.append(blocks[place])
+        return list(squares.values()), list(blocks.values())
+
+    def _square_job(self, number: int, square: tuple[int, int]) -> Job:
+        """Return the job of a square; its mark tells of all inputs that may matter."""
+        survey, part = self.survey, self.plan.rounds[number]
+        head = self.plan.head[: part.end + (part.blocks is not None)]
+        far = max(self.plan.sees_m / survey.unit if number else 0.0, self.farthest)
+        box = survey.squares.box(square, far)
+        mark = fingerprint(
+            [build(), head, survey.stamps_of(head), survey.layout, survey.unit, vars(part)],
+            square,
+            survey.seen([s for s in survey.near_box(box) if s.path not in survey.unreadable]),
+        )
+        name = square_name(self._context, number, square)
+        return Job(name, self._points_of_squares[square], square, mark=mark)
+
+    def _block_task(self, job: Job) -> Callable[[], Any]:
+        """Return the task that computes a block."""
+        squares = [self.store.path(each.name) for each in job.jobs]
+        return partial(make_block, self._context, job.tile, squares, self.store.path(job.name))
+
+    def _known_squares(self, number: int, squares: list[Job]) -> list[Job]:
+        """Return the jobs of a round with those that only an earlier run needed."""
+        places = self._points_of_squares.keys() - {job.tile for job in squares}
+        others = [self._square_job(number, place) for place in places]
+        for job in others:
+            note = self.store.note(job.name)
+            job.record = note if note.get("fingerprint") == job.mark else {}
+        return [*squares, *others]
 
 
 def _make_ready(out: Job, waiting: deque[Job]) -> None:
@@ -509,18 +549,17 @@ def _make_ready(out: Job, waiting: deque[Job]) -> None:
 
 
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
-    """What a run would do: tiles, points, memory and disk, estimated from the headers of the inputs
-    (``--dry-run``).
-    """
+    """Estimate a run from the headers of inputs: tiles, points, memory and disk (``--dry-run``)."""
     grid, options, density = survey.grid, survey.options, survey.density
     tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
     if survey.per == "tile":
         outputs_for(plan, survey.paths, [job.name for job in tiles])
     count, read = density.points, density.read_by(grid.size, survey.halo_units)
     kept = float(count * _KEPT)
-    if plan.first is not None:
-        cells = density.area * (survey.unit / plan.first.blocks.cell) ** 2
+    if plan.blocks is not None:
+        cells = density.area * (survey.unit / plan.blocks.cell) ** 2
         kept += count * _KEPT_BEFORE + cells * _KEPT_OF_CELL
+    kept += sum(count * _KEPT for part in plan.rounds if part.kept and part.blocks is None)
     largest = density.largest if survey.per == "file" else 0
     summary = survey.figures(plan) | {
         "workers": options.local_workers,
