@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.grid import begins_run, cell_keys, cell_numbers, key_offset, places_among, split_keys
+from ..base.jit import njit
 from ..features.cell_means import WHOLE
 from ..terrain.components import number_sets
 
@@ -259,27 +260,31 @@ def _distances(
     cells: VoteCells, segments: Segments, is_large: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.float64]:
     """Return the distance (m,) of each cell to the nearest one of a large segment of its window."""
-    from scipy.spatial import cKDTree
-
-    size, apart = round(RULES.block / RULES.cell), 4.0 * RULES.distance / RULES.cell
-    block = np.stack([cells.column // size, cells.row // size])
-    # A window is a layer of its own, farther from the others than is searched.
-    windows = np.concatenate([block[:, segments.cells] + np.array(b)[:, None] for b in _BLOCKS], 1)
-    keys = cell_keys(*windows)
-    layers, window = np.unique(keys, return_inverse=True)
-    layer, there = places_among(layers, cell_keys(*block))
-    origin = cells.column.min(), cells.row.min()
-    column, row = cells.column - origin[0], cells.row - origin[1]
+    size, count = round(RULES.block / RULES.cell), len(segments.cells)
+    column, row = cells.column // size, cells.row // size
     large = np.flatnonzero(is_large[segments.label])
-    out = np.full(len(cells.keys), RULES.distance)
-    if not len(large):
-        return out
-    at = segments.cells[large % len(segments.cells)]
-    tree = cKDTree(np.stack([column[at], row[at], apart * window[large]], axis=1))
-    near, _ = tree.query(
-        np.stack([column, row, apart * layer], axis=1),
-        distance_upper_bound=(RULES.distance + 0.1) / RULES.cell,
-    )
-    is_near = there & np.isfinite(near)
-    out[is_near] = np.minimum(near[is_near] * RULES.cell, RULES.distance)
+    at = segments.cells[large % count]
+    columns, rows = np.array(_BLOCKS)[large // count].T
+    window = cell_keys(column[at] + columns, row[at] + rows)
+    order = np.argsort(window, kind="stable")
+    window, at = window[order], at[order]
+    block = cell_keys(column, row)
+    first, end = (np.searchsorted(window, block, side) for side in ("left", "right"))
+    places = np.stack([cells.column, cells.row], axis=1)
+    squared = _nearest(places, places[at], first, end, (RULES.distance / RULES.cell) ** 2)
+    return RULES.cell * np.sqrt(squared)
+
+
+@njit
+def _nearest(places, others, first, end, most):
+    """Return the squared distance (m,) of each place to the nearest of its others, `most` at most.
+
+    Others of a place are `others` (k, 2) from `first` to `end`.
+    """
+    out = np.full(len(places), most)
+    for place in range(len(places)):
+        for other in range(first[place], end[place]):
+            across = others[other, 0] - places[place, 0]
+            along = others[other, 1] - places[place, 1]
+            out[place] = min(out[place], float(across * across + along * along))
     return out
