@@ -230,5 +230,5 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
 
 
 def test_a_block_without_points_has_no_cells():
-    none = cells_of_block(np.empty((0, 4)), (3, -4), FilterOptions(openings=(5,)))
+    none = cells_of_block(np.empty((0, 3)), (3, -4), FilterOptions(openings=(5,)))
     assert none.cells["opened"].shape == (0, 1)

@@ -80,7 +80,7 @@ def make_block(
     blocks = context.plan.blocks
     assert blocks is not None
     low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(block, blocks.reach)
-    parts = [np.empty((0, 4))]
+    parts = [np.empty((0, 3))]
     for path in squares:
         points = load_arrays(path, ["around"])["around"]
         x, y = points[:, 0], points[:, 1]

@@ -281,7 +281,7 @@ def run_tile(
         if number + 1 < len(context.plan.rounds):
             arrays = arrays if part.kept else {}
         if part.blocks is not None:
-            arrays |= _joined([{"around": np.empty((0, 4))}, *head.reduced])
+            arrays |= _joined([{"around": np.empty((0, 3))}, *head.reduced])
         save_arrays(target, arrays)
         return record | {"outputs": written([target])}
 
