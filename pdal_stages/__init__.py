@@ -31,7 +31,6 @@ _WHERE = {
     "hag_minima": "terrain",
     "load_model": "classifier.model",
     "make_town": "synthetic",
-    "object_frames": "reports.object_layers",
     "object_layers": "reports.object_layers",
     "parse_neighborhoods": "features.neighborhoods",
     "run_pipeline": "pipeline.run",
@@ -59,7 +58,7 @@ if TYPE_CHECKING:
     from .pipeline.python_pdal import Filter, Writer
     from .pipeline.run import Pipeline, run_pipeline
     from .reports.accuracy_page import write_accuracy_report
-    from .reports.object_layers import object_frames, object_layers
+    from .reports.object_layers import object_layers
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima
     from .tiling.options import TilingOptions

@@ -249,8 +249,7 @@ def test_a_roof_from_whose_inside_nothing_came_back(turned):
     xyz = np.concatenate([ground, *(p for p, _ in parts)])
     found = found_in(xyz, np.concatenate([codes, *(c for _, c in parts)])).tables[Kind.BUILDING]
     area = {
-        round(float(found.cells_of(n)[1].mean()) / 40): a
-        for n, a in enumerate(found.columns["area"])
+        round(float(found.cells[n][1].mean()) / 40): a for n, a in enumerate(found.columns["area"])
     }
     assert area[0] == pytest.approx(64, abs=8)
     assert all(area.get(n, 0) < 35 for n in (1, 2))
@@ -275,7 +274,7 @@ def test_a_shift_by_whole_cells_shifts_the_objects(town):
         a, b = one.tables[kind], two.tables[kind]
         assert len(a) == len(b) > 0
         for own, twin in zip(a.cells, b.cells, strict=True):
-            np.testing.assert_array_equal(own[:, 0] - 1024, twin[:, 0])
+            np.testing.assert_array_equal(own[0] - 1024, twin[0])
         np.testing.assert_array_equal(a.columns["area"], b.columns["area"])
 
 
@@ -294,7 +293,7 @@ def test_the_town(town):
     blocks = [g for g in shapely.get_parts(houses.intersection(square)) if g.area > 4]
     hit = 0
     for n in range(len(table)):
-        row, column, _ = table.cells_of(n)
+        row, column, _ = table.cells[n]
         shape = shapely.union_all(shapely.box(column / 2, row / 2, column / 2 + 0.5, row / 2 + 0.5))
         hit += any(shape.intersection(g).area / shape.union(g).area >= 0.5 for g in blocks)
     assert hit >= 0.93 * max(len(blocks), len(table))
@@ -387,7 +386,7 @@ def test_objects_of_some_reasons_left_out():
     buildings, kept = found.tables[Kind.BUILDING], rest.tables[Kind.BUILDING]
     assert (left_out, len(buildings), len(kept)) == (1, 2, 1)
     number = buildings.ids.tolist().index(kept.ids[0])
-    for one, other in zip(kept.cells_of(0), buildings.cells_of(number), strict=True):
+    for one, other in zip(kept.cells[0], buildings.cells[number], strict=True):
         np.testing.assert_array_equal(one, other)
     assert set(rest.owner) == {i for table in rest.tables.values() for i in table.ids}
     assert len(rest.key) == len(rest.owner) < len(found.key)

@@ -84,7 +84,6 @@ def test_figures_of_buildings():
     assert got["area"]["iou"] == pytest.approx(140 / (204 + 245 - 140))
     assert got["covered"] == pytest.approx(1 / 3)
     assert got["boundary"]["p95"] == pytest.approx(0.5) and got["boundary"]["median"] == 0
-    assert got["sizes"]["0 to 25 m2"]["completeness"] == 0
     empty = compare_buildings([], true)
     assert empty["objects"]["completeness"] == 0 and np.isnan(empty["objects"]["correctness"])
 

@@ -294,35 +294,6 @@ def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path,
     assert not list(tmp_path.glob(".town*"))
 
 
-def test_frames_in_one_call(folder):
-    geopandas = pytest.importorskip("geopandas")
-    las = laspy.read(folder / "town.laz")
-    frames = ps.object_frames(las.xyz, las.classification, crs="EPSG:25832")
-    cells = ps.Cells.from_points(*las.xyz.T, np.asarray(las.classification), 0.5)
-    layers = ps.object_layers(ps.find_objects(cells, progress=False))
-    assert list(frames) == list(layers)
-    for name, frame in frames.items():
-        assert isinstance(frame, geopandas.GeoDataFrame) and frame.crs.to_epsg() == 25832
-        assert frame["object_id"].tolist() == layers[name].columns["object_id"].tolist()
-        assert all(shapely.equals_exact(np.array(frame.geometry), np.array(layers[name].shapes)))
-
-
-def test_frames_of_what_cannot_be():
-    pytest.importorskip("geopandas")
-    xyz = np.zeros((3, 3))
-    for places, codes, text in (
-        (xyz, np.ones(3, int), "no point has a class"),
-        (xyz, np.full(3, 6), "there is no ground"),
-        (xyz, np.ones(4, int), "one row per point"),
-        (xyz, np.full(3, 300), "0 to 255"),
-        (xyz * np.nan, np.full(3, 2), "finite"),
-    ):
-        with pytest.raises(StageError, match=text):
-            ps.object_frames(places, codes)
-    frames = ps.object_frames(xyz, np.full(3, 2))
-    assert all(len(frame) == 0 for frame in frames.values())
-
-
 def cloud(path, xyz, codes, epsg=25832):
     pyproj = pytest.importorskip("pyproj")
     header = laspy.LasHeader(point_format=6, version="1.4")

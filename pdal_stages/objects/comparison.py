@@ -21,10 +21,6 @@ from ..base.errors import StageError
 from ..base.units import horizontal_part
 from ..base.vector import reading, vector
 
-#: Limits of the size classes of buildings, m2.
-AREA_LIMITS = (0.0, 25.0, 100.0, 500.0, np.inf)
-#: Limits of the size classes of trees, m.
-HEIGHT_LIMITS = (0.0, 5.0, 10.0, 20.0, np.inf)
 #: Distance between the places at which boundaries are compared, meters.
 BOUNDARY_STEP = 0.5
 #: Names of columns that hold heights of trees.
@@ -94,11 +90,10 @@ def compare_buildings(detected: Sequence[Any], true: Sequence[Any]) -> dict[str,
     Returns
     -------
     dict
-        ``objects`` (matched at an intersection over union of 0.5), ``sizes`` (the same by area),
-        ``area`` (completeness, correctness and intersection over union of all area), ``covered``
-        (share of true outlines that detected ones cover by at least 80 %), ``boundary`` (distance
-        of places along the true boundary from the detected one, of blocks that match: median and
-        95th percentile, meters).
+        ``objects`` (matched at an intersection over union of 0.5), ``area`` (completeness,
+        correctness and intersection over union of all area), ``covered`` (share of true outlines
+        that detected ones cover by at least 80 %), ``boundary`` (distance of places along the true
+        boundary from the detected one, of blocks that match: median and 95th percentile, meters).
     """
     shapely = vector("shapely")
     detected, true = list(shapely.make_valid(list(detected))), list(shapely.make_valid(list(true)))
@@ -114,7 +109,7 @@ def compare_buildings(detected: Sequence[Any], true: Sequence[Any]) -> dict[str,
     offset = np.concatenate(offsets)
     pairs = match_by_overlap(detected, true)
     return {
-        **_scores(pairs, shapely.area(detected), areas, AREA_LIMITS, "m2"),
+        "objects": _scores(pairs, len(detected), len(true)),
         "area": {
             "reference": whole_true.area,
             "found": whole.area,
@@ -141,39 +136,22 @@ def compare_trees(
     error = heights[a] - true_heights[b]
     error = error[~np.isnan(error)]
     return {
-        **_scores(pairs, heights, true_heights, HEIGHT_LIMITS, "m"),
+        "objects": _scores(pairs, len(heights), len(true_heights)),
         "place": {"median": _percentile(distance, 50)},
         "height": {"bias": _mean(error), "rmse": float(np.sqrt(_mean(error**2)))},
     }
 
 
-def _scores(
-    pairs: Pairs, size: NDArray, true_size: NDArray, limits: Sequence[float], unit: str
-) -> dict[str, Any]:
-    """Return the scores of all objects, and of those of each size class."""
-    matched, true_matched = np.zeros(len(size), bool), np.zeros(len(true_size), bool)
-    a, b = np.array(pairs, np.int64).reshape(-1, 2).T
-    matched[a], true_matched[b] = True, True
-
-    def score(low: float, high: float) -> dict[str, float]:
-        right = matched[(size >= low) & (size < high)]
-        hit = true_matched[(true_size >= low) & (true_size < high)]
-        counts = {"reference": len(hit), "found": len(right)}
-        return {**counts, "completeness": _mean(hit), "correctness": _mean(right)}
-
-    sizes = {}
-    for low, high in itertools.pairwise(limits):
-        name = f"{low:g} to {high:g} {unit}" if np.isfinite(high) else f"{low:g} {unit} and more"
-        sizes[name] = score(low, high)
-    objects = {
-        "reference": len(true_size),
-        "found": len(size),
-        "completeness": _mean(true_matched),
-        "correctness": _mean(matched),
+def _scores(pairs: Pairs, detected: int, true: int) -> dict[str, Any]:
+    """Return the scores of a number of detected and of true objects."""
+    return {
+        "reference": true,
+        "found": detected,
+        "completeness": _share(len(pairs), true),
+        "correctness": _share(len(pairs), detected),
         "matched": len(pairs),
-        "f1": _share(2 * len(pairs), len(size) + len(true_size)),
+        "f1": _share(2 * len(pairs), detected + true),
     }
-    return {"objects": objects, "sizes": sizes}
 
 
 def _share(part: float, whole: float) -> float:
@@ -332,15 +310,11 @@ def table(figures: dict[str, Any]) -> str:
     lines: list[str] = []
     for layer, scores in figures.items():
         objects = scores["objects"]
-        used = {n: row for n, row in scores["sizes"].items() if row["reference"] or row["found"]}
+        shares = [_percent(objects[key]) for key in ("completeness", "correctness")]
         lines += [
             f"{layer}: {objects['found']:,} found, {objects['reference']:,} in the reference",
-            f"{'':24s}{'reference':>10s}{'found':>10s}{'complete':>10s}{'correct':>10s}",
+            f"complete {shares[0]}, correct {shares[1]}",
         ]
-        for name, row in {"all": objects, **used}.items():
-            shares = (_percent(row[key]) for key in ("completeness", "correctness"))
-            counts = f"{name:24s}{row['reference']:10,}{row['found']:10,}"
-            lines.append(counts + "".join(f"{share:>10s}" for share in shares))
         if layer == "trees":
             place, height = scores["place"], scores["height"]
             lines += [

@@ -99,7 +99,7 @@ def _table(objects: list[_Object]) -> ObjectTable:
     return ObjectTable(
         np.array([each.identity for each in objects], np.int64),
         {name: np.array([each.record[name] for each in objects]) for name in names},
-        [np.column_stack([each.cells.row, each.cells.column, each.cells.z]) for each in objects],
+        [(each.cells.row, each.cells.column, each.cells.z) for each in objects],
         [each.record["path"] for each in objects if "path" in each.record],
     )
 

@@ -40,7 +40,7 @@ RULES = OutlineRules()
 def raw_outlines(table: ObjectTable, size: float, *, hole: float = RULES.min_hole) -> list[Any]:
     """Return the union of each object's cells; holes smaller than `hole` m2 are closed."""
     shapely = vector("shapely")
-    return [_polygon(shapely, *table.cells_of(n)[:2], hole / size**2) for n in range(len(table))]
+    return [_polygon(shapely, row, column, hole / size**2) for row, column, _ in table.cells]
 
 
 def _polygon(shapely: Any, row: NDArray, column: NDArray, hole: float) -> Any:

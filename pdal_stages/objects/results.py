@@ -69,19 +69,12 @@ class ObjectTable:
 
     ids: NDArray[np.int64]  #: (n,)
     columns: dict[str, NDArray]  #: (n,) measures and verdicts by name
-    cells: list[NDArray[np.float64]]  #: (k, 3) row, column and height of each object's cells
+    cells: list[tuple[NDArray, NDArray, NDArray]]  #: (k,) rows, columns, heights of each object
     paths: list[NDArray[np.float64]]  #: (k, 3) the line along each span; empty for other kinds
 
     def __len__(self) -> int:
         """Return the number of objects."""
         return len(self.ids)
-
-    def cells_of(
-        self, number: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Return rows, columns and heights of an object's cells."""
-        row, column, z = self.cells[number].T
-        return row.astype(np.int64), column.astype(np.int64), z
 
     def reasons(self) -> list[list[str]]:
         """Return why each object is to be checked."""
@@ -94,7 +87,7 @@ class ObjectTable:
     def select(self, kept: NDArray[np.bool_]) -> ObjectTable:
         """Return a table of the objects in a mask (n,)."""
         columns = {name: values[kept] for name, values in self.columns.items()}
-        cells, paths = (list(compress(values, kept)) for values in (self.cells, self.paths))
+        cells, paths = list(compress(self.cells, kept)), list(compress(self.paths, kept))
         return ObjectTable(self.ids[kept], columns, cells, paths)
 
 

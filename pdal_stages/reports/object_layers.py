@@ -1,22 +1,19 @@
-"""Objects as layers of shapes with attributes, as GeoDataFrames, and as vector files."""
+"""Objects as layers of shapes with attributes, and as vector files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import class_color
-from ..base.errors import StageError
 from ..base.units import Units
 from ..base.vector import vector
 from ..objects.attributes import CHECK
-from ..objects.cells import CLASSES, Cells, Kind, refuse_unclassified
-from ..objects.detect import find_objects
+from ..objects.cells import Kind
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines
-from ..objects.results import Objects, ObjectSettings, ObjectTable
+from ..objects.results import Objects, ObjectTable
 from .vector_files import Layer, qml, write_layers
 
 #: Layers of objects, in this order.
@@ -91,69 +88,6 @@ def _columns(table: ObjectTable, kind: Kind) -> dict[str, NDArray]:
         values = table.columns.get(name, np.empty(0)).astype(_TYPES.get(name, np.float64))
         out[name] = np.round(values, 3) if values.dtype == np.float64 else values
     return out
-
-
-def object_frames(
-    xyz: NDArray,
-    classification: NDArray,
-    *,
-    reliability: NDArray | None = None,
-    settings: ObjectSettings | None = None,
-    classes: Mapping[Kind, Sequence[int]] = CLASSES,
-    straight: bool = True,
-    crs: Any = None,
-) -> dict[str, Any]:
-    """Return the objects of a cloud as GeoDataFrames (needs geopandas), one for each layer.
-
-    Parameters
-    ----------
-    xyz : (n, 3) float64
-        Meters.
-    classification : (n,) integers
-        ASPRS class codes; leave out points that are withheld or noise.
-    reliability : (n,) float, optional
-        0 to 1.
-    settings : ObjectSettings, optional
-    classes : mapping of Kind to codes, optional
-        Class codes of each kind.
-    straight : bool
-        Outlines of buildings and decks along walls, instead of along cells.
-    crs : optional
-        Reference system, as geopandas takes it: ``"EPSG:25832"``.
-
-    Raises
-    ------
-    StageError
-        Where arrays do not fit each other, no point has a class of any kind, or none is ground.
-    """
-    import geopandas
-
-    (x, y, z), codes = _checked(xyz, classification, reliability)
-    settings = settings or ObjectSettings()
-    cells = Cells.from_points(
-        x, y, z, codes, settings.cell, reliability=reliability, classes=classes
-    )
-    refuse_unclassified(cells, codes)
-    layers = object_layers(find_objects(cells, settings, progress=False), straight=straight)
-    return {
-        name: geopandas.GeoDataFrame(layer.columns, geometry=layer.shapes, crs=crs)
-        for name, layer in layers.items()
-    }
-
-
-def _checked(
-    xyz: NDArray, classification: NDArray, reliability: NDArray | None
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return coordinates (3, n) and codes (n,), or raise StageError where arrays do not fit."""
-    xyz, codes = np.asarray(xyz, np.float64), np.asarray(classification)
-    rated = codes if reliability is None else np.asarray(reliability)
-    if xyz.shape != (len(codes), 3) or rated.shape != codes.shape:
-        raise StageError("arrays must have one row per point", found=f"{xyz.shape}, {codes.shape}")
-    if codes.size and not (codes.min() >= 0 and codes.max() <= 255):
-        raise StageError("class codes are 0 to 255", found=f"{codes.min()} to {codes.max()}")
-    if not np.isfinite(xyz).all():
-        raise StageError("coordinates must be finite", cure="Leave out rows of NaN or infinity")
-    return xyz.T, codes.astype(np.uint8)
 
 
 def write_objects(

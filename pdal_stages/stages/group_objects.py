@@ -164,7 +164,7 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
         for kind in (Kind.BUILDING, Kind.SPAN, Kind.DECK):
             table = objects.tables[kind]
             for number in np.flatnonzero(np.isin(table.ids, ids)).tolist():
-                row, column, _ = table.cells_of(number)
+                row, column, _ = table.cells[number]
                 beyond = (
                     west - column.min() * size,
                     (column.max() + 1) * size - east,
