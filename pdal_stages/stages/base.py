@@ -367,7 +367,7 @@ class FarReaching(Stage):
     def reduce_points(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """Return what blocks need of points.
 
-        That is an array (n, 4) ``around``, for blocks that the points do not lie in, and (n, 3)
+        That is an array (n, 3) ``around``, for blocks that the points do not lie in, and (n, 3)
         for each block that they lie in (:func:`inside_block`).
         """
 
