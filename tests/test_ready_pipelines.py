@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from pathlib import Path
 
@@ -21,8 +20,15 @@ FOLDER = Path(__file__).resolve().parent.parent / "pipelines"
 FILES = sorted(FOLDER.glob("*.json"))
 
 
-def run(name, *words):
-    overrides, rest = parse_overrides(words)
+def words(source, output=None, model=None, more=()):
+    """Options by tag: the files of a run, and more as (tag.option, value)."""
+    options = {"input.filename": source, "output.filename": output, "classifier.model": model}
+    return [f"--stage.{k}={v}" for k, v in {**options, **dict(more)}.items() if v is not None]
+
+
+def run(name, *given, **more):
+    """Run a ready pipeline with its files."""
+    overrides, rest = parse_overrides(words(*given, **more))
     assert not rest
     pipeline = Pipeline(FOLDER / f"{name}.json", overrides)
     pipeline.execute()
@@ -43,26 +49,17 @@ def test_none_is_forgotten():
 
 @pytest.mark.parametrize(
     "name",
-    ["classify", "classify-with-rejection", "classify-on-smrf-ground", "classify-regularized"],
+    [f"classify{more}" for more in ("", "-with-rejection", "-on-smrf-ground", "-regularized")],
 )
 def test_classify(ready_town, ready_models, tmp_path, name):
-    out = tmp_path / "o.laz"
     model = ready_models / ("smrf.model" if "smrf" in name else "classes.model")
-    run(
-        name,
-        f"--stage.input.filename={ready_town}",
-        f"--stage.classifier.model={model}",
-        f"--stage.output.filename={out}",
-    )
-    before, after = laspy.read(ready_town), laspy.read(out)
-    sure = np.isin(before.classification, [2, 5, 6]) & (np.asarray(after["Reliability"]) > 0.5)
-    assert (
-        np.mean(np.asarray(after.classification)[sure] == np.asarray(before.classification)[sure])
-        > 0.85
-    )
+    run(name, ready_town, tmp_path / "o.laz", model)
+    before, after = laspy.read(ready_town), laspy.read(tmp_path / "o.laz")
+    reliability, codes = np.asarray(after["Reliability"]), np.asarray(after.classification)
+    sure = np.isin(before.classification, [2, 5, 6]) & (reliability > 0.5)
+    assert np.mean(codes[sure] == np.asarray(before.classification)[sure]) > 0.85
     if name == "classify-with-rejection":
-        low = np.asarray(after["Reliability"]) < 0.5
-        assert (np.asarray(after.classification)[low] == 1).all()
+        assert (codes[reliability < 0.5] == 1).all()
         assert {"Margin", "Probability_2"} <= set(after.point_format.dimension_names)
 
 
@@ -70,13 +67,11 @@ def test_classify(ready_town, ready_models, tmp_path, name):
     "name", ["noise", "normalize", "features", "features-for-viewers", "copc-to-tiles"]
 )
 def test_those_that_need_no_model_of_their_own(ready_town, ready_models, tmp_path, name):
-    source = (
-        Path(__file__).parent / "data" / "town.copc.laz" if name.startswith("copc") else ready_town
-    )
-    words = [f"--stage.input.filename={source}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
-    if '"classifier"' in (FOLDER / f"{name}.json").read_text():
-        words.append(f"--stage.classifier.model={ready_models / 'classes.model'}")
-    run(name, *words)
+    octree = Path(__file__).parent / "data" / "town.copc.laz"
+    source = octree if name.startswith("copc") else ready_town
+    classifies = '"classifier"' in (FOLDER / f"{name}.json").read_text()
+    model = ready_models / "classes.model" if classifies else None
+    run(name, source, tmp_path / "o_#.laz", model)
     parts = [laspy.read(path) for path in tmp_path.glob("o_*.laz")]
     assert sum(map(len, parts)) == len(laspy.read(source))
 
@@ -87,38 +82,25 @@ def test_tile_index_to_tiles(ready_halves, ready_models, tmp_path):
     command += ["--stdin", "-f", "GPKG", "--lyr_name", "pdal"]
     files = "\n".join(map(str, ready_halves.glob("*.laz")))
     subprocess.run(command, input=files, text=True, check=True, capture_output=True)
-    words = [f"--stage.input.filename={index}", f"--stage.output.filename={tmp_path / 'o_#.laz'}"]
-    words.append(f"--stage.classifier.model={ready_models / 'classes.model'}")
-    run_tiled(
-        FOLDER / "tile-index-to-tiles.json", 500, parse_overrides(words)[0], per="tile", workers=0
-    )
+    options = words(index, tmp_path / "o_#.laz", ready_models / "classes.model")
+    overrides = parse_overrides(options)[0]
+    run_tiled(FOLDER / "tile-index-to-tiles.json", 500, overrides, per="tile", workers=0)
     assert list(tmp_path.glob("o_*.laz"))
 
 
 def test_evaluate(ready_town, ready_models, tmp_path):
-    pipeline = run(
-        "evaluate",
-        f"--stage.input.filename={ready_town}",
-        f"--stage.classifier.model={ready_models / 'classes.model'}",
-        f"--stage.output.filename={tmp_path / 'o.laz'}",
-        f"--stage.accuracy.json={tmp_path / 'a.json'}",
-        f"--stage.accuracy.html={tmp_path / 'a.html'}",
-    )
-    figures = json.loads((tmp_path / "a.json").read_text())
+    pages = {f"accuracy.{kind}": tmp_path / f"a.{kind}" for kind in ("json", "html")}
+    model = ready_models / "classes.model"
+    pipeline = run("evaluate", ready_town, tmp_path / "o.laz", model, more=pages)
     shown = pipeline.metadata["metadata"]["filters.accuracy"]["overall_accuracy"]
     assert 0.8 < shown <= 1
-    assert str(round(shown, 6))[:6] in json.dumps(figures)
+    assert str(round(shown, 6))[:6] in (tmp_path / "a.json").read_text()
     assert "<html" in (tmp_path / "a.html").read_text()
 
 
 def test_tiles_to_tiles(ready_town, ready_halves, ready_models, tmp_path):
-    run(
-        "tiles-to-tiles",
-        f"--stage.input.filename={ready_halves}/*.laz",
-        f"--stage.classifier.model={ready_models / 'classes.model'}",
-        f"--stage.output.filename={tmp_path}/classified_#.laz",
-        "--stage.tiles.length=40",
-    )
+    files = ready_halves / "*.laz", tmp_path / "classified_#.laz", ready_models / "classes.model"
+    run("tiles-to-tiles", *files, more={"tiles.length": 40})
     parts = [laspy.read(p) for p in sorted(tmp_path.glob("classified_*.laz"))]
     assert len(parts) == 4
     assert sum(len(p) for p in parts) == len(laspy.read(ready_town))
@@ -132,11 +114,7 @@ def test_tiles_to_tiles(ready_town, ready_halves, ready_models, tmp_path):
 
 def test_raw_to_footprints(ready_town, tmp_path):
     pyogrio = pytest.importorskip("pyogrio")
-    run(
-        "raw-to-footprints",
-        f"--stage.input.filename={ready_town}",
-        f"--stage.output.filename={tmp_path / 'o.gpkg'}",
-    )
+    run("raw-to-footprints", ready_town, tmp_path / "o.gpkg")
     names = [name for name, _ in pyogrio.list_layers(tmp_path / "o.gpkg")]
     assert names[:5] == ["buildings", "trees", "crowns", "spans", "decks"]
     assert pyogrio.read_info(tmp_path / "o.gpkg", layer="buildings")["features"] > 0
@@ -147,37 +125,20 @@ def test_terrain_and_surface_of_a_survey_show_no_tiles(ready_town, ready_halves,
     writer = {"type": "writers.las", "filename": "", "forward": "all", "extra_dims": "all"}
     heights = {"type": "filters.hag_morphological", "window": 20}
     writer["filename"] = str(tmp_path / "classified" / "#.laz")
-    assert not run_tiled(
-        [str(ready_halves / "*.laz"), heights, writer], 25, workers=0, progress=False
-    ).failures
+    stages = [str(ready_halves / "*.laz"), heights, writer]
+    assert not run_tiled(stages, 25, workers=0, progress=False).failures
     writer["filename"] = str(tmp_path / "whole.laz")
     Pipeline([str(ready_town), heights, writer]).execute()
+    place = {"resolution": 1, "origin_x": 499_995, "origin_y": 5_399_995, "width": 70, "height": 70}
     rasters = {}
-    for kind, source in (
-        ("files", tmp_path / "classified" / "*.laz"),
-        ("whole", tmp_path / "whole.laz"),
-    ):
-        words = [f"--stage.input.filename={source}"]
+    for kind, source in (("files", "classified/*.laz"), ("whole", "whole.laz")):
+        options = {}
         for model in ("surface", "terrain"):
-            place = {
-                "resolution": 1,
-                "origin_x": 499_995,
-                "origin_y": 5_399_995,
-                "width": 70,
-                "height": 70,
-            }
-            place["filename"] = tmp_path / f"{model}_{kind}.tif"
-            words += [f"--stage.{model}.{name}={value}" for name, value in place.items()]
-        run("terrain-and-surface", *words)
+            options |= {f"{model}.{name}": value for name, value in place.items()}
+            options[f"{model}.filename"] = tmp_path / f"{model}_{kind}.tif"
+        run("terrain-and-surface", tmp_path / source, more=options)
         for model in ("surface", "terrain"):
-            reader = {
-                "type": "readers.gdal",
-                "filename": str(tmp_path / f"{model}_{kind}.tif"),
-                "header": "Z",
-            }
-            reading = Pipeline([reader])
-            reading.execute()
-            rasters[model, kind] = reading.arrays[0]["Z"].reshape(70, 70)
+            rasters[model, kind] = raster(tmp_path / f"{model}_{kind}.tif").reshape(70, 70)
     for model in ("surface", "terrain"):
         assert np.allclose(rasters[model, "files"], rasters[model, "whole"], atol=1e-9)
         assert (rasters[model, "files"][10:60, 10:60] != -9999).all()
@@ -221,15 +182,14 @@ def test_rasters_of_points_with_flags(tmp_path, write_las, pdal_program, program
     made = []
     for point_format in (1, 6):
         source = flagged(write_las, tmp_path / f"{point_format}.las", point_format, everywhere)
-        words = [f"--stage.input.filename={source}"]
-        for model in ("surface", "terrain"):
-            words.append(f"--stage.{model}.filename={tmp_path / f'{model}{point_format}.tif'}")
+        rasters = {kind: tmp_path / f"{kind}{point_format}.tif" for kind in ("surface", "terrain")}
+        more = {f"{kind}.filename": path for kind, path in rasters.items()}
         if program == "pdal":
-            command = [pdal_program, "pipeline", FOLDER / "terrain-and-surface.json", *words]
-            subprocess.run(command, check=True, capture_output=True)
+            command = [pdal_program, "pipeline", FOLDER / "terrain-and-surface.json"]
+            subprocess.run([*command, *words(source, more=more)], check=True, capture_output=True)
         else:
-            run("terrain-and-surface", *words)
-        made += [raster(tmp_path / f"{kind}{point_format}.tif") for kind in ("surface", "terrain")]
+            run("terrain-and-surface", source, more=more)
+        made += map(raster, rasters.values())
     for old, new in zip(made[:2], made[2:], strict=True):
         assert len(old) in range(39**2, 42**2) and np.array_equal(old, new)
         assert np.abs(old[old != -9999]).max() < 1
@@ -239,9 +199,8 @@ def test_rasters_of_points_with_flags(tmp_path, write_las, pdal_program, program
 def test_flags_stay_as_the_docs_say(tmp_path, write_las, ready_models, name):
     source = flagged(write_las, tmp_path / "in.las", 1)
     model = ready_models / ("smrf.model" if "smrf" in name else "classes.model")
-    words = [f"--stage.input.filename={source}", f"--stage.classifier.model={model}"]
-    words += [f"--stage.output.{k}={v}" for k, v in (("minor_version", 4), ("dataformat_id", 6))]
-    run(name, *words, f"--stage.output.filename={tmp_path / 'o.las'}")
+    las_14 = {"output.minor_version": 4, "output.dataformat_id": 6}
+    run(name, source, tmp_path / "o.las", model, more=las_14)
     before, after = laspy.read(source), laspy.read(tmp_path / "o.las")
     for flag in ("key_point", "synthetic", "withheld"):
         assert np.array_equal(before[flag], after[flag]), flag

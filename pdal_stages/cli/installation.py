@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import textwrap
-from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -30,10 +29,9 @@ def add_commands(parser: Parser) -> None:
     add("stage", help="One of ours or PDAL's, e.g. filters.hag_minima")
     add("--showjson", action="store_true", help="As JSON Schema")
 
-    what = "List commands with their arguments"
+    what = "List commands, stages, models and classes as JSON, for programs that build dialogs"
     add = parser.command("commands", partial(_commands, parser), what)
-    details = "As JSON, with stages, models and classes, for programs that build dialogs"
-    add("--showjson", action="store_true", help=details)
+    add("--showjson", action="store_true", help="Accepted as that of drivers and options")
 
     parser.command("doctor", _doctor, "Check what is installed, and say how to get what is missing")
 
@@ -107,16 +105,8 @@ def _options(options: argparse.Namespace) -> None:
         print(text)
 
 
-def _commands(parser: Parser, options: argparse.Namespace) -> None:
-    if options.showjson:
-        print(_dialogs(parser.commands))
-        return
-    for name, command in parser.commands.items():
-        print(f"{name:12s} {command.description}")
-
-
-def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
-    """Return commands, stages, models and classes as JSON, for programs that build dialogs.
+def _commands(main_parser: Parser, options: argparse.Namespace) -> None:
+    """Print commands, stages, models and classes as JSON, for programs that build dialogs.
 
     The plugin for QGIS is one of them.
 
@@ -142,13 +132,13 @@ def _dialogs(commands: Mapping[str, argparse.ArgumentParser]) -> str:
         "version": __version__,
         "models": list(shipped()),
         "classes": {str(c): {"name": name, "color": class_color(c)} for c, name in NAMES.items()},
-        "commands": {name: describe_command(parser) for name, parser in commands.items()},
+        "commands": {n: describe_command(parser) for n, parser in main_parser.commands.items()},
         "stages": {
             name: {"help": stage.summary, "options": [*map(describe_option, stage.all_options())]}
             for name, stage in stage_types().items()
         },
     }
-    return json.dumps(content, indent=1)
+    print(json.dumps(content, indent=1))
 
 
 def _argument(action: argparse.Action) -> dict[str, Any]:

@@ -120,15 +120,6 @@ def writer_of(target: str) -> dict[str, Any]:
     return stage
 
 
-def stages_of(thing: Any) -> list[dict[str, Any]] | None:
-    """Return the stages of an object of python-pdal; None where it is not one."""
-    pdal = bindings()
-    stages = thing.stages if isinstance(thing, pdal.Pipeline) else [thing]
-    if not all(isinstance(stage, pdal.pipeline.Stage) for stage in stages):
-        return None
-    return [{"type": stage.type, **stage.options} for stage in stages]
-
-
 def with_types(
     stages: Sequence[Any], where: Callable[[int], str] | None = None
 ) -> list[dict[str, Any]]:
@@ -149,15 +140,11 @@ def with_types(
             plain = "".join(c if c.isascii() else "_" for c in name)  # that no locale refuses
             stage["type"] = str(getattr(libpdalpython, f"infer_{kind}_driver")(plain))
             if not name or not stage["type"]:
-                raise PipelineError(
-                    f"PDAL has no {kind} for a file of this name"
-                    if name
-                    else "a stage has neither a type nor the name of a file",
-                    where=where(number) if where else None,
-                    found=name,
-                    cure="Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "
-                    f'"{kind}s.las"',
-                )
+                what = f"PDAL has no {kind} for a file of this name"
+                what = what if name else "a stage has neither a type nor the name of a file"
+                cure = "Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "
+                place = where(number) if where else None
+                raise PipelineError(what, where=place, found=name, cure=f'{cure}"{kind}s.las"')
         out.append(stage)
     return out
 
@@ -255,12 +242,9 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         keep_alive(stdout)
         read = readers_files(stages, las=True)
         if read and _CUT_POINTS.search(str(error)):
-            raise PipelineError(
-                "the LAS file is damaged: its points cannot be decoded",
-                where=read[0] if len(read) == 1 else "one of " + ", ".join(read),
-                found=str(error).strip(),
-                cure=DAMAGED,
-            ) from None
+            what, files = "the LAS file is damaged: its points cannot be decoded", ", ".join(read)
+            where = f"one of {files}" if len(read) > 1 else files
+            raise PipelineError(what, where=where, found=str(error).strip(), cure=DAMAGED) from None
         raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
     except MemoryError:
         cure = "Work in tiles (--tile), or read less, e.g. with filters.crop"
@@ -434,12 +418,10 @@ def for_this_version(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
             stage = {"measure_dim": "Z", **stage}
         elif kind == "readers.copc":
             if beyond := [name for name in stage if name in _COPC_OPTIONS]:
-                raise PipelineError(
-                    f"PDAL {dotted_version()} reads COPC files whole, without {', '.join(beyond)}",
-                    where="readers.copc",
-                    found=str(stage.get("filename", "")),
-                    cure="Use PDAL 2.4 or later, or filters.crop after the reader",
-                )
+                what = f"PDAL {dotted_version()} reads COPC files whole, not by {beyond[0]}"
+                cure = "Use PDAL 2.4 or later, or filters.crop after the reader"
+                name = str(stage.get("filename", ""))
+                raise PipelineError(what, where="readers.copc", found=name, cure=cure)
             stage = {k: v for k, v in stage.items() if k not in _COPC_TUNING}
             stage["type"] = "readers.las"
         else:

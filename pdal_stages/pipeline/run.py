@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -165,19 +165,6 @@ class Pipeline:
         files += [name for ours in self.expanded.ours for name in stage_files(ours.stage)]
         return [*files, *filter(None, [self.source.name])]
 
-    def __or__(self, other: Any) -> Pipeline:
-        """Return the pipeline with more stages: of another one, or of python-pdal's objects."""
-        stages = other.source.stages if isinstance(other, Pipeline) else pdal_env.stages_of(other)
-        if stages is None:
-            return NotImplemented
-        lines = [*self.source.lines, *(0 for _ in stages)]
-        return Pipeline(PipelineSource([*self.source.stages, *stages], lines, self.source.name))
-
-    def __ror__(self, other: Any) -> Pipeline:
-        """Return the pipeline with stages before it: ours; PDAL's own raise before they ask."""
-        stages = pdal_env.stages_of(other)
-        return NotImplemented if stages is None else Pipeline(stages) | self
-
     def execute(self, *, arrays: bool = True, loglevel: int = logging.WARNING) -> int:
         """Run the pipeline in this process; return the number of points that came out.
 
@@ -204,8 +191,10 @@ class Pipeline:
             if isinstance(failure, InterruptedStage):
                 raise KeyboardInterrupt from None
             raise failure or self._located(error) from None
-        metadata = _named_metadata(result.metadata, self.expanded)
-        self.metadata = _with_final_names(metadata, final_names)
+        text = json.dumps(result.metadata)
+        for name, final in final_names.items():
+            text = text.replace(json.dumps(name), json.dumps(final))
+        self.metadata = _named_metadata(json.loads(text), self.expanded)
         self.arrays, self.log_lines = result.arrays, pdal_env.log_lines(result.log)
         return result.count
 
@@ -321,12 +310,3 @@ def _named_metadata(metadata: dict[str, Any], expanded: Expanded) -> dict[str, A
 
 def _as_list(node: Any) -> list[Any]:
     return node if isinstance(node, list) else [node]
-
-
-def _with_final_names(node: Any, names: Mapping[str, str]) -> Any:
-    """Return metadata with the final names of files."""
-    if isinstance(node, dict):
-        return {key: _with_final_names(value, names) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_with_final_names(value, names) for value in node]
-    return names.get(node, node) if isinstance(node, str) else node

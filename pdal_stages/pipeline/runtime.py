@@ -49,6 +49,14 @@ class ExpandedStage:
         """Put facts into the context of the runs to come."""
         self.context = replace(self.context, **facts)
 
+    def function(
+        self, module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
+    ) -> None:
+        """Run the stage on one view; its report is kept, and becomes PDAL's metadata."""
+        report = run_on_view(self.stage, self.context, module, ins, outs)
+        module["out_metadata"] = node(self.stage.type, leaves(report))
+        self.reports.append(report)
+
 
 #: Gets the script's globals, the dimensions, and a dict for those to write back.
 Function = Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None]
@@ -116,7 +124,7 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         # Only the last may give memory of PDAL's arrays back, which it does with those of a dict.
         seen = {**ins, **outs} if arguments is several[-1] else ChainMap(outs, cast(dict, ins))
         try:
-            _run_interruptible(arguments, label, module, seen, outs)
+            _run_interruptible(arguments, module, seen, outs)
         except BaseException as error:
             where = place(arguments.get("stage", "filters.python"), arguments.get("tag"))
             failure = as_stage_error(error, where)
@@ -134,30 +142,23 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
 @pdal_env.interruptible
 def _run_interruptible(
     arguments: Mapping[str, Any],
-    label: str,
     module: dict[str, Any],
     ins: Mapping[str, Any],
     outs: dict[str, Any],
 ) -> None:
     """Run a stage or a function on one view; any exception may come out, Ctrl-C too."""
     pdal_env.check_interrupt()
-    held = BY_LABEL.get(label)
-    if isinstance(held, Callback):
-        held.function(module, ins, outs)
-        return
-    stage, context = (held.stage, held.context) if held else _from_arguments(arguments)
-    report = run_on_view(stage, context, module, ins, outs)
-    module["out_metadata"] = node(arguments["stage"], leaves(report))
-    if held:
-        held.reports.append(report)
+    held = BY_LABEL.get(str(arguments.get("label", "")))
+    (held or _from_arguments(arguments)).function(module, ins, outs)
 
 
-def _from_arguments(arguments: Mapping[str, Any]) -> tuple[Stage, StageContext]:
+def _from_arguments(arguments: Mapping[str, Any]) -> ExpandedStage:
     """Return the stage of a pipeline that another process expanded."""
     named = {"type": arguments["stage"], "tag": arguments.get("tag")}
-    stage = stage_from({**arguments.get("options", {}), **named})
+    as_written = {**arguments.get("options", {}), **named}
+    stage = stage_from(as_written).after(arguments.get("preparation", ()))
     context = StageContext(arguments.get("created_before", False))
-    return stage.after(arguments.get("preparation", ())), context
+    return ExpandedStage(stage, 0, 0, as_written, {}, context)
 
 
 def points_of(

@@ -136,10 +136,9 @@ class WorkerProcesses(AbstractContextManager):
                 try:
                     pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
                 except OSError as error:
+                    what = "worker processes cannot be started"
                     cure = "Make /dev/shm writable, or do without them: --workers 0"
-                    raise StageError(
-                        "worker processes cannot be started", found=error, cure=cure
-                    ) from None
+                    raise StageError(what, found=error, cure=cure) from None
                 future = pool.submit(perform_task, task)
         self._busy[future] = pool
         return future
@@ -189,11 +188,9 @@ def _environment(threads: int) -> Iterator[None]:
     not imported in it, so a script needs no ``if __name__ == "__main__"``.
     """
     names = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES]
-    wanted = dict.fromkeys(names, str(threads)) | {
-        "PDAL_STAGES_PROGRESS": "0",
-        "PYTHONSAFEPATH": "1",
-    }
-    before = {name: os.environ.get(name) for name in wanted}
+    wanted = dict.fromkeys(names, str(threads))
+    wanted |= {"PDAL_STAGES_PROGRESS": "0", "PYTHONSAFEPATH": "1"}
+    before = {name: os.environ[name] for name in wanted if name in os.environ}
     program = sys.modules["__main__"]
     os.environ.update(wanted)
     sys.modules["__main__"] = types.ModuleType("__main__")
@@ -203,10 +200,9 @@ def _environment(threads: int) -> Iterator[None]:
         yield
     finally:
         sys.modules["__main__"] = program
-        for name, value in before.items():
+        for name in wanted:
             os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
+        os.environ.update(before)
         with suppress(AttributeError):
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
