@@ -70,7 +70,7 @@ def ours(neighborhoods: str, feature_set: str, threads: int) -> Work:
 
     def run(xyz: np.ndarray) -> None:
         dimensions = {name: np.zeros(len(xyz), np.float32) for name in plan.dimensions}
-        for _ in FeatureEngine(xyz, plan, threads=threads).blocks(dimensions=dimensions):
+        for _ in FeatureEngine(xyz, plan, threads=threads).run(dimensions=dimensions).computed():
             pass
 
     return run

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pdal_stages.features import compute_features
 from pdal_stages.features.adaptive import curvature_threshold, radii_of
 from pdal_stages.features.engine import FeatureEngine
-from pdal_stages.features.moments import RADIUS, SX, SZ, SZZ, N
+from pdal_stages.features.moments import M
 from pdal_stages.features.nearest_neighbors import build_tree
 from pdal_stages.features.plan import FeaturePlan
 from pdal_stages.features.point_grid import build_grid
@@ -103,8 +103,10 @@ def check_nearest(xyz, queries, need, cap=math.inf):
         sums = np.zeros(3)
         for row in offsets:
             sums += row  # one after the other, as they come
-        assert (table[N, i], table[RADIUS, i]) == (n, distance[n - 1] if n else 0.0), f"query {i}"
-        assert np.array_equal(table[SX : SZ + 1, i], sums)
+        assert (table[M.N, i], table[M.RADIUS, i]) == (n, distance[n - 1] if n else 0.0), (
+            f"query {i}"
+        )
+        assert np.array_equal(table[M.SX : M.SZ + 1, i], sums)
 
 
 # ---- the tree ----------------------------------------------------------------------------------------------
@@ -124,12 +126,6 @@ def test_tree_boxes_hold_their_points(cloud):
             visit(2 * node + 2, mid, hi, depth - 1)
 
     visit(0, 0, len(tree.x), tree.depth)
-
-
-def test_a_tree_built_by_threads_is_the_same():
-    xyz = scattered(120_000, 12, (300, 300, 10))
-    one, pieces = build_tree(*columns(xyz), 1), build_tree(*columns(xyz), 4)
-    assert np.array_equal(one.perm, pieces.perm) and np.array_equal(one.boxes, pieces.boxes)
 
 
 def test_no_tree_over_nothing():
@@ -174,7 +170,7 @@ def test_copies_a_dense_facade_and_a_dense_ball_are_not_quadratic():
     facade = np.c_[np.full(30_000, 3.0), rng.uniform(0, 0.5, 30_000), rng.uniform(0, 30, 30_000)]
     ball = rng.normal(50, 1e-4, (30_000, 3))
     xyz = np.vstack([facade, ball, np.tile([100.0, 200.0, 5.0], (200_000, 1))])
-    radius = choose(xyz, xyz[:60_001], "k20")[RADIUS]
+    radius = choose(xyz, xyz[:60_001], "k20")[M.RADIUS]
     assert radius[-1] == 0
     for i in range(0, 60_000, 7001):
         assert radius[i] == pytest.approx(oracle.by_distance(xyz, xyz[i])[1][20], rel=1e-12)
@@ -190,7 +186,7 @@ def test_kopt_is_the_oracle_s(cloud):
     table = choose(xyz, queries, "kopt")
     for i, q in enumerate(queries):
         members, r, entropies = oracle.kopt(xyz, q)
-        n = int(table[N, i])
+        n = int(table[M.N, i])
         least = min(11, len(xyz))
         got = entropies[n - least]
         if math.isinf(got):  # no candidate at all: the largest is taken
@@ -198,7 +194,7 @@ def test_kopt_is_the_oracle_s(cloud):
         # The same, unless the two differ by rounding only.
         assert n == len(members) or abs(got - entropies[len(members) - least]) < 2e-9, f"query {i}"
         if n == len(members):
-            assert table[RADIUS, i] == r
+            assert table[M.RADIUS, i] == r
 
 
 def test_other_ranges_and_a_cap():
@@ -208,7 +204,7 @@ def test_other_ranges_and_a_cap():
         table = choose(xyz, queries, f"kopt({k_min},{k_max})", cap=cap)
         for i, q in enumerate(queries):
             members, r, _ = oracle.kopt(xyz, q, k_min, k_max, cap)
-            assert (table[N, i], table[RADIUS, i]) == (len(members), r)
+            assert (table[M.N, i], table[M.RADIUS, i]) == (len(members), r)
 
 
 def test_features_of_kopt_and_k():
@@ -282,9 +278,9 @@ def test_ropt_is_the_oracle_s(cloud):
         table = choose(xyz, queries, token, least)
         for i, q in enumerate(queries):
             r, entropies = oracle_ropt(xyz, q, radii, least)
-            assert table[N, i] == len(oracle.sphere(xyz, q, table[RADIUS, i]))
-            mine = entropies[list(radii).index(table[RADIUS, i])]
-            assert table[RADIUS, i] == r or abs(mine - min(entropies)) < 2e-9, f"query {i}"
+            assert table[M.N, i] == len(oracle.sphere(xyz, q, table[M.RADIUS, i]))
+            mine = entropies[list(radii).index(table[M.RADIUS, i])]
+            assert table[M.RADIUS, i] == r or abs(mine - min(entropies)) < 2e-9, f"query {i}"
 
 
 def dimensionality(members):
@@ -301,14 +297,14 @@ def test_rdim_has_the_lowest_entropy_of_dimensionality():
     for xyz in CLOUDS.values():
         queries = some(xyz, 25)
         table, by_eigenentropy = choose(xyz, queries, "rdim", 10), choose(xyz, queries, "ropt", 10)
-        other += np.count_nonzero(table[RADIUS] != by_eigenentropy[RADIUS])
+        other += np.count_nonzero(table[M.RADIUS] != by_eigenentropy[M.RADIUS])
         for i, q in enumerate(queries):
             spheres = [oracle.sphere(xyz, q, radius) for radius in radii]
             entropies = [
                 dimensionality(one) if len(one) >= 10 and np.ptp(one, axis=0).max() > 0 else np.inf
                 for one in spheres
             ]
-            chosen = list(radii).index(table[RADIUS, i])
+            chosen = list(radii).index(table[M.RADIUS, i])
             if np.isinf(entropies).all():
                 assert chosen == len(radii) - 1
             else:
@@ -319,12 +315,7 @@ def test_rdim_has_the_lowest_entropy_of_dimensionality():
 def test_members_at_exactly_a_radius_are_inside():
     xyz = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3], [0, 0, -0.3]])
     table = choose(xyz, xyz[:1], "ropt", 3)
-    assert (table[RADIUS, 0], table[N, 0], table[SZZ, 0]) == (0.3, 5, pytest.approx(0.18))
-
-
-def test_radii():
-    assert radii_of(0.25, 2.0, 0.05).shape == (36,) and radii_of(0.25, 2.0, 0.05)[-1] == 2.0
-    assert radii_of(1.0, 1.0, 0.5).tolist() == [1.0]
+    assert (table[M.RADIUS, 0], table[M.N, 0], table[M.SZZ, 0]) == (0.3, 5, pytest.approx(0.18))
 
 
 # ---- copt --------------------------------------------------------------------------------------------------
@@ -418,6 +409,6 @@ def test_real_clouds(data_dir, file):
     for i, q in enumerate(queries):
         points, distance = oracle.by_distance(xyz, q)
         members, _, entropies = oracle.kopt(points[:101], q)
-        n = int(table[N, i])
+        n = int(table[M.N, i])
         assert n == len(members) or abs(entropies[n - 11] - entropies[len(members) - 11]) < 2e-9
-        assert table[RADIUS, i] == distance[n - 1]
+        assert table[M.RADIUS, i] == distance[n - 1]

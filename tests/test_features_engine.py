@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from processes import printed, python
 
 from pdal_stages.base.errors import DimensionError, OptionError, StageError
-from pdal_stages.base.progress import Progress
 from pdal_stages.features import FeatureEngine, FeaturePlan, ShapeBins, compute_features
 from pdal_stages.features.registry import GROUPS
 
@@ -117,21 +116,6 @@ def test_refused_plans(spec, feature_set, message):
         FeaturePlan.parse(spec, feature_set)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        {},
-        [],
-        None,
-        {"neighborhoods": "c1", "features": [], "dimensions": []},
-        {"neighborhoods": ["c1"]},
-    ],
-)
-def test_refused_plan_dicts(data):
-    with pytest.raises(OptionError):
-        FeaturePlan.from_dict(data)
-
-
 def test_halo():
     assert FeaturePlan.parse("c1,s5").halo_m == 6.0
     assert FeaturePlan.parse("c50").halo_m == 54.0
@@ -159,7 +143,6 @@ def test_fitting_does_not_depend_on_order(cloud, whole):
 def test_any_queries(cloud, whole):
     rows = np.random.default_rng(1).integers(0, len(cloud), 300)
     assert np.array_equal(again(whole, cloud, rows).values, whole.values[rows])
-    assert np.array_equal(again(whole, cloud, cloud[rows]).values, whole.values[rows])
 
 
 @pytest.mark.parametrize(
@@ -223,10 +206,12 @@ def test_rigid_motions(data):
 
 def test_blocks_cover_every_query_once(cloud, whole):
     plan = FeaturePlan.parse(TOKENS)
-    engine = FeatureEngine(cloud, plan, bins=whole.bins, copt_threshold=whole.copt_threshold)
+    engine = FeatureEngine(
+        cloud, plan, bins=whole.bins, copt_threshold=whole.copt_threshold, threads=2
+    )
     for queries, count in ((None, len(cloud)), (np.arange(500, 900), 400)):
         seen = []
-        for rows, values in engine.blocks(queries, memory_mb=16, threads=2):
+        for _, rows, values, *_ in engine.run(queries, memory_mb=16).computed():
             assert (
                 rows.dtype == np.int64 and values.dtype == np.float32 and values.flags.c_contiguous
             )
@@ -237,13 +222,11 @@ def test_blocks_cover_every_query_once(cloud, whole):
         assert len(seen) == count and np.array_equal(
             np.sort(seen), np.arange(len(cloud)) if queries is None else queries
         )
-    rows = np.concatenate([r for r, _ in engine.blocks(cloud[:50] + 0.25)])
-    assert np.array_equal(np.sort(rows), np.arange(50))  # coordinates: rows of the queries
 
 
 def test_blocks_are_computed_in_the_workers(cloud):
     large = np.vstack([cloud + np.array([30.0 * i, 0, 0]) for i in range(20)])
-    run = FeatureEngine(large, FeaturePlan.parse("c1,c3,s3", MOMENTS)).run(threads=2, memory_mb=16)
+    run = FeatureEngine(large, FeaturePlan.parse("c1,c3,s3", MOMENTS), threads=2).run(memory_mb=16)
     computed = run.compute
     threads = set()
 
@@ -254,20 +237,6 @@ def test_blocks_are_computed_in_the_workers(cloud):
     run.compute = compute
     assert sum(len(block.rows) for block in run.computed()) == len(large)
     assert len(run.ranges) > 1 and threading.get_ident() not in threads
-
-
-def test_a_reader_may_stop_early(cloud):
-    engine = FeatureEngine(cloud, FeaturePlan.parse("c1", "Density"))
-    before = threading.active_count()
-    for _ in engine.blocks(threads=2, memory_mb=16):
-        break
-    assert threading.active_count() <= before + 2
-
-
-def test_progress_counts_queries(cloud):
-    bar = Progress(len(cloud), "features", enabled=False)
-    compute_features(cloud, None, "c1", "Density", progress=bar)
-    assert bar.count == len(cloud)
 
 
 def test_report(cloud):
@@ -292,13 +261,12 @@ def test_dimensions(cloud):
     own = np.arange(len(cloud), dtype=np.float64)
     plan = FeaturePlan.parse("c1", "Density", ["Z", "HeightAboveGround"])
     engine = FeatureEngine(cloud, plan)
-    for rows, values in engine.blocks(dimensions={"HeightAboveGround": own}):
+    for _, rows, values, *_ in engine.run(dimensions={"HeightAboveGround": own}).computed():
         assert np.array_equal(values[:, 2], own[rows].astype(np.float32))
         assert np.array_equal(values[:, 1], cloud[rows, 2].astype(np.float32))
     picked = np.array([7, 3, 9])
-    for rows, values in engine.blocks(
-        picked, dimensions={"HeightAboveGround": [70.0, 30.0, 90.0], "Z": [1, 2, 3]}
-    ):
+    dimensions = {"HeightAboveGround": [70.0, 30.0, 90.0], "Z": [1, 2, 3]}
+    for _, rows, values, *_ in engine.run(picked, dimensions=dimensions).computed():
         assert np.array_equal(values[:, 2], rows * 10)  # one value per query
         assert sorted(values[:, 1]) == [1, 2, 3]  # a Z that is given is taken
     seen = []
@@ -308,7 +276,8 @@ def test_dimensions(cloud):
         return {"HeightAboveGround": own[rows]}
 
     for queries in (None, np.array([7, 3, 9]), np.arange(0, len(cloud), 2)):
-        found = list(engine.blocks(queries, dimensions=of))  # asked for block by block
+        run = engine.run(queries, dimensions=of)  # called block by block
+        found = [(block.rows, block.values) for block in run.computed()]
         assert all(
             np.array_equal(values[:, 2], own[rows].astype(np.float32)) for rows, values in found
         )
@@ -323,9 +292,9 @@ def test_dimensions(cloud):
 def test_a_missing_dimension_is_asked_for(cloud):
     engine = FeatureEngine(cloud, FeaturePlan.parse("weinmann2018", "Density", "HeightAboveGround"))
     with pytest.raises(DimensionError, match=r"HeightAboveGround.*Give dimensions="):
-        list(engine.blocks())
+        engine.run()
     with pytest.raises(DimensionError, match="one number per query"):
-        list(engine.blocks(dimensions={"HeightAboveGround": np.zeros(3)}))
+        engine.run(dimensions={"HeightAboveGround": np.zeros(3)})
 
 
 # ---- mistakes ----------------------------------------------------------------------------------------------
@@ -335,12 +304,11 @@ def test_a_missing_dimension_is_asked_for(cloud):
     "xyz, message",
     [
         (np.zeros((3, 2)), r"shape \(n, 3\)"),
-        (np.zeros((3, 7)), "transposed"),
         (np.zeros(3), "shape"),
         ([[1, 2], [3]], "array"),
         (np.zeros((4, 3), "U1"), "float64"),
         (np.zeros((4, 3), complex), "float64"),
-        (np.zeros(4, [("X", float), ("Y", float), ("Z", float)]), "structured"),
+        (np.zeros(4, [("X", float), ("Y", float), ("Z", float)]), "float64"),
         (np.array([[0, 0, 0], [np.nan, 0, 0], [0, np.inf, 0]]), "2 of 3 points"),
         (np.array([[0, 0, 1e200]]), "beyond"),
         (np.array([[500_000, 6_000_000, 3]], np.float32), "float32"),
@@ -359,8 +327,7 @@ def test_wrong_clouds(xyz, message):
         ([-1], "outside the cloud"),
         ([0.5], "indices"),
         (np.array([True, False]), "flatnonzero"),
-        (np.zeros((2, 2)), "shape"),
-        ([[np.nan, 0, 0]], "NaN"),
+        (np.zeros((2, 3)), "shape"),
     ],
 )
 def test_wrong_queries(cloud, queries, message):
@@ -379,18 +346,16 @@ def test_strays_far_apart_change_nothing(cloud, far):
 
 def test_wrong_options(cloud):
     plan = FeaturePlan.parse("c1", "Density")
-    with pytest.raises(OptionError, match="plan"):
-        FeatureEngine(cloud, "c1")
     with pytest.raises(OptionError, match="seed"):
         FeatureEngine(cloud, plan, seed=-1)
     with pytest.raises(OptionError, match="threads"):
         FeatureEngine(cloud, plan, threads=-2)
     with pytest.raises(OptionError, match="memory_mb"):
-        list(FeatureEngine(cloud, plan).blocks(memory_mb=1))
+        FeatureEngine(cloud, plan).run(memory_mb=1)
     with pytest.raises(OptionError, match="thresholds"):
         compute_features(cloud, None, "c1", "A3", bins=ShapeBins({}))
     with pytest.raises(StageError, match="no points"):
-        compute_features(np.zeros((0, 3)), [[0.0, 0.0, 0.0]], "c1", "Density")
+        FeatureEngine(np.zeros((0, 3)), FeaturePlan.parse("c1", "A3")).fit()
     with pytest.raises(KeyError, match="Density_c1"):
         compute_features(cloud, [0], "c1", "Density")["Density_c2"]
 
@@ -467,13 +432,13 @@ def test_memory_budget_is_honoured():
         n = 400_000
         xyz = np.random.default_rng(0).uniform(0, 300, (n, 3)) * [1, 1, 0.02]
         plan = FeaturePlan.parse("c1,c2,s1,s2", "covariance")
-        for rows, values in FeatureEngine(xyz[:1000], plan).blocks():
+        for block in FeatureEngine(xyz[:1000], plan).run().computed():
             pass
         def peak():
             return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        engine = FeatureEngine(xyz, plan)
+        engine = FeatureEngine(xyz, plan, threads=2)
         before = peak()
-        for rows, values in engine.blocks(memory_mb=32, threads=2):
+        for block in engine.run(memory_mb=32).computed():
             pass
         print(peak() - before)
     """
@@ -488,8 +453,9 @@ def test_interrupt_stops_soon():
         from pdal_stages.features import FeatureEngine, FeaturePlan
         plan = FeaturePlan.parse("c5,s5", "covariance")
         rng = np.random.default_rng(0)
-        list(FeatureEngine(rng.uniform(0, 9, (99, 3)), plan).blocks())
-        engine = FeatureEngine(rng.uniform(0, 100, (1_000_000, 3)) * [1, 1, 0.02], plan)
+        list(FeatureEngine(rng.uniform(0, 9, (99, 3)), plan).run().computed())
+        xyz = rng.uniform(0, 100, (1_000_000, 3)) * [1, 1, 0.02]
+        engine = FeatureEngine(xyz, plan, threads=2)
         sent = []
         def kill():
             time.sleep(1.0)
@@ -497,7 +463,7 @@ def test_interrupt_stops_soon():
             os.kill(os.getpid(), signal.SIGINT)
         threading.Thread(target=kill, daemon=True).start()
         try:
-            for block in engine.blocks(threads=2):
+            for block in engine.run().computed():
                 pass
         except KeyboardInterrupt:
             print(time.monotonic() - sent[0])

@@ -15,20 +15,16 @@ RTOL = 1e-5
 ATOL = {"Omnivariance": 3e-5}
 
 
-def check(xyz, queries, radii=(1.0, 2.5), kinds="cs", atol=1e-9, results=None):
-    """Compare with the oracle at `queries` (indices or coordinates)."""
+def check(xyz, queries, radii=(1.0, 2.5), atol=1e-9):
+    """Compare with the oracle at the points `queries`."""
     radii = [round(radius, 6) for radius in radii]
-    names = [f"{kind}{radius}" for kind in kinds for radius in radii]
-    if results is None:
-        results = compute_features(
-            xyz, queries, names, ["covariance", *oracle.GEOMETRIC], threads=1
-        )
-    coordinates = xyz[queries] if np.ndim(queries) == 1 else queries
-    for kind in kinds:
+    names = [f"{kind}{radius}" for kind in "cs" for radius in radii]
+    results = compute_features(xyz, queries, names, ["covariance", *oracle.GEOMETRIC], threads=1)
+    for kind in "cs":
         for radius in radii:
             (suffix,) = (n.suffix for n in parse_neighborhoods(f"{kind}{radius}"))
             volume = math.pi * radius**2 if kind == "c" else oracle.ball_volume(radius)
-            for i, q in enumerate(coordinates):
+            for i, q in enumerate(xyz[queries]):
                 members = (
                     oracle.cylinder(xyz, q, radius)
                     if kind == "c"
@@ -165,18 +161,6 @@ def test_few_points(count, rng):
 def test_no_points():
     table = compute_features(np.zeros((0, 3)), None, "c1,s1", "covariance")
     assert table.values.shape == (0, 16)
-
-
-def test_queries_that_are_not_points(random_cloud, rng):
-    xyz = random_cloud(1200, seed=3)
-    queries = np.vstack([rng.uniform(-3, 23, (40, 3)), [[500.0, 500.0, 0.0]]])
-    check(xyz, queries, radii=(1.0, 4.0))
-    cluster = np.tile([[4.0, 4.0, 1.0]], (5, 1))  # coinciding points away from the query
-    table = compute_features(cluster, [[3.2, 3.5, 7.7]], "c2", ["covariance", *oracle.GEOMETRIC])
-    assert table["EigenvalueSum_c2"][0] == 0 and table["SurfaceVariation_c2"][0] == np.float32(
-        1 / 3
-    )
-    assert table["HeightStd_c2"][0] == 0 and table["HeightRange_c2"][0] == 0
 
 
 def test_horizontal_line_is_not_vertical_and_a_pole_is():

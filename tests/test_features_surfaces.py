@@ -5,7 +5,7 @@ import oracle
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_features_adaptive import CLOUDS, some, town
+from test_features_adaptive import CLOUDS, town
 
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import OptionError
@@ -16,15 +16,12 @@ from pdal_stages.features.registry import SURFACE_FEATURES
 TOKENS = "k3,k20"
 
 
-def test_names_are_the_oracle_s():
-    assert SURFACE_FEATURES == oracle.SURFACES
-
-
 @pytest.mark.parametrize("cloud", CLOUDS)
 def test_surfaces_are_the_oracle_s(cloud):
     xyz = CLOUDS[cloud]
-    queries = some(xyz, 15)
-    got = compute_features(xyz, queries, TOKENS, "surfaces")
+    rows = np.unique(np.linspace(0, len(xyz) - 1, 15).astype(int))
+    queries = xyz[rows]
+    got = compute_features(xyz, rows, TOKENS, "surfaces")
     assert np.isfinite(got.values).all()
     for i, q in enumerate(queries):
         for k in (3, 20):
@@ -37,17 +34,6 @@ def test_surfaces_are_the_oracle_s(cloud):
                     k,
                     i,
                 )
-
-
-def test_queries_that_are_no_points_of_the_cloud():
-    xyz = CLOUDS["town"]
-    queries = np.vstack([some(xyz, 30) + 0.07, [[200.0, 0.0, 0.0]]])
-    got = compute_features(xyz, queries, "k3", "surfaces")
-    for i, q in enumerate(queries):
-        expected, gap = oracle.surfaces(xyz, q, 3)
-        assert gap < 1e-5 or got.values[i] == pytest.approx(
-            list(expected.values()), rel=1e-4, abs=2e-5
-        )
 
 
 @settings(max_examples=25, deadline=None)
@@ -123,10 +109,8 @@ def test_any_order_threads_blocks_and_queries():
     )
     assert other.values.tobytes() == whole.values[order].tobytes()
     rows = order[:300]
-    for queries in (rows, xyz[rows]):
-        assert np.array_equal(
-            compute_features(xyz, queries, TOKENS, "surfaces,Linearity").values, whole.values[rows]
-        )
+    part = compute_features(xyz, rows, TOKENS, "surfaces,Linearity")
+    assert np.array_equal(part.values, whole.values[rows])
 
 
 def test_beside_other_features():

@@ -286,7 +286,6 @@ GOOD = {name: list(np.linspace(0.1, 3.0, 9)) for name in METRIC_NAMES}
     [
         [1, 2],
         {"c1": [1, 2]},
-        {"c1": {**GOOD, "D5": GOOD["D1"]}},
         {"c1": {k: v for k, v in GOOD.items() if k != "D1"}},
         {"c1": {**GOOD, "D1": "abcdefghi"}},
         {"c1": {**GOOD, "D1": [float("nan")] * 9}},

@@ -101,7 +101,6 @@ class CloudFeatures:
         return self._engine.run(
             rows,
             dimensions=self._take,
-            threads=request.threads,
             memory_mb=max(request.memory_mb * memory_share, 16.0),
         )
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..base.jit import device, njit
 from ..base.threads import map_blocks
-from .moments import COINCIDENT, LEAST_MEMBERS, MOMENTS, RADIUS, REACH, ROWS, SX, SY, SZ, N, finish
+from .moments import COINCIDENT, LEAST_MEMBERS, MOMENTS, M, finish
 from .nearest_neighbors import (
     CROWD,
     FIRST2,
@@ -37,11 +37,11 @@ from .nearest_neighbors import (
     make_near,
     sort_near,
 )
-from .neighbor_surfaces import COLUMNS, FAR, SURFACE, UP, agreement
+from .neighbor_surfaces import COLUMNS, UP, S, agreement
 from .neighborhoods import AROUND, COPT_REACH
 from .plan import Columns, FeaturePlan, columns_of
 from .point_grid import CellGrid
-from .registry import SURFACE_FEATURES
+from .registry import SURFACE_FEATURES, rows_of
 from .scale_selection import (
     add_up,
     eigenvalues_of,
@@ -67,13 +67,10 @@ NOTHING_FITTED = Fitted()
 #: Queries computed at a time for a whole cloud.
 CHUNK = 4096
 
-# Columns of :attr:`Search.choices`.
-FIRST = 0  #: first candidate among radii and ks
-END = 1  #: behind the last one
-MEMBERS = 2  #: members that a candidate needs
-BY_DIMENSIONALITY = (
-    3  #: 1 where the entropy of dimensionality chooses, 0 where the eigenentropy does
-)
+#: Columns of :attr:`Search.choices`: the first candidate among radii and ks, the one behind the last,
+#: the members that a candidate needs, and 1 where the entropy of dimensionality chooses, 0 where the
+#: eigenentropy does.
+CHOICE = rows_of("first", "end", "members", "by_dimensionality")
 
 
 def radii_of(first: float, last: float, step: float) -> np.ndarray:
@@ -120,7 +117,7 @@ class Search(NamedTuple):
     ks: np.ndarray  # (k,) int64: neighbors besides the point itself, ascending
     within2: float  # all points within this squared distance are wanted
     cap2: float  # and of those within this one as many as the last of `ks` says
-    choices: np.ndarray  # (n, 4) int64: see FIRST, END, MEMBERS, BY_DIMENSIONALITY
+    choices: np.ndarray  # (n, 4) int64: columns as in CHOICE
     curved: bool = False  # copt: radii where the point is regular, ks where it is scattered
     least: int = LEAST_MEMBERS  # members that a sphere needs to have a curvature
     threshold: float = math.nan  # curvature from which on a point is scattered
@@ -129,7 +126,7 @@ class Search(NamedTuple):
 class Results(NamedTuple):
     """Arrays that a search fills."""
 
-    table: np.ndarray  # (numbers, ROWS, m) float64: moments of what is chosen
+    table: np.ndarray  # (numbers, len(M), m) float64: moments of what is chosen
     curvature: np.ndarray  # (m,) float64: curvature of the points where the search is curved
     out: np.ndarray  # (m, F) float32: shapes and features of surfaces
 
@@ -137,38 +134,37 @@ class Results(NamedTuple):
 class Surfaces(NamedTuple):
     """Surfaces of the cloud's points, and where features of them go."""
 
-    values: np.ndarray  # (n, SURFACE) float32; n = 0 where none are wanted
+    values: np.ndarray  # (n, S) float32; n = 0 where none are wanted
     columns: np.ndarray  # (neighborhoods, features) int64: columns of the output; -1: not wanted
 
 
 class AdaptiveNeighborhoods(NeighborhoodGroup):
-    """A tree over a grid's cloud, built by `threads`, and the adaptive neighborhoods of a plan.
+    """A tree over a grid's cloud, and the adaptive neighborhoods of a plan.
 
     Prepared once for a grid; the engine calls :meth:`fill` for every block.
     """
 
     def __init__(self, grid: CellGrid, plan: FeaturePlan, threads: int | None = None) -> None:
-        fixed = ("cylinder", "sphere")
-        super().__init__([c for c in plan.layout if c.at and c.neighborhood.kind not in fixed])
+        super().__init__([c for c in plan.layout if c.at and not c.neighborhood.fixed])
         self.grid, self.halo_m = grid, plan.halo_m
         self.surface_columns = columns_of(self.chosen, SURFACE_FEATURES)
         self.searches = _searches(self.chosen, plan.least_members)
-        self.tree = build_tree(grid.x, grid.y, grid.z, threads)
-        self._surfaces = np.zeros((0, SURFACE), np.float32)
+        self.tree = build_tree(grid.x, grid.y, grid.z)
+        self._surfaces = np.zeros((0, len(S)), np.float32)
         if (self.surface_columns >= 0).any():
             self._surfaces = self._make_surfaces(threads)
 
     def _make_surfaces(self, threads: int | None) -> np.ndarray:
-        """Return the surface of every point of the cloud, (n, SURFACE) float32."""
-        surfaces = np.empty((len(self.grid), SURFACE), np.float32)
-        nearest = _by_number({0: (AROUND, AROUND)}, False)
+        """Return the surface of every point of the cloud, (n, S) float32."""
+        surfaces = np.empty((len(self.grid), len(S)), np.float32)
+        nearest = _by_number({0: (AROUND, AROUND)})
 
         def fill_part(part: slice) -> None:
             points, out = self._part(part), surfaces[part]
             (table,) = self.choose(nearest, points)
             few, copies = np.zeros(1, np.int64), np.ones(len(out), np.int64)
             finish(table, 0.0, points[2], few, copies, COLUMNS, out)
-            out[:, FAR] = table[REACH] * UP
+            out[:, S.FAR] = table[M.REACH] * UP
 
         self._for_all(fill_part, threads)
         return surfaces
@@ -225,8 +221,8 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
             table = self.choose(search, points, fitted, shapes, out)
             for k, rows in zip(search.numbers.tolist(), table, strict=True):
                 finish(rows, 0.0, points[2], few[k : k + 1], copies, self.columns[k], out)
-                far[k] += int(copies[rows[REACH] > self.halo_m].sum())
-                reach = max(reach, float(rows[REACH].max(initial=0.0)))
+                far[k] += int(copies[rows[M.REACH] > self.halo_m].sum())
+                reach = max(reach, float(rows[M.REACH].max(initial=0.0)))
         return few, far, reach
 
     def choose(
@@ -239,7 +235,7 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         *,
         curvature: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return moments (numbers, ROWS, m) of what is chosen for points.
+        """Return moments (numbers, len(M), m) of what is chosen for points.
 
         Features of shapes and surfaces go to `out`, curvatures to `curvature`, where given.
         """
@@ -248,25 +244,20 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
             search = search._replace(threshold=float(fitted.copt_threshold))
         if curvature is None:
             curvature = np.empty(m if search.curved else 0)
-        # Surfaces of neighbors are looked at only where features are written, by a search that
-        # finds AROUND of them.
-        looked = out is not None and len(search.numbers) > 0 and search.cap2 == math.inf
-        surfaces = self._surfaces if looked else self._surfaces[:0]
+        # Surfaces of neighbors are looked at only where features are written.
+        surfaces = self._surfaces[:0] if out is None or search.cap2 < math.inf else self._surfaces
         out = np.empty((m, 0), np.float32) if out is None else out
-        results = Results(np.empty((len(search.numbers), ROWS, m)), curvature, out)
+        results = Results(np.empty((len(search.numbers), len(M), m)), curvature, out)
         adaptive_block(
             self.tree, points, search, Surfaces(surfaces, self.surface_columns), shapes, results
         )
         return results.table
 
 
-def _by_number(ranges: dict[int, tuple[int, int]], with_around: bool) -> Search:
-    """Return one search for ranges of numbers of neighbors, by the neighborhood's number.
-
-    With `with_around` it also finds the AROUND nearest points.
-    """
+def _by_number(ranges: dict[int, tuple[int, int]]) -> Search:
+    """Return one search for ranges of numbers of neighbors, by the neighborhood's number."""
     all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
-    ks = np.array(sorted(all_ks | ({AROUND} if with_around else set())), np.int64)
+    ks = np.array(sorted(all_ks), np.int64)
     choices = [
         [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST_MEMBERS, 0]
         for first, last in ranges.values()
@@ -294,8 +285,7 @@ def _searches(chosen: list[Columns], least: int) -> list[Search]:
             ks = np.arange(COPT_K[0], COPT_K[1] + 1)
             search = search._replace(ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
         searches.append(search)
-    with_around = any(name in columns.at for columns in chosen for name in SURFACE_FEATURES)
-    return ([_by_number(ranges, with_around)] if ranges else []) + searches
+    return ([_by_number(ranges)] if ranges else []) + searches
 
 
 # ---- kernels ---------------------------------------------------------------------------------
@@ -306,24 +296,6 @@ class Scratch(NamedTuple):
 
     sums: np.ndarray  # (MOMENTS + 1, candidates) float64
     ends: np.ndarray  # (candidates,) int64: members of each candidate
-    surface: np.ndarray  # (1, SURFACE) float32: the query's own
-    # What ``finish`` takes for one query (a constant's type would have it compiled once more).
-    moments: np.ndarray  # (ROWS, 1) float64
-    ignored: np.ndarray  # (1,) int64
-    columns: np.ndarray
-
-
-@device(_nrt=True)
-def make_scratch(candidates):
-    """Return scratch for so many candidates."""
-    return Scratch(
-        np.empty((MOMENTS + 1, candidates)),
-        np.zeros(candidates, np.int64),
-        np.empty((1, SURFACE), np.float32),
-        np.empty((ROWS, 1)),
-        np.zeros(1, np.int64),
-        COLUMNS.copy(),
-    )
 
 
 @njit
@@ -345,7 +317,8 @@ def adaptive_block(tree, points, search, surfaces, shapes, results):
     qx, qy, qz = points
     queries, need = make_groups(qx, qy, qz), _wanted(tree, search).need
     near = make_near(CROWD * need + ROOM)
-    scratch = make_scratch(len(search.radii) + len(search.ks))
+    candidates = len(search.radii) + len(search.ks)
+    scratch = Scratch(np.empty((MOMENTS + 1, candidates)), np.zeros(candidates, np.int64))
     record = np.empty((0, 4), np.float32)
     done = 0
     while True:
@@ -392,8 +365,6 @@ def _serve_groups(tree, queries, search, surfaces, shapes, results, buffers, don
                     farthest2 = max(farthest2, near.sorted[min(count, need) - 1])
                 if search.curved:
                     results.curvature[q] = _curvature(scratch.sums, search)
-                if len(surfaces.values):
-                    _find_surface(near, count, queries, q, search, surfaces, scratch)
                 for j in range(len(search.numbers)):
                     best = _choose(
                         search, j, results.curvature[q] if search.curved else 0.0, scratch
@@ -402,15 +373,8 @@ def _serve_groups(tree, queries, search, surfaces, shapes, results, buffers, don
                     number, members = search.numbers[j], scratch.ends[best]
                     if len(surfaces.values):
                         columns = surfaces.columns[number]
-                        beyond = agreement(
-                            surfaces.values,
-                            near,
-                            members,
-                            scratch.surface[0],
-                            columns,
-                            results.out[q],
-                        )
-                        results.table[j, REACH, q] = max(results.table[j, REACH, q], beyond)
+                        beyond = agreement(surfaces.values, near, members, columns, results.out[q])
+                        results.table[j, M.REACH, q] = max(results.table[j, M.REACH, q], beyond)
                     if shapes is not None and shapes.shaped[number]:
                         centroid = _record_members(near, members, point, scratch.sums, best, record)
                         write_shapes(shapes, number, q, record, members, centroid, results.out)
@@ -439,7 +403,7 @@ def _curvature(sums, search):
     j = 0
     while search.radii[j] < CURVATURE_RADIUS:
         j += 1
-    if sums[N, j] < search.least:
+    if sums[M.N, j] < search.least:
         return SCATTERED
     l1, l2, l3, spread = eigenvalues_of(sums, j)
     total = l1 + l2 + l3
@@ -447,30 +411,13 @@ def _curvature(sums, search):
 
 
 @device
-def _find_surface(near, count, queries, q, search, surfaces, scratch):
-    """Write the surface of a query to the scratch: that of its point, or of its neighbors."""
-    surface = scratch.surface
-    if near.sorted[0] == 0.0:
-        for f in range(SURFACE):
-            surface[0, f] = surfaces.values[near.at[near.pos[0]], f]
-        return
-    nearest = len(search.radii)  # the candidate of AROUND neighbors
-    while search.ks[nearest - len(search.radii)] != AROUND:
-        nearest += 1
-    write_moments(scratch.sums, nearest, scratch.moments, 0)
-    heights, ignored = queries.z[q : q + 1], scratch.ignored
-    finish(scratch.moments, 1.0, heights, ignored, ignored, scratch.columns, surface)
-    surface[0, FAR] = math.sqrt(near.sorted[AROUND]) * UP if count > AROUND else math.inf
-
-
-@device
 def _choose(search, j, curvature, scratch):
     """Return the best candidate for the neighborhood number `j` of a search."""
-    first, end = search.choices[j, FIRST], search.choices[j, END]
-    members = search.choices[j, MEMBERS]
+    first, end = search.choices[j, CHOICE.first], search.choices[j, CHOICE.end]
+    members = search.choices[j, CHOICE.members]
     if search.curved and curvature >= search.threshold:
         first, end, members = len(search.radii), len(scratch.ends), LEAST_MEMBERS
-    if search.choices[j, BY_DIMENSIONALITY]:
+    if search.choices[j, CHOICE.by_dimensionality]:
         return lowest_dimensionality(scratch.sums, first, end, members)
     return lowest_entropy(scratch.sums, first, end, members)
 
@@ -481,14 +428,14 @@ def _write_reach(near, count, search, choice, scratch, table, q):
     j, best = choice
     shells, n = len(search.radii), scratch.ends[best]
     write_moments(scratch.sums, best, table, q)
-    table[REACH, q] = 0.0
+    table[M.REACH, q] = 0.0
     if best < shells:
-        table[RADIUS, q] = search.radii[best]
+        table[M.RADIUS, q] = search.radii[best]
         return
-    table[RADIUS, q] = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
+    table[M.RADIUS, q] = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
     if not search.curved:
-        k = search.ks[search.choices[j, END] - 1 - shells]
-        table[REACH, q] = math.sqrt(near.sorted[k]) if k < count else math.inf
+        k = search.ks[search.choices[j, CHOICE.end] - 1 - shells]
+        table[M.REACH, q] = math.sqrt(near.sorted[k]) if k < count else math.inf
 
 
 @device
@@ -499,6 +446,6 @@ def _record_members(near, count, point, sums, best, record):
         p = near.pos[i]
         record[i, 0], record[i, 1] = near.x[p] - x, near.y[p] - y
         record[i, 2], record[i, 3] = near.z[p] - z, 0.0
-    w = 1.0 / sums[N, best]
-    gx, gy, gz = sums[SX, best] * w, sums[SY, best] * w, sums[SZ, best] * w
+    w = 1.0 / sums[M.N, best]
+    gx, gy, gz = sums[M.SX, best] * w, sums[M.SY, best] * w, sums[M.SZ, best] * w
     return np.float32(gx), np.float32(gy), np.float32(gz)

@@ -38,49 +38,20 @@ NEIGHBORHOOD_BYTES = 130
 #: by their indices.
 Given = Mapping[str, npt.ArrayLike] | Callable[[np.ndarray], Mapping[str, np.ndarray]] | None
 
-#: Counts of a block: by kind, then by neighborhood.
-Tally = dict[str, dict[str, int]]
-
 
 @dataclass
 class FeatureTable:
-    """Features of queries: an array with names, which NumPy and scikit-learn take as it is.
-
-    pandas, too: ``pandas.DataFrame(table, columns=list(table))``.
-    """
+    """Features of queries: an array with names. ``table["Linearity_c1"]`` is a column of it."""
 
     values: np.ndarray  #: (m, F) float32
     names: tuple[str, ...]  #: of the columns
-    #: As given or fitted, both; hand them to another call to get comparable features.
+    #: As passed in or fitted, both; hand them to another call to get comparable features.
     bins: ShapeBins | None = None
     copt_threshold: float | None = None
     report: Report = field(default_factory=Report)  #: see :class:`FeatureEngine`
 
-    def __len__(self) -> int:
-        """Return the number of queries."""
-        return len(self.values)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Numbers of queries and features."""
-        return self.values.shape
-
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
-        """Return the values, for NumPy."""
-        return np.array(self.values, dtype) if copy else np.asarray(self.values, dtype)
-
-    def __iter__(self) -> Iterator[str]:
-        """Iterate over the names, as a data frame does."""
-        return iter(self.names)
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether there is a feature of that name."""
-        return name in self.names
-
-    def __getitem__(self, name: str | list[str]) -> np.ndarray:
-        """Return the column of a name, a view; or those of several names, (m, names)."""
-        if isinstance(name, list):
-            return np.stack([self[each] for each in name], axis=1)
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return the column of a name, a view."""
         if name not in self.names:
             raise KeyError(
                 f"no feature '{name}' in this table. {suggest(name, self.names)}".strip()
@@ -89,7 +60,7 @@ class FeatureTable:
 
 
 class FeatureEngine:
-    """Computes the features of a plan for queries against one cloud.
+    """Computes the features of a plan for queries, which are points of one cloud.
 
     Parameters
     ----------
@@ -110,7 +81,7 @@ class FeatureEngine:
     Attributes
     ----------
     bins, copt_threshold
-        As given or fitted.
+        As passed in or fitted.
     report : Report
         So far: ``points`` of the cloud, ``queries`` computed, ``fewer_than_three`` (by
         neighborhood, queries whose neighborhood had fewer than three points, so that
@@ -123,13 +94,12 @@ class FeatureEngine:
 
     Notes
     -----
-    A result is the same to the last bit for any order of the points, any queries asked beside it,
-    any number of threads, any block size, and in a tile whose halo is ``plan.halo_m`` meters or
-    more.
+    A result is the same to the last bit for any order of the points, any queries beside it, any
+    number of threads, any block size, and in a tile whose halo is ``plan.halo_m`` meters or more.
 
     Memory over the cloud's own: 28 bytes a point for the index (about 52 while it is being
     sorted), about 10 more with neighborhoods of k points, 21 more with their surfaces, and the
-    block budget of :meth:`blocks`.
+    block budget of :meth:`run`.
     """
 
     def __init__(
@@ -143,18 +113,8 @@ class FeatureEngine:
         threads: int | None = None,
         grid: CellGrid | None = None,
     ) -> None:
-        if not isinstance(plan, FeaturePlan):
-            raise OptionError(
-                "'plan' must be a FeaturePlan",
-                found=type(plan).__name__,
-                cure="Use FeaturePlan.parse",
-            )
-        resolve_threads(threads)
-        self.plan, self.seed, self.threads = (
-            plan,
-            checks.whole("'seed'", seed, 0, 2**63 - 1),
-            threads,
-        )
+        self.plan, self.threads = plan, resolve_threads(threads)
+        self.seed = checks.whole("'seed'", seed, 0, 2**63 - 1)
         self.bins, self.copt_threshold = bins, copt_threshold
         self.cloud = check_xyz(xyz)
         self.grid = build_grid(self.cloud, plan.cell) if grid is None else grid
@@ -171,14 +131,11 @@ class FeatureEngine:
         """Values that were passed in or fitted, as the kernels take them."""
         return Fitted(self.bins, self.copt_threshold, self.seed)
 
-    # ---- fitting
-    # -------------------------------------------------------------------------------------------
-
     def fit(self) -> FeatureEngine:
-        """Fit what the plan needs and was not given: shape thresholds and the threshold of copt.
+        """Fit what the plan needs and was not passed in: thresholds of shapes and of copt.
 
         Samples are the 500 points with the smallest hash of (seed, coordinates), so they do not
-        depend on the order of the points. Called by :meth:`blocks` when needed; a second call does
+        depend on the order of the points. Called by :meth:`run` when needed; a second call does
         nothing. For several clouds see :func:`fit_clouds`.
 
         Raises
@@ -187,18 +144,7 @@ class FeatureEngine:
             Where the cloud is empty, so that there is nothing to fit to.
         """
         with self._lock:
-            needs_copt = self.copt_threshold is None and self.plan.copt
-            needs_bins = self.bins is None and self.plan.shapes
-            if (needs_copt or needs_bins) and not len(self):
-                raise StageError("the cloud has no points to fit shape thresholds or copt to")
-            if needs_copt:
-                from .adaptive import curvature_threshold
-
-                self.copt_threshold = curvature_threshold(self.curvatures())
-            if needs_bins:
-                self.bins = ShapeBins.fit(
-                    self.shape_values(smallest_hashes(self.cloud, self.seed)[1])
-                )
+            self.bins, self.copt_threshold = _fit([self.cloud], lambda _: self, self)
         return self
 
     def curvatures(self) -> np.ndarray:
@@ -212,15 +158,15 @@ class FeatureEngine:
         out[self.grid.order] = adaptive.curvatures(self.plan.least_members, self.threads)
         return out
 
-    def shape_values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+    def shape_values(self, rows: np.ndarray, threshold: float | None) -> dict[str, np.ndarray]:
         """Return by token the metrics of all pulls round points of the cloud, comparable.
 
-        (m, METRICS, PULLS) float32 for m `rows`.
+        (m, METRICS, PULLS) float32 for m `rows`; `threshold` is the one of copt.
         """
         x, y, z = np.ascontiguousarray(self.cloud[rows].T)
         values: dict[str, np.ndarray] = {}
         for group in filter(None, self.neighborhoods()):
-            values |= group.shape_values((x, y, z), self.fitted)
+            values |= group.shape_values((x, y, z), Fitted(None, threshold, self.seed))
         shaped = (c.neighborhood.token for c in self.plan.layout if c.shapes)
         return {token: values[token] for token in shaped}
 
@@ -231,95 +177,59 @@ class FeatureEngine:
                 from .fixed_radius import FixedRadius
 
                 adaptive = None
-                fixed = ("cylinder", "sphere")
-                if any(c.at and c.neighborhood.kind not in fixed for c in self.plan.layout):
+                if any(c.at and not c.neighborhood.fixed for c in self.plan.layout):
                     from .adaptive import AdaptiveNeighborhoods
 
                     adaptive = AdaptiveNeighborhoods(self.grid, self.plan, self.threads)
                 self._parts = FixedRadius(self.grid, self.plan), adaptive
             return self._parts
 
-    # ---- computing
-    # -----------------------------------------------------------------------------------------
-
-    def blocks(
-        self,
-        queries: npt.ArrayLike | None = None,
-        *,
-        dimensions: Given = None,
-        threads: int | None = None,
-        memory_mb: float = 512,
-        progress: Progress | bool | None = None,
-    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Compute features block by block, on every core.
-
-        :meth:`run` is for more work on each block in its thread.
-
-        Parameters
-        ----------
-        queries : array, optional
-            ``None``: every point of the cloud; an array of indices into the cloud; or (m, 3)
-            coordinates.
-        dimensions : mapping of str to (m,) array, or function
-            One value per query for each of ``plan.dimensions``. X, Y and Z need not be given. A
-            function is called in the worker's thread with a block's `rows` and gives their values:
-            no copy of all is needed.
-        threads : int, optional
-            The engine's where not given.
-        memory_mb : float
-            Memory that blocks may take in all, over the cloud and its index.
-        progress : Progress or bool, optional
-            A progress to update, or ``True`` for one of its own.
-
-        Yields
-        ------
-        rows : (b,) int64 array
-            Where the queries are points of the cloud (``None`` or indices): their indices in the
-            cloud. Where they are coordinates: their row numbers. Every query comes once, in the
-            order of the grid.
-        values : (b, len(plan.names)) float32 array, C-contiguous
-
-        Raises
-        ------
-        DimensionError
-            Where a dimension of the plan is not given, or has not one value per query.
-        """
-        run = self.run(queries, dimensions=dimensions, threads=threads, memory_mb=memory_mb)
-        for block in run.computed(progress):
-            yield block.rows, block.values
-
     def run(
         self,
         queries: npt.ArrayLike | None = None,
         *,
         dimensions: Given = None,
-        threads: int | None = None,
         memory_mb: float = 512,
     ) -> Run:
-        """Return the blocks of queries to compute; parameters as for :meth:`blocks`.
+        """Return the blocks of queries to compute.
 
-        A classifier computes a block's features and classifies it in one thread, so that the whole
-        matrix is never held. Its function `classify` calls ``run.compute``::
+        ``run.computed()`` computes them on every core. A classifier computes a block's features
+        and classifies it in one thread, so that the whole matrix is never held: its function
+        `classify` calls ``run.compute``::
 
             for block, classes in map_blocks(classify, run.ranges, run.threads):
                 run.count(block)
+
+        Parameters
+        ----------
+        queries : array, optional
+            Indices into the cloud; ``None``: every point of it.
+        dimensions : mapping of str to (m,) array, or function
+            One value per query for each of ``plan.dimensions``; X, Y and Z are known. A function
+            is called in the worker's thread with a block's `rows` and returns their values: no
+            copy of all is needed.
+        memory_mb : float
+            Memory that blocks may take in all, over the cloud and its index.
+
+        Raises
+        ------
+        DimensionError
+            Where a dimension of the plan is missing, or has not one value per query.
         """
-        return Run(self, queries, dimensions, threads, memory_mb)
+        return Run(self, queries, dimensions, memory_mb)
 
     def table(
         self,
         queries: npt.ArrayLike | None = None,
         *,
-        dimensions: Mapping[str, npt.ArrayLike] | None = None,
-        threads: int | None = None,
-        memory_mb: float = 512,
-        progress: Progress | bool | None = None,
+        progress: Progress | None = None,
+        **options: Any,
     ) -> FeatureTable:
         """Return the features of all queries as one table, row i for query i.
 
-        Parameters as for :meth:`blocks`.
+        Parameters as for :meth:`run`.
         """
-        run = self.run(queries, dimensions=dimensions, threads=threads, memory_mb=memory_mb)
+        run = self.run(queries, **options)
         values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
         for block in run.computed(progress):
             values[block.positions] = block.values
@@ -330,15 +240,17 @@ class FeatureBlock(NamedTuple):
     """Features of some queries."""
 
     positions: np.ndarray  #: (b,) int64: which of the queries, in the user's order
-    rows: np.ndarray  #: (b,) int64: which points of the cloud; positions where they are coordinates
+    rows: np.ndarray  #: (b,) int64: which points of the cloud
     values: np.ndarray  #: (b, features) float32
-    tally: Tally
+    few: dict[str, int]  #: by neighborhood, queries with fewer than three points
+    far: dict[str, int]  #: by neighborhood, queries whose result reaches beyond the halo
+    reach: float  #: meters to the farthest point that matters to adaptive neighborhoods
 
 
 class Run:
     """A run over queries, sorted like the cloud and cut into blocks.
 
-    Arguments as of :meth:`FeatureEngine.blocks`.
+    Arguments as of :meth:`FeatureEngine.run`.
     """
 
     def __init__(
@@ -346,29 +258,26 @@ class Run:
         engine: FeatureEngine,
         queries: npt.ArrayLike | None,
         dimensions: Given,
-        threads: int | None,
         memory_mb: float,
     ) -> None:
-        self.engine, self.plan = engine, engine.plan
-        self.indices, coordinates = _queries(queries, engine.cloud)
-        count = len(engine) if coordinates is None else len(coordinates)
+        self.engine, self.plan, self.threads = engine, engine.plan, engine.threads
+        self.indices = None if queries is None else _check_indices(queries, len(engine))
+        self.grid = engine.grid
+        if self.indices is not None:
+            self.grid = build_grid(engine.cloud[self.indices], self.plan.cell)
+        count = len(self.grid)
         self.dimensions = (
             dimensions if callable(dimensions) else _dimensions(self.plan, dimensions, count)
         )
-        self.grid = engine.grid if coordinates is None else build_grid(coordinates, self.plan.cell)
         checks.number("'memory_mb'", memory_mb, 16)
-        self.threads = resolve_threads(engine.threads if threads is None else threads)
         #: Sorted queries that are no copies of the one before.
         self.distinct = np.zeros(0, np.int64)
         #: First distinct query of each block, and the first behind it.
         self.ranges: list[tuple[int, int]] = []
         if not count:
             return
-        if not len(engine):
-            raise StageError("the cloud has no points", found=f"{count} queries")
         engine.fit()
         self.fixed, self.adaptive = engine.neighborhoods()
-        self.reaches = [0.0]  # of the blocks: how far away the farthest neighbors lie
         x, y, z = self.grid.x, self.grid.y, self.grid.z
         new = np.ones(count, np.bool_)
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
@@ -377,11 +286,8 @@ class Run:
         # double a block.
         row = NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods) + ROW_BYTES
         row += 8 * len(self.plan.names)
-        rows = min(
-            memory_mb * 2**20 / ((2 * self.threads + 1) * row),
-            MOST_ROWS,
-            count / (4 * self.threads),
-        )
+        budget = memory_mb * 2**20 / ((2 * self.threads + 1) * row)
+        rows = min(budget, MOST_ROWS, count / (4 * self.threads))
         starts = np.arange(0, len(self.distinct) - 1, max(int(rows), LEAST_ROWS))
         self.ranges = list(pairwise([*starts.tolist(), len(self.distinct) - 1]))
 
@@ -395,16 +301,13 @@ class Run:
         points = grid.x[at], grid.y[at], grid.z[at]
         width = len(plan.names)
         values = np.empty((len(at), width), np.float32)
-        few = self.fixed.fill(points, copies, engine.fitted, values)
-        tally: Tally = {"fewer_than_three": dict(zip(self.fixed.tokens, few.tolist(), strict=True))}
+        few_fixed = self.fixed.fill(points, copies, engine.fitted, values)
+        few, far, reach = dict(zip(self.fixed.tokens, few_fixed.tolist(), strict=True)), {}, 0.0
         if self.adaptive is not None:
             tokens = self.adaptive.tokens
-            few, far, reach = self.adaptive.fill(points, copies, engine.fitted, values)
-            tally["fewer_than_three"].update(zip(tokens, few.tolist(), strict=True))
-            self.reaches.append(reach)
-            tally["beyond_halo"] = {
-                token: n for token, n in zip(tokens, far.tolist(), strict=True) if n
-            }
+            counts, beyond, reach = self.adaptive.fill(points, copies, engine.fitted, values)
+            few |= dict(zip(tokens, counts.tolist(), strict=True))
+            far = {token: n for token, n in zip(tokens, beyond.tolist(), strict=True) if n}
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)
@@ -415,55 +318,46 @@ class Run:
             dimensions = {name: column[positions] for name, column in self.dimensions.items()}
         axes = {"X": grid.x, "Y": grid.y, "Z": grid.z}
         for column, name in enumerate(plan.dimensions, width - len(plan.dimensions)):
-            given_values = dimensions.get(name)
-            if given_values is None:
-                given_values = axes[name][first:last]
-            values[:, column] = given_values
-        return FeatureBlock(positions, rows, values, tally)
+            known = dimensions.get(name)
+            values[:, column] = axes[name][first:last] if known is None else known
+        return FeatureBlock(positions, rows, values, few, far, reach)
 
-    def computed(self, progress: Progress | bool | None = None) -> Iterator[FeatureBlock]:
-        """Yield all blocks, counted, as threads finish them."""
-        bar = Progress(len(self.grid), "features") if progress is True else progress or None
-        try:
-            for block in map_blocks(self.compute, self.ranges, self.threads):
-                self.count(block)
-                if bar is not None:
-                    bar.update(len(block.rows))
-                yield block
-        finally:
-            if progress is True and bar is not None:
-                bar.close()
+    def computed(self, progress: Progress | None = None) -> Iterator[FeatureBlock]:
+        """Yield all blocks, counted, as threads finish them, in the order of the grid."""
+        for block in map_blocks(self.compute, self.ranges, self.threads):
+            self.count(block)
+            if progress is not None:
+                progress.update(len(block.rows))
+            yield block
 
     def count(self, block: FeatureBlock) -> None:
         """Add a block to the engine's report; by one thread only."""
         report = self.engine.report
         report.figures["queries"] += len(block.rows)
-        report.reach = max(report.reach, *self.reaches)
-        totals = {"beyond_halo": report.beyond_halo, **report.figures}
-        for key, counts in block.tally.items():
+        report.reach = max(report.reach, block.reach)
+        for totals, counts in (
+            (report.figures["fewer_than_three"], block.few),
+            (report.beyond_halo, block.far),
+        ):
             for token, n in counts.items():
-                totals[key][token] = totals[key].get(token, 0) + n
+                totals[token] = totals.get(token, 0) + n
 
 
-def _queries(queries, cloud: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return indices into the cloud, or None; and coordinates, None for the whole cloud."""
-    if queries is None:
-        return None, None
+def _check_indices(queries: npt.ArrayLike, count: int) -> np.ndarray:
+    """Return indices into a cloud of `count` points as int64; OptionError for others."""
     array = np.asarray(queries)
-    if array.ndim == 2:
-        return None, check_xyz(array, "queries")
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise OptionError(
-            "'queries' must be indices of points or (m, 3) coordinates",
+            "'queries' must be indices of points",
             found=f"dtype {array.dtype}, shape {array.shape}",
             cure="Use np.flatnonzero(mask)" if array.dtype.kind == "b" else None,
         )
     array = array.astype(np.int64, copy=False)
-    if outside := np.count_nonzero((array < 0) | (array >= len(cloud))):
+    if outside := np.count_nonzero((array < 0) | (array >= count)):
         raise OptionError(
-            f"'queries' has indices outside the cloud of {len(cloud)} points", found=outside
+            f"'queries' has indices outside the cloud of {count} points", found=outside
         )
-    return array, cloud[array]
+    return array
 
 
 def _dimensions(
@@ -499,7 +393,7 @@ def compute_features(
     *,
     dimensions: Mapping[str, npt.ArrayLike] | None = None,
     memory_mb: float = 512,
-    progress: Progress | bool | None = None,
+    progress: Progress | None = None,
     **settings: Any,
 ) -> FeatureTable:
     """Compute multi-scale features of a point cloud.
@@ -509,8 +403,7 @@ def compute_features(
     xyz : (n, 3) array
         The cloud, float64, in meters.
     queries : array, optional
-        Whose features: ``None`` for every point, an array of indices into the cloud, or (m, 3)
-        coordinates.
+        Indices of the points whose features are computed; ``None`` for every point.
     neighborhoods : str or list of str
         Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
     feature_set : str or list of str
@@ -522,7 +415,7 @@ def compute_features(
         weinmann2018).
     memory_mb : float
         Memory that blocks may take, over the cloud, its index and the table.
-    progress : Progress or bool, optional
+    progress : Progress, optional
     **settings
         ``bins``, ``copt_threshold``, ``seed`` and ``threads`` of :class:`FeatureEngine`.
 
@@ -555,38 +448,42 @@ def fit_clouds(
     the order of the clouds (n, 3), in meters, does not matter. None where the plan has no shapes,
     or no copt.
     """
-    if not (plan.shapes or plan.copt):
-        return None, None
-    if len(clouds) == 1:
-        engine = FeatureEngine(clouds[0], plan, seed=seed, threads=threads).fit()
-        return engine.bins, engine.copt_threshold
-    threshold = None
-    if plan.copt:
+
+    def engine_of(number: int) -> FeatureEngine:  # one index at a time
+        return FeatureEngine(clouds[number], plan, seed=seed, threads=threads)
+
+    return _fit(clouds, engine_of, FeatureEngine(np.zeros((0, 3)), plan, seed=seed))
+
+
+def _fit(
+    clouds: Sequence[npt.ArrayLike], engine_of: Callable[[int], FeatureEngine], like: FeatureEngine
+) -> tuple[ShapeBins | None, float | None]:
+    """Fit what an engine with the plan and the thresholds of `like` lacks, to all clouds."""
+    plan, bins, threshold = like.plan, like.bins, like.copt_threshold
+    needs_copt, needs_bins = plan.copt and threshold is None, plan.shapes and bins is None
+    if (needs_copt or needs_bins) and not any(len(np.asarray(cloud)) for cloud in clouds):
+        raise StageError("the cloud has no points to fit shape thresholds or copt to")
+    if needs_copt:
         from .adaptive import curvature_threshold
 
-        each = [FeatureEngine(cloud, plan, threads=threads).curvatures() for cloud in clouds]
+        each = [engine_of(number).curvatures() for number in range(len(clouds))]
         threshold = curvature_threshold(np.concatenate(each))
-    if not plan.shapes:
-        return None, threshold
-    samples = [smallest_hashes(np.asarray(cloud), seed) for cloud in clouds]
-    hashes = np.sort(np.concatenate([of_cloud for of_cloud, _ in samples]))
-    last = hashes[min(SAMPLES, len(hashes)) - 1]
-    values: dict[str, list[np.ndarray]] = {}
-    for cloud, (of_cloud, rows) in zip(clouds, samples, strict=True):
-        rows = rows[of_cloud <= last]  # a thinned copy's points tie, and all stay
-        if len(rows):
-            engine = FeatureEngine(
-                cloud, plan, copt_threshold=threshold, seed=seed, threads=threads
-            )
-            for token, metrics in engine.shape_values(rows).items():
-                values.setdefault(token, []).append(metrics)
-            del engine  # one index at a time
-    joined = {token: np.concatenate(parts) for token, parts in values.items()}
-    return ShapeBins.fit(joined), threshold
+    if needs_bins:
+        samples = [smallest_hashes(np.asarray(cloud), like.seed) for cloud in clouds]
+        hashes = np.sort(np.concatenate([of_cloud for of_cloud, _ in samples]))
+        last = hashes[min(SAMPLES, len(hashes)) - 1]
+        values: dict[str, list[np.ndarray]] = {}
+        for number, (of_cloud, rows) in enumerate(samples):
+            rows = rows[of_cloud <= last]  # a thinned copy's points tie, and all stay
+            if len(rows):
+                for token, metrics in engine_of(number).shape_values(rows, threshold).items():
+                    values.setdefault(token, []).append(metrics)
+        bins = ShapeBins.fit({token: np.concatenate(parts) for token, parts in values.items()})
+    return bins, threshold
 
 
 def warmup() -> None:
     """Compile every kernel and fill the cache, e.g. at installation."""
     xyz = np.random.default_rng(0).uniform(0.0, 3.0, (60, 3))
     compute_features(xyz, None, "c1,s1,k5,kopt(2,5),ropt,copt", "all,surfaces", threads=1)
-    compute_features(xyz, np.zeros((1, 3)), neighborhoods="c1", feature_set="covariance", threads=1)
+    compute_features(xyz, [0], neighborhoods="c1", feature_set="covariance", threads=1)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import device, njit
-from .moments import ROWS, SX, SY, SZ, Candidates, N, distance2, finish, height_key, sums_within
+from .moments import Candidates, M, distance2, finish, height_key, sums_within
 from .plan import FeaturePlan
 from .point_grid import CellGrid
 from .shape_distributions import Axes, NeighborhoodGroup, write_shapes
@@ -36,7 +36,7 @@ class FixedRadius(NeighborhoodGroup):
     """The fixed-radius neighborhoods of `plan` on `grid`, the sorted cloud."""
 
     def __init__(self, grid: CellGrid, plan: FeaturePlan) -> None:
-        fixed = [c for c in plan.layout if c.neighborhood.kind in ("cylinder", "sphere") and c.at]
+        fixed = [c for c in plan.layout if c.neighborhood.fixed and c.at]
         super().__init__(sorted(fixed, key=lambda c: c.neighborhood.parameters[0]))
         self.grid = grid
         radius = np.array([c.neighborhood.parameters[0] for c in self.chosen], np.float64)
@@ -72,8 +72,8 @@ class FixedRadius(NeighborhoodGroup):
         self._run(points, shapes, np.empty((len(points[0]), 0), np.float32))
 
     def _run(self, points: Axes, shapes, out: np.ndarray) -> np.ndarray:
-        """Return moments (neighborhoods, ROWS, m); write shapes where `shapes` says."""
-        table = np.empty((len(self), ROWS, len(points[0])))
+        """Return moments (neighborhoods, len(M), m); write shapes where `shapes` says."""
+        table = np.empty((len(self), len(M), len(points[0])))
         fixed_block(self.grid.tables(), points, self.radii, shapes, table, out)
         return table
 
@@ -112,7 +112,7 @@ def fixed_block(grid, points, radii, shapes, table, out):
     radii : Radii
     shapes : Shapes or None
         None compiles to a kernel without them, in half the time.
-    table : (k, ROWS, m) float64 array
+    table : (k, len(M), m) float64 array
         Out: moments about the queries.
     out : (m, F) float32 array
         Out: shapes.
@@ -157,8 +157,8 @@ def fixed_block(grid, points, radii, shapes, table, out):
                     if count >= len(record):
                         record = np.empty((2 * count + 1, 4), np.float32)
                     n = members(candidates, count, point, spherical, r2, record)
-                    w = 1.0 / sums[N, q]
-                    gx, gy, gz = sums[SX, q] * w, sums[SY, q] * w, sums[SZ, q] * w
+                    w = 1.0 / sums[M.N, q]
+                    gx, gy, gz = sums[M.SX, q] * w, sums[M.SY, q] * w, sums[M.SZ, q] * w
                     centroid = np.float32(gx), np.float32(gy), np.float32(gz)
                     write_shapes(shapes, k, q, record, n, centroid, out)
         a = b

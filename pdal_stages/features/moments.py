@@ -188,24 +188,15 @@ def eigenentropy(l1, l2, l3):
     return entropy_term(l1 * scale) + entropy_term(l2 * scale) + entropy_term(l3 * scale)
 
 
-# Rows of a table of moments about the queries.
-N = 0  #: number of points
-SX = 1  #: sum of x, and so on
-SY = 2
-SZ = 3
-SXX = 4  #: sum of the products x x, and so on
-SXY = 5
-SXZ = 6
-SYY = 7
-SYZ = 8
-SZZ = 9
-LOW = 10  #: lowest z
-HIGH = 11  #: highest z
-RADIUS = 12  #: radius that was chosen for the query, meters
-REACH = 13  #: meters to the farthest point that matters to the choice
+#: Rows of a table of moments about the queries: the number of points, sums of coordinates and of
+#: their products, the lowest and highest z, the radius that was chosen for the query, and the meters
+#: to the farthest point that matters to the choice.
+M = rows_of(
+    *("N", "SX", "SY", "SZ", "SXX", "SXY", "SXZ", "SYY", "SYZ", "SZZ", "LOW", "HIGH"),
+    *("RADIUS", "REACH"),
+)
 #: Rows that are sums and extremes of points.
-MOMENTS = RADIUS
-ROWS = 14
+MOMENTS = M.RADIUS
 
 #: Rows of the features that :func:`finish` computes, and of the unit normal, by name.
 ROW = rows_of(*MOMENT_FEATURES, "NormalX", "NormalY", "NormalZ")
@@ -225,15 +216,9 @@ COINCIDENT = 1e-13
 
 _MOST = np.int64(2**63 - 1)
 
-# Rows of the scratch of :func:`finish`: a covariance matrix, and the number of its points, 0 where
-# they all coincide.
-XX = 0
-YY = 1
-ZZ = 2
-XY = 3
-XZ = 4
-YZ = 5
-COUNT = 6
+#: Rows of the scratch of :func:`finish`: a covariance matrix, and the number of its points, 0 where
+#: they all coincide.
+C = rows_of("XX", "YY", "ZZ", "XY", "XZ", "YZ", "COUNT")
 
 
 class Candidates(NamedTuple):
@@ -292,10 +277,10 @@ def sums_within(candidates, count, point, spherical, r2, out, j):
         key = keys[i]
         low = min(low, key if inside else _MOST)
         high = max(high, key if inside else -_MOST)
-    out[N, j], out[SX, j], out[SY, j], out[SZ, j] = n, sx, sy, sz
-    out[SXX, j], out[SXY, j], out[SXZ, j] = sxx, sxy, sxz
-    out[SYY, j], out[SYZ, j], out[SZZ, j] = syy, syz, szz
-    out[LOW, j], out[HIGH, j] = height_of(low), height_of(high)
+    out[M.N, j], out[M.SX, j], out[M.SY, j], out[M.SZ, j] = n, sx, sy, sz
+    out[M.SXX, j], out[M.SXY, j], out[M.SXZ, j] = sxx, sxy, sxz
+    out[M.SYY, j], out[M.SYZ, j], out[M.SZZ, j] = syy, syz, szz
+    out[M.LOW, j], out[M.HIGH, j] = height_of(low), height_of(high)
 
 
 @device(forceinline=True)
@@ -329,23 +314,23 @@ def write_eigen_features(values, j, n, l1, l2, l3, nz):
 def _center(moments, heights, count, m, values):
     """Write covariances about the means to `m`, and the features of heights to `values`."""
     for j in range(count):
-        n = moments[N, j]
+        n = moments[M.N, j]
         inverse = 1.0 / (n if n > 0.0 else 1.0)
-        mx, my, mz = moments[SX, j], moments[SY, j], moments[SZ, j]
+        mx, my, mz = moments[M.SX, j], moments[M.SY, j], moments[M.SZ, j]
         mx, my, mz = mx * inverse, my * inverse, mz * inverse
-        ax, ay, az = moments[SXX, j], moments[SYY, j], moments[SZZ, j]
+        ax, ay, az = moments[M.SXX, j], moments[M.SYY, j], moments[M.SZZ, j]
         ax, ay, az = ax * inverse, ay * inverse, az * inverse
         xx, yy, zz = ax - mx * mx, ay - my * my, az - mz * mz
         apart = xx + yy + zz > COINCIDENT * (ax + ay + az)
-        m[XX, j], m[YY, j], m[ZZ, j] = xx, yy, zz
-        m[XY, j] = moments[SXY, j] * inverse - mx * my
-        m[XZ, j] = moments[SXZ, j] * inverse - mx * mz
-        m[YZ, j] = moments[SYZ, j] * inverse - my * mz
+        m[C.XX, j], m[C.YY, j], m[C.ZZ, j] = xx, yy, zz
+        m[C.XY, j] = moments[M.SXY, j] * inverse - mx * my
+        m[C.XZ, j] = moments[M.SXZ, j] * inverse - mx * mz
+        m[C.YZ, j] = moments[M.SYZ, j] * inverse - my * mz
         # Not read from the moments again, which LLVM must fear to overlap with what is written.
-        m[COUNT, j] = n if apart else 0.0
-        values[ROW.HeightRange, j] = moments[HIGH, j] - moments[LOW, j] if n > 0.0 else 0.0
+        m[C.COUNT, j] = n if apart else 0.0
+        values[ROW.HeightRange, j] = moments[M.HIGH, j] - moments[M.LOW, j] if n > 0.0 else 0.0
         values[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
-        values[ROW.HeightAboveLowest, j] = heights[j] - moments[LOW, j] if n > 0.0 else 0.0
+        values[ROW.HeightAboveLowest, j] = heights[j] - moments[M.LOW, j] if n > 0.0 else 0.0
 
 
 @njit
@@ -358,7 +343,7 @@ def finish(table, volume, heights, few, copies, columns, out):
 
     Parameters
     ----------
-    table : (ROWS, m) float64 array
+    table : (len(M), m) float64 array
     volume : float
         Area of the cylinder's base or volume of the sphere: what Density divides by; 0 where the
         table holds the radii.
@@ -373,21 +358,21 @@ def finish(table, volume, heights, few, copies, columns, out):
         (0, 0, 0) where there is none.
     """
     # Of constant shapes: rows known not to overlap let the loops be vectorized.
-    values, m = np.empty((FEATURES, WIDTH)), np.empty((COUNT + 1, WIDTH))
+    values, m = np.empty((FEATURES, WIDTH)), np.empty((len(C), WIDTH))
     for start in range(0, len(heights), BATCH):
         count = min(BATCH, len(heights) - start)
         moments = table[:, start : start + count]
         _center(moments, heights[start:], count, m, values)
         for j in range(count):
-            r = max(moments[RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
-            values[ROW.Radius, j] = moments[RADIUS, j]
-            values[ROW.Density, j] = moments[N, j] / (
+            r = max(moments[M.RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
+            values[ROW.Radius, j] = moments[M.RADIUS, j]
+            values[ROW.Density, j] = moments[M.N, j] / (
                 4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume
             )
         for j in range(count):
-            n = m[COUNT, j]
+            n = m[C.COUNT, j]
             l1, l2, l3, nx, ny, nz = eigen3(
-                m[XX, j], m[XY, j], m[XZ, j], m[YY, j], m[YZ, j], m[ZZ, j]
+                m[C.XX, j], m[C.XY, j], m[C.XZ, j], m[C.YY, j], m[C.YZ, j], m[C.ZZ, j]
             )
             real = 1.0 if n >= LEAST_MEMBERS else 0.0
             values[ROW.NormalX, j] = real * nx
@@ -395,7 +380,7 @@ def finish(table, volume, heights, few, copies, columns, out):
             values[ROW.NormalZ, j] = real * nz
             write_eigen_features(values, j, n, l1, l2, l3, nz)
         for j in range(count):
-            if moments[N, j] < LEAST_MEMBERS:
+            if moments[M.N, j] < LEAST_MEMBERS:
                 few[0] += copies[start + j]
         for f in range(len(columns)):
             if columns[f] >= 0:

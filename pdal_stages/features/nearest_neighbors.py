@@ -22,7 +22,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import device, njit
-from ..base.threads import map_blocks
 
 #: A leaf holds at most this many points.
 LEAF = 24
@@ -43,52 +42,35 @@ class KdTree(NamedTuple):
     depth: int  # levels below the root; all leaves lie on the last
 
 
-def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray, threads: int | None = None) -> KdTree:
+def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> KdTree:
     """Return the tree over a cloud of 1 to 2**32 - 1 points with finite coordinates (n,) each."""
     x, y, z = (np.ascontiguousarray(v, dtype=np.float64) for v in (x, y, z))
     n = len(x)
     if not 1 <= n < 2**32:
         raise ValueError(f"a tree needs 1 to 2**32 - 1 points, not {n}")
     depth = (n // LEAF).bit_length()
-    tree = KdTree(
-        x, y, z, np.arange(n, dtype=np.uint32), np.empty((2 ** (depth + 1) - 1, 6)), depth
-    )
-    keys = np.empty(n)
-    upper = min(depth, 2)  # levels made one node after the other; the subtrees below them at once
-    tasks = [(0, 0, n)]
-    for _ in range(upper):
-        halves = []
-        for node, lo, hi in tasks:
-            build_nodes(tree, keys, node, lo, hi, 1, False)
-            middle = (lo + hi) // 2
-            halves += [(2 * node + 1, lo, middle), (2 * node + 2, middle, hi)]
-        tasks = halves
-    for _ in map_blocks(
-        lambda task: build_nodes(tree, keys, *task, depth - upper, True), tasks, threads
-    ):
-        pass
+    boxes = np.empty((2 ** (depth + 1) - 1, 6))
+    tree = KdTree(x, y, z, np.arange(n, dtype=np.uint32), boxes, depth)
+    build_nodes(tree, np.empty(n))
     return tree
 
 
 @njit
-def build_nodes(tree, keys, node, lo, hi, depth, whole):
-    """Make a node of the points perm[lo:hi] and, if `whole`, the `depth` levels below it."""
+def build_nodes(tree, keys):
+    """Make all nodes of a tree; `keys` (n,) are scratch."""
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     stack = np.empty((STACK, 4), np.int64)
-    top = push(stack, 0, node, lo, hi, depth)
+    top = push(stack, 0, 0, 0, len(perm), tree.depth)
     while top > 0:
         top -= 1
         node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
         box = bounding_box(x, y, z, perm, lo, hi)
         for i in range(6):
             boxes[node, i] = box[i]
-        if depth == 0:
-            continue
-        middle = halve(x, y, z, perm, keys, lo, hi, box)
-        if not whole:
-            return
-        top = push(stack, top, 2 * node + 2, middle, hi, depth - 1)
-        top = push(stack, top, 2 * node + 1, lo, middle, depth - 1)
+        if depth > 0:
+            middle = halve(x, y, z, perm, keys, lo, hi, box)
+            top = push(stack, top, 2 * node + 2, middle, hi, depth - 1)
+            top = push(stack, top, 2 * node + 1, lo, middle, depth - 1)
 
 
 @device(forceinline=True)
@@ -196,13 +178,8 @@ def gather(tree, box, reach2, copies, limit, candidates):
     """
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     x0, y0, z0, x1, y1, z1 = box
-    cx, cy, cz, ci, stack = (
-        candidates.x,
-        candidates.y,
-        candidates.z,
-        candidates.at,
-        candidates.stack,
-    )
+    cx, cy, cz, ci = candidates.x, candidates.y, candidates.z, candidates.at
+    stack = candidates.stack
     # Unsigned: what may be negative is looked up with a detour.
     count, step = np.uint64(0), np.uint64(1)
     top = push(stack, 0, 0, 0, len(perm), tree.depth)

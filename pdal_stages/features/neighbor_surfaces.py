@@ -20,18 +20,14 @@ from .moments import FEATURES
 from .moments import ROW as MOMENT_ROW
 from .registry import SURFACE_FEATURES, rows_of
 
-# Columns of the table of surfaces, float32.
-NX = 0  #: unit normal
-NY = 1
-NZ = 2
-VARIATION = 3  #: surface variation
-FAR = 4  #: meters to the farthest of the 10 neighbors, infinite where there are fewer
-SURFACE = 5  #: number of columns
+#: Columns of the table of surfaces, float32: the unit normal, the surface variation, and the meters
+#: to the farthest of the 10 neighbors, infinite where there are fewer.
+S = rows_of("NX", "NY", "NZ", "VARIATION", "FAR")
 
 #: Where :func:`moments.finish` writes what the 10 nearest make, all but the reach.
 COLUMNS = np.full(FEATURES, -1)
-COLUMNS[MOMENT_ROW.SurfaceVariation] = VARIATION
-COLUMNS[[MOMENT_ROW.NormalX, MOMENT_ROW.NormalY, MOMENT_ROW.NormalZ]] = NX, NY, NZ
+COLUMNS[MOMENT_ROW.SurfaceVariation] = S.VARIATION
+COLUMNS[[MOMENT_ROW.NormalX, MOMENT_ROW.NormalY, MOMENT_ROW.NormalZ]] = S.NX, S.NY, S.NZ
 
 #: Rows of the features that :func:`agreement` computes.
 ROW = rows_of(*SURFACE_FEATURES)
@@ -48,8 +44,8 @@ def _write(out, column, value):
 
 
 @device(forceinline=True)
-def agreement(surfaces, near, count, surface, columns, out):
-    """Write features of the first `count` neighbors of a query with the given `surface`.
+def agreement(surfaces, near, count, columns, out):
+    """Write features of the first `count` neighbors of a query, a point of the cloud.
 
     `columns` has the column of `out` for each of :data:`ROW`; -1: not wanted. Returns the distance
     in meters from the query to the farthest point that the features depend on.
@@ -59,19 +55,21 @@ def agreement(surfaces, near, count, surface, columns, out):
         wanted |= columns[row] >= 0
     if not wanted:
         return 0.0
-    nx, ny, nz = np.float64(surface[NX]), np.float64(surface[NY]), np.float64(surface[NZ])
-    first = np.float64(surfaces[near.at[near.pos[0]], VARIATION])
+    query = near.at[near.pos[0]]
+    nx, ny = np.float64(surfaces[query, S.NX]), np.float64(surfaces[query, S.NY])
+    nz = np.float64(surfaces[query, S.NZ])
+    first = np.float64(surfaces[query, S.VARIATION])
     agree = total = squares = far = 0.0
     low = first
     for i in range(count):
         p = near.at[near.pos[i]]
-        agree += abs(nx * surfaces[p, NX] + ny * surfaces[p, NY] + nz * surfaces[p, NZ])
-        v = np.float64(surfaces[p, VARIATION])
+        agree += abs(nx * surfaces[p, S.NX] + ny * surfaces[p, S.NY] + nz * surfaces[p, S.NZ])
+        v = np.float64(surfaces[p, S.VARIATION])
         low = min(low, v)
         d = v - first  # of equal ones the deviation is exactly 0
         total += d
         squares += d * d
-        far = max(far, math.sqrt(near.sorted[i]) + surfaces[p, FAR])
+        far = max(far, math.sqrt(near.sorted[i]) + surfaces[p, S.FAR])
     w = 1.0 / count
     mean = total * w
     deviation = math.sqrt(max(squares * w - mean * mean, 0.0))
@@ -79,4 +77,4 @@ def agreement(surfaces, near, count, surface, columns, out):
     _write(out, columns[ROW.SurfaceVariationMin], low)
     _write(out, columns[ROW.SurfaceVariationMean], first + mean)
     _write(out, columns[ROW.SurfaceVariationStd], deviation)
-    return max(far, np.float64(surface[FAR]))
+    return max(far, np.float64(surfaces[query, S.FAR]))

@@ -33,6 +33,7 @@ ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in meters [H17]
 BY_RADIUS = ("ropt", "rdim")
 #: Kinds whose size is chosen point by point.
 ADAPTIVE = ("kopt", *BY_RADIUS, "copt")
+_DEFAULTS = {"kopt": KOPT_DEFAULT, **dict.fromkeys(BY_RADIUS, ROPT_DEFAULT), "copt": ()}
 #: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with
 #: fewer are not candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t
 #: of 0.03 and the counts of its Table 1 come out (docs/papers.md), with three they do not.
@@ -79,10 +80,7 @@ class Neighborhood:
         values = [_number(value) for value in self.parameters]
         if self.kind in ("cylinder", "sphere", "knn"):
             return {"cylinder": "c", "sphere": "s", "knn": "k"}[self.kind] + values[0]
-        default = {"kopt": KOPT_DEFAULT, **dict.fromkeys(BY_RADIUS, ROPT_DEFAULT)}.get(
-            self.kind, ()
-        )
-        if self.parameters == default:
+        if self.parameters == _DEFAULTS[self.kind]:
             return self.kind
         return f"{self.kind}({','.join(values)})"
 
@@ -99,6 +97,11 @@ class Neighborhood:
         if self.kind in BY_RADIUS:
             return self.parameters[1]
         return COPT_REACH if self.kind == "copt" else None
+
+    @property
+    def fixed(self) -> bool:
+        """True for cylinders and spheres, whose size is a radius."""
+        return self.kind in ("cylinder", "sphere")
 
     @property
     def adaptive(self) -> bool:
@@ -129,7 +132,7 @@ def parse_neighborhoods(spec: str | Iterable[str]) -> list[Neighborhood]:
     ['c2', 's0.5', 'kopt']
     """
     parsed: dict[str, Neighborhood] = {}
-    for word in _words(spec):
+    for word in split_words(spec):
         for token in PRESETS[word][0] if word in PRESETS else (word,):
             neighborhood = _parse_token(token)
             parsed.setdefault(neighborhood.token, neighborhood)
@@ -151,20 +154,19 @@ def parse_neighborhoods(spec: str | Iterable[str]) -> list[Neighborhood]:
 
 def preset_dimensions(spec: str | Iterable[str]) -> tuple[str, ...]:
     """Return the points' own dimensions that the presets named in `spec` use as features."""
-    used = (PRESETS[word][1] for word in _words(spec) if word in PRESETS)
+    used = (PRESETS[word][1] for word in split_words(spec) if word in PRESETS)
     return tuple(dict.fromkeys(name for names in used for name in names))
 
 
-def _words(spec: Any) -> list[str]:
+def split_words(spec: Any, what: str = "neighborhoods") -> list[str]:
+    """Return the words of text or a list of text, in lower case; OptionError for something else."""
     if isinstance(spec, str):
         # A comma inside parentheses belongs to the token.
         return [w.strip().lower() for w in re.split(r",(?![^()]*\))", spec) if w.strip()]
     items = list(spec) if isinstance(spec, Iterable) else [spec]
     if not all(isinstance(item, str) for item in items):
-        raise OptionError(
-            "'neighborhoods' must be text or a list of text", found=repr(spec)[:80], cure=_CURE
-        )
-    return [word for item in items for word in _words(item)]
+        raise OptionError(f"'{what}' must be text or a list of text", found=repr(spec)[:80])
+    return [word for item in items for word in split_words(item)]
 
 
 def _parse_token(text: str) -> Neighborhood:
@@ -173,16 +175,13 @@ def _parse_token(text: str) -> Neighborhood:
     if match is None:
         raise OptionError(f"unknown neighborhood '{text}'", cure=suggest(word, _KNOWN) + _CURE)
     head, value, inner = match["head"], match["value"], match["inner"]
-    if head in ("c", "s", "k"):
-        if value is None or inner is not None:
-            raise OptionError(f"the neighborhood '{text}' needs a size, as in {head}2", cure=_CURE)
-        return _sized(text, head, float(value))
-    if value is not None:
-        raise OptionError(f"unknown neighborhood '{text}'", cure=_CURE)
-    return _adaptive(text, head, inner)
-
-
-def _sized(text: str, head: str, size: float) -> Neighborhood:
+    if len(head) > 1:
+        if value is not None:
+            raise OptionError(f"unknown neighborhood '{text}'", cure=_CURE)
+        return _parse_adaptive(text, head, inner)
+    if value is None or inner is not None:
+        raise OptionError(f"the neighborhood '{text}' needs a size, as in {head}2", cure=_CURE)
+    size = float(value)
     if head == "k":
         if size != int(size) or not 1 <= size <= MAX_K:
             raise OptionError(f"k must be a whole number from 1 to {MAX_K}", found=text)
@@ -194,42 +193,33 @@ def _sized(text: str, head: str, size: float) -> Neighborhood:
     return Neighborhood("cylinder" if head == "c" else "sphere", (_rounded(size),))
 
 
-def _adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
+def _parse_adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
     try:
-        values = tuple(float(v) for v in inner.split(",")) if inner else ()
+        values = tuple(float(v) for v in inner.split(",")) if inner else _DEFAULTS[head]
     except ValueError:
         raise OptionError(
             "the values in parentheses must be numbers", found=text, cure=_CURE
         ) from None
     if not all(math.isfinite(v) for v in values):
         raise OptionError("the values in parentheses must be finite", found=text)
+    fault = None
     if head == "kopt":
-        values = values or KOPT_DEFAULT
-        if (
-            len(values) != 2
-            or any(v != int(v) for v in values)
-            or not 2 <= values[0] <= values[1] <= MAX_K
-        ):
-            raise OptionError(
-                f"kopt takes two whole numbers, kopt(k_min,k_max), 2 <= k_min <= k_max <= {MAX_K}",
-                found=text,
-            )
+        whole = len(values) == 2 and all(v == int(v) for v in values)
+        if not whole or not 2 <= values[0] <= values[1] <= MAX_K:
+            fault = f"two whole numbers, kopt(k_min,k_max), 2 <= k_min <= k_max <= {MAX_K}"
     elif head in BY_RADIUS:
-        values = values or ROPT_DEFAULT
-        if len(values) != 3 or not (
-            MIN_RADIUS <= values[0] <= values[1] <= MAX_RADIUS and values[2] >= MIN_RADIUS
+        least = f"each at least {MIN_RADIUS}, r_min <= r_max"
+        if (
+            len(values) != 3
+            or not MIN_RADIUS <= min(values) <= values[0] <= values[1] <= MAX_RADIUS
         ):
-            raise OptionError(
-                f"{head} takes meters, {head}(r_min,r_max,step), each at least {MIN_RADIUS}, "
-                "r_min <= r_max",
-                found=text,
-            )
-        if (values[1] - values[0]) / values[2] > 1000:
-            raise OptionError(
-                f"{head} may try at most 1000 radii", found=text, cure="Make the step larger"
-            )
+            fault = f"meters, {head}(r_min,r_max,step), {least}"
+        elif (values[1] - values[0]) / values[2] > 1000:
+            fault = "at most 1000 radii: make the step larger"
     elif values:
-        raise OptionError("copt takes no values", found=text, cure="Write copt")
+        fault = "no values: write copt"
+    if fault:
+        raise OptionError(f"{head} takes {fault}", found=text)
     return Neighborhood(head, tuple(_rounded(v) for v in values))
 
 

@@ -156,7 +156,7 @@ class FeaturePlan:
         It follows from the largest radius alone: 1 m for radii from 0.75 to 20 m, finer below,
         coarser above.
         """
-        radii = [n.parameters[0] for n in self.neighborhoods if n.kind in ("cylinder", "sphere")]
+        radii = [n.parameters[0] for n in self.neighborhoods if n.fixed]
         largest = max(radii, default=1.0)
         if largest > 20.0:
             return 2.0 ** math.ceil(math.log2(largest / 20.0))
@@ -208,19 +208,8 @@ class FeaturePlan:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
-        """Return the plan that :meth:`to_dict` described; OptionError for another description."""
-        lists = ("neighborhoods", "features", "dimensions")
-        is_mapping = isinstance(data, Mapping)
-        values: list[Any] = [data.get(name) if is_mapping else None for name in lists]
-        for value in values:
-            if not isinstance(value, list | tuple) or not all(
-                isinstance(item, str) for item in value
-            ):
-                raise OptionError(
-                    f"a feature plan needs lists of text: {', '.join(lists)}", found=repr(data)[:80]
-                )
-        tokens, features, dimensions = values
+        """Return the plan that :meth:`to_dict` described; OptionError for unknown words."""
         members = data.get("least_members", LEAST_MEMBERS)
         least = checks.whole("'least_members' of a feature plan", members, 3, 100)
-        parsed = tuple(parse_neighborhoods(tokens))
-        return cls(parsed, tuple(features), tuple(dimensions), least)
+        parsed = tuple(parse_neighborhoods(data["neighborhoods"]))
+        return cls(parsed, tuple(data["features"]), tuple(data["dimensions"]), least)

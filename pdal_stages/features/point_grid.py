@@ -98,22 +98,15 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
         array = np.asarray(xyz)
     except ValueError as error:
         raise StageError(f"'{what}' cannot be made an array", found=str(error)) from None
-    if array.dtype.names:
-        raise StageError(
-            f"'{what}' must be a plain (n, 3) array, not a structured one",
-            found=f"fields {', '.join(array.dtype.names[:6])}",
-            cure="Use np.column_stack([points['X'], points['Y'], points['Z']])",
-        )
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 4):
         raise StageError(
             f"'{what}' must hold float64 coordinates in meters", found=f"dtype {array.dtype}"
         )
     if array.ndim != 2 or array.shape[1] != 3:
-        cure = "Rows are points: one column each for x, y and z"
-        if array.ndim == 2 and array.shape[0] == 3:
-            cure += "; this one looks transposed, give its .T"
         raise StageError(
-            f"'{what}' must have the shape (n, 3)", found=f"shape {array.shape}", cure=cure
+            f"'{what}' must have the shape (n, 3)",
+            found=f"shape {array.shape}",
+            cure="Rows are points: one column each for x, y and z",
         )
     # Two reductions and no copy; NaN comes through both.
     largest = float(np.maximum(float(array.max()), -float(array.min()))) if array.size else 0.0

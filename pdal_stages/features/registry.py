@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..base.errors import OptionError, suggest
-from .neighborhoods import ADAPTIVE, Neighborhood
+from .neighborhoods import ADAPTIVE, Neighborhood, split_words
 
 #: Raise it when values of existing features change: models that were trained with another version
 #: then warn.
@@ -122,33 +122,19 @@ def parse_feature_set(spec: str | Iterable[str]) -> tuple[str, ...]:
     OptionError
         For a word that is neither; it names the nearest known one.
     """
-    if isinstance(spec, str):
-        words = spec.split(",")
-    else:
-        try:
-            words = [part for item in spec for part in item.split(",")]
-        except (TypeError, AttributeError):
-            raise OptionError(
-                "'feature_set' must be text or a list of text", found=repr(spec)
-            ) from None
     known = {name.lower(): name for name in (*GROUPS, *BY_NAME)}
     names: dict[str, None] = {}
-    for word in (w.strip() for w in words):
-        if not word:
-            continue
-        name = known.get(word.lower())
-        if name is None:  # a feature of one neighborhood keeps its suffix
-            heads = (name for name in BY_NAME if word.lower().startswith(f"{name.lower()}_"))
-            head = max(heads, key=len, default=None)
-            if head is None:
-                cure = suggest(word, (*GROUPS, *BY_NAME))
-                single = [f.name for f in BY_NAME.values() if f.group != "shapes"]
-                raise OptionError(
-                    f"unknown feature or group '{word}'",
-                    cure=f"{cure}Groups: {', '.join(GROUPS)}; features: {', '.join(single)}",
-                )
-            name = head + word[len(head) :].lower()
-        names[name] = None
+    for word in split_words(spec, "feature_set"):
+        heads = [head for head in known if f"{word}_".startswith(f"{head}_")]
+        if not heads:
+            single = [f.name for f in BY_NAME.values() if f.group != "shapes"]
+            raise OptionError(
+                f"unknown feature or group '{word}'",
+                cure=f"{suggest(word, (*GROUPS, *BY_NAME))}Groups: {', '.join(GROUPS)}; "
+                f"features: {', '.join(single)}",
+            )
+        head = max(heads, key=len)  # a feature of one neighborhood keeps its suffix
+        names[known[head] + word[len(head) :]] = None
     if not names:
         raise OptionError(
             "'feature_set' names no feature", found=repr(spec), cure="Write all, or leave it out"

@@ -13,25 +13,7 @@ import math
 import numpy as np
 
 from ..base.jit import FAST, device
-from .moments import (
-    COINCIDENT,
-    HIGH,
-    LOW,
-    MOMENTS,
-    SX,
-    SXX,
-    SXY,
-    SXZ,
-    SY,
-    SYY,
-    SYZ,
-    SZ,
-    SZZ,
-    N,
-    eigen3,
-    eigenentropy,
-    log_fast,
-)
+from .moments import COINCIDENT, MOMENTS, M, eigen3, eigenentropy, log_fast
 
 #: Estimated entropies are off by less than half of this.
 MARGIN = 2e-6
@@ -73,10 +55,10 @@ def add_up(near, point, ends, first, last, s):
             low = height if height < low else low
             high = height if height > high else high
             i += 1
-        s[N, j], s[SX, j], s[SY, j], s[SZ, j] = i, sx, sy, sz
-        s[SXX, j], s[SXY, j], s[SXZ, j] = sxx, sxy, sxz
-        s[SYY, j], s[SYZ, j], s[SZZ, j] = syy, syz, szz
-        s[LOW, j], s[HIGH, j] = low, high
+        s[M.N, j], s[M.SX, j], s[M.SY, j], s[M.SZ, j] = i, sx, sy, sz
+        s[M.SXX, j], s[M.SXY, j], s[M.SXZ, j] = sxx, sxy, sxz
+        s[M.SYY, j], s[M.SYZ, j], s[M.SZZ, j] = syy, syz, szz
+        s[M.LOW, j], s[M.HIGH, j] = low, high
 
 
 @device
@@ -134,10 +116,10 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
 @device
 def eigenvalues_of(s, j):
     """Return eigenvalues of the covariance of the sums `j`, and their mean squared distance."""
-    w = 1.0 / s[N, j]
-    x, y, z = s[SX, j] * w, s[SY, j] * w, s[SZ, j] * w
-    xx, yy, zz = s[SXX, j] * w, s[SYY, j] * w, s[SZZ, j] * w
-    xy, xz, yz = s[SXY, j] * w, s[SXZ, j] * w, s[SYZ, j] * w
+    w = 1.0 / s[M.N, j]
+    x, y, z = s[M.SX, j] * w, s[M.SY, j] * w, s[M.SZ, j] * w
+    xx, yy, zz = s[M.SXX, j] * w, s[M.SYY, j] * w, s[M.SZZ, j] * w
+    xy, xz, yz = s[M.SXY, j] * w, s[M.SXZ, j] * w, s[M.SYZ, j] * w
     l1, l2, l3, _, _, _ = eigen3(
         xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z
     )
@@ -147,8 +129,8 @@ def eigenvalues_of(s, j):
 @device
 def estimate_entropies(s, entropy, first, last, least):
     """Estimate the eigenentropies of the candidates first..last - 1 of at least `least` members."""
-    n, x, y, z = s[N], s[SX], s[SY], s[SZ]
-    xx, xy, xz, yy, yz, zz = s[SXX], s[SXY], s[SXZ], s[SYY], s[SYZ], s[SZZ]
+    n, x, y, z = s[M.N], s[M.SX], s[M.SY], s[M.SZ]
+    xx, xy, xz, yy, yz, zz = s[M.SXX], s[M.SXY], s[M.SXZ], s[M.SYY], s[M.SYZ], s[M.SZZ]
     for j in range(first, last):
         w = 1.0 / n[j]
         a, b, c = x[j] * w, y[j] * w, z[j] * w
@@ -215,7 +197,7 @@ def lowest_dimensionality(s, first, last, least_members):
     """
     best, least = last - 1, NEVER
     for j in range(first, last):
-        if s[N, j] < least_members:
+        if s[M.N, j] < least_members:
             continue
         l1, l2, l3, spread = eigenvalues_of(s, j)
         if l1 + l2 + l3 <= COINCIDENT * spread:

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,14 +175,15 @@ class ShapeBins:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> ShapeBins:
         """Return the bins that :meth:`to_dict` described; OptionError for another description."""
-        each = data.values() if isinstance(data, Mapping) else [None]
-        if not all(isinstance(rows, Mapping) and set(rows) == set(METRIC_NAMES) for rows in each):
+        try:
+            rows = {token: [each[name] for name in METRIC_NAMES] for token, each in data.items()}
+        except (AttributeError, KeyError, TypeError):
             raise OptionError(
                 f"shape thresholds must be those of {', '.join(METRIC_NAMES)} of each neighborhood",
                 found=repr(data)[:80],
                 cure=_CURE,
-            )
-        return cls({token: [rows[name] for name in METRIC_NAMES] for token, rows in data.items()})
+            ) from None
+        return cls(rows)
 
     def __eq__(self, other: object) -> bool:
         """Return whether all thresholds are equal."""
@@ -195,23 +196,18 @@ def _check(token: str, rows: Any) -> np.ndarray:
         array = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError):
         array = np.zeros(0)
-    if array.shape != (len(METRIC_NAMES), INNER):
+    top = np.array([[math.pi if name == "A3" else math.inf] for name in METRIC_NAMES])
+    if array.shape != (METRICS, INNER) or not (
+        np.isfinite(array).all()
+        and (np.diff(array) >= 0).all()
+        and (array >= 0).all()
+        and (array <= top).all()
+    ):
         raise OptionError(
-            f"the shape thresholds of '{token}' must be {INNER} numbers for each of "
-            f"{', '.join(METRIC_NAMES)}",
+            f"the shape thresholds of '{token}' must be {INNER} finite, ascending numbers for each "
+            f"of {', '.join(METRIC_NAMES)}: angles from 0 to pi, lengths not below 0",
             cure=_CURE,
         )
-    for name, row in zip(METRIC_NAMES, array, strict=True):
-        top = math.pi if name == "A3" else math.inf
-        if not (
-            np.isfinite(row).all() and (np.diff(row) >= 0).all() and row[0] >= 0 and row[-1] <= top
-        ):
-            raise OptionError(
-                f"the {name} thresholds of '{token}' must be finite, ascending, and "
-                + ("from 0 to pi" if name == "A3" else "not below 0"),
-                found=", ".join(f"{v:g}" for v in row),
-                cure=_CURE,
-            )
     return array
 
 
@@ -248,26 +244,6 @@ def make_work() -> Work:
     )
 
 
-def shapes_of(chosen: Sequence[Columns], points: Axes, seed: int, bins: ShapeBins | None) -> Shapes:
-    """Return what a kernel takes to compute the shapes of the `chosen` neighborhoods of points.
-
-    It counts pulls in `bins`, or, without, writes the metrics of all pulls, to which bins are
-    fitted.
-    """
-    k, m = len(chosen), len(points[0])
-    thresholds, seeds = np.zeros((k, METRICS, INNER), np.float32), np.zeros((k, m), np.uint64)
-    for number, columns in enumerate(chosen):
-        if columns.shapes:
-            token = columns.neighborhood.token
-            seeds[number] = point_seeds(*points, seed, token)
-            if bins is not None:
-                thresholds[number] = bins.comparable([token])[0]
-    values = np.empty((k, m if bins is None else 0, METRICS, PULLS), np.float32)
-    shaped = np.array([columns.shapes for columns in chosen])
-    features, counts = columns_of(chosen, SHAPE_FEATURES), np.empty(FEATURES, np.float32)
-    return Shapes(shaped, features, thresholds, seeds, values, counts, make_work())
-
-
 class Fitted(NamedTuple):
     """Values that were fitted to a cloud, or passed in, beside a plan."""
 
@@ -290,18 +266,36 @@ class NeighborhoodGroup:
         return len(self.chosen)
 
     def shapes(self, points: Axes, fitted: Fitted) -> Shapes | None:
-        """Return what kernels take to compute shapes of points; None where none are wanted."""
+        """Return what kernels take to compute shapes of points; None where none are wanted.
+
+        Pulls are counted in the fitted bins; without, the metrics of all pulls are written, to
+        which bins are fitted.
+        """
         if not any(columns.shapes for columns in self.chosen):
             return None
-        return shapes_of(self.chosen, points, fitted.seed, fitted.bins)
+        k, m, bins = len(self.chosen), len(points[0]), fitted.bins
+        thresholds, seeds = np.zeros((k, METRICS, INNER), np.float32), np.zeros((k, m), np.uint64)
+        for number, columns in enumerate(self.chosen):
+            if columns.shapes:
+                token = columns.neighborhood.token
+                seeds[number] = point_seeds(*points, fitted.seed, token)
+                if bins is not None:
+                    thresholds[number] = bins.comparable([token])[0]
+        values = np.empty((k, m if bins is None else 0, METRICS, PULLS), np.float32)
+        shaped = np.array([columns.shapes for columns in self.chosen])
+        features = columns_of(self.chosen, SHAPE_FEATURES)
+        counts = np.empty(FEATURES, np.float32)
+        return Shapes(shaped, features, thresholds, seeds, values, counts, make_work())
 
     def measure_shapes(self, points: Axes, shapes: Shapes, fitted: Fitted) -> None:
         """Write the metrics of all pulls into `shapes`."""
         raise NotImplementedError
 
     def shape_values(self, points: Axes, fitted: Fitted) -> dict[str, np.ndarray]:
-        """Return by token the metrics (m, METRICS, PULLS) of all pulls round points, comparable."""
-        fitted = fitted._replace(bins=None)
+        """Return by token the metrics (m, METRICS, PULLS) of all pulls round points, comparable.
+
+        `fitted` has no bins.
+        """
         shapes = self.shapes(points, fitted)
         if shapes is None:
             return {}

@@ -86,10 +86,10 @@ def represent(
     np.subtract(place, 1, out=place)
     if by is not None:
         place = place[by]
-    start = np.zeros(len(kept) + 1, small)
-    requested = np.arange(0) if rows is None else rows
-    members = np.empty(len(place) if rows is None else len(requested), small)
-    list_members(place, rows is None, requested, start, members)
+    place = place if rows is None else place[rows]
+    members = np.argsort(place, kind="stable").astype(small)
+    start = np.searchsorted(place[members], np.arange(len(kept) + 1)).astype(small)
+    members = members if rows is None else rows[members].astype(small)
     wanted = np.flatnonzero(np.diff(start))
     return Representatives(
         kept.astype(small), None if 0 < len(wanted) == len(kept) else wanted, members, start
@@ -137,20 +137,3 @@ def choose_one_each(order, keys, hashes, by):
         single = single and end == start + 1
         start = end
     return single
-
-
-@njit
-def list_members(place, all_points, wanted, start, members):
-    """Fill `members`, the points wanted by the place of their representative, and their `start`."""
-    for k in range(len(members)):
-        start[place[k if all_points else wanted[k]] + 1] += 1
-    for r in range(1, len(start)):
-        start[r] += start[r - 1]
-    for k in range(len(members)):
-        i = k if all_points else wanted[k]
-        r = place[i]
-        members[start[r]] = i
-        start[r] += 1
-    for r in range(len(start) - 1, 0, -1):
-        start[r] = start[r - 1]
-    start[0] = 0

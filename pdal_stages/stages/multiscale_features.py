@@ -155,17 +155,13 @@ class MultiscaleFeatures(Stage):
         columns = [plan.names.index(name) for name in names]
         out = {name: np.array(points.arrays[name]) for name in self.creates()}
         with Progress(total, self.type) as progress:
-            for rows, values in engine.blocks(
-                queries,
-                dimensions=inputs,
-                threads=self.threads,
-                memory_mb=self.memory,
-                progress=progress if representatives is None else None,
-            ):  # rows are indices into the engine's cloud, with queries too
+            run = engine.run(queries, dimensions=inputs, memory_mb=self.memory)
+            for block in run.computed():
+                rows, values = block.rows, block.values
                 if representatives is not None:
                     rows, place = representatives.members(rows)
                     values = values[place]
-                    progress.update(len(rows))
+                progress.update(len(rows))
                 rows = there[rows]
                 for name, column in zip(names, columns, strict=True):
                     out[name][rows] = values[:, column]
