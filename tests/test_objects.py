@@ -324,19 +324,6 @@ def test_what_is_nowhere_two_meters_wide_is_to_be_checked():
     assert ["narrow" in reason for reason in table.columns["reason"]] == [True, False]
 
 
-def plants(*trees, seed=0):
-    """Points in crowns of trees (x, y, height, radius), 60 to each square meter."""
-    rng, made = np.random.default_rng(seed), []
-    for x, y, height, radius in trees:
-        n = int(60 * np.pi * radius**2)
-        away, way = radius * np.sqrt(rng.random(n)), rng.uniform(0, 2 * np.pi, n)
-        up = height * (0.3 + 0.7 * rng.random(n) * (1 - 0.8 * away / radius))
-        up[0] = height
-        made.append(np.column_stack([x + away * np.cos(way), y + away * np.sin(way), up]))
-    xyz = np.concatenate(made)
-    return xyz, np.full(len(xyz), 5, np.uint8)
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 2.0]), st.booleans())
 def test_tops_of_trees_are_h_maxima_and_a_part_has_those_of_the_whole(seed, depth, whole_meters):
@@ -365,16 +352,6 @@ def test_tops_of_trees_are_h_maxima_and_a_part_has_those_of_the_whole(seed, dept
     part = crown_cells(s[7:, 5:], least, depth, float(reach))
     moved = np.where(part >= 0, (part // 59 + 7) * 64 + part % 59 + 5, -1)
     np.testing.assert_array_equal(moved[20:, 20:], owner[27:, 25:])
-
-
-def test_stems_are_estimated_from_heights_and_crowns():
-    cloud = plants((20, 20, 15, 2.5))
-    one, other = (
-        found_in(*scene(cloud), **k).tables[Kind.TREE].columns
-        for k in ({}, {"dbh_factor": 1.004, "dbh_power": 0.73})
-    )
-    assert one["dbh"] == pytest.approx(0.557 * (one["height"] * one["diam"]) ** 0.809)
-    assert other["dbh"] == pytest.approx(1.004 * (one["height"] * one["diam"]) ** 0.73)
 
 
 def test_objects_of_some_reasons_left_out():

@@ -11,7 +11,6 @@ from pdal_stages.objects.comparison import (
     compare_buildings,
     compare_trees,
     match_by_overlap,
-    match_by_place,
 )
 
 shapely = pytest.importorskip("shapely")
@@ -55,25 +54,6 @@ def test_overlaps_are_matched_as_by_hand():
             other.add(b)
             kept.append((a, b))
     assert len(kept) > 5 and sorted(match_by_overlap(found, true, 0.3)) == sorted(kept)
-
-
-def test_trees_are_matched_as_by_hand():
-    rng = np.random.default_rng(3)
-    found, true = rng.uniform(0, 60, (80, 2)), rng.uniform(0, 60, (70, 2))
-    high, true_high = rng.uniform(4, 20, 80), rng.uniform(4, 20, 70)
-    pairs = sorted(
-        (float(np.hypot(*(f - t))), a, b)
-        for a, f in enumerate(found)
-        for b, t in enumerate(true)
-        if np.hypot(*(f - t)) <= 4 and abs(high[a] - true_high[b]) <= 0.3 * true_high[b]
-    )
-    kept, one, other = [], set(), set()
-    for _, a, b in pairs:
-        if a not in one and b not in other:
-            one.add(a)
-            other.add(b)
-            kept.append((a, b))
-    assert len(kept) > 10 and sorted(match_by_place(found, high, true, true_high)) == sorted(kept)
 
 
 def test_figures_of_buildings():

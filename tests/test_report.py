@@ -17,7 +17,7 @@ from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.base.errors import StageError
 from pdal_stages.reports.accuracy_page import Place, write_accuracy_report
-from pdal_stages.reports.run_page import run_page
+from pdal_stages.reports.page import run_page
 
 VOID = {"meta", "img", "br"}
 

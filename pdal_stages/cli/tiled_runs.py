@@ -195,7 +195,7 @@ def end_run(files: Sequence[Output], run: TiledRun, again: str) -> int:
     content = run.to_dict()
     for file in files:
         if file.kind == HTML:
-            from ..reports.run_page import run_page
+            from ..reports.page import run_page
 
             write_whole(file.path, run_page(content).encode(), file.what)
         elif file.what == "metadata" and run.metadata is not None:
