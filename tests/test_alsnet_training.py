@@ -272,9 +272,9 @@ def test_transfer_starts_from_the_other_model(tmp_path):
 @needs_torch
 def test_transfer_from_something_else_is_refused(tmp_path):
     model_of(random_net(("Z", "Intensity"))).save(tmp_path / "other.model")
-    with pytest.raises(ModelError, match=r"other inputs.*Z, Intensity"):
+    with pytest.raises(ModelError, match="inputs Z, Intensity"):
         fit(start_from=str(tmp_path / "other.model"))
-    with pytest.raises(ModelError, match="another network"):
+    with pytest.raises(ModelError, match="other inputs or another network"):
         fit(start_from=str(tmp_path / "other.model"), configuration="tiny")
     forest = Path(pdal_stages.__file__).parent / "models" / "standard.model"
     with pytest.raises(ModelError, match="network only"):

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.tree import DecisionTreeClassifier
 
+from pdal_stages import TrainingOptions
 from pdal_stages.base.errors import ModelError
-from pdal_stages.classifier.random_forest import MAX_DEPTH, Forest, Growth, grow_forest
+from pdal_stages.classifier.random_forest import MAX_DEPTH, Forest, grow_forest
 
 
 def data(n=600, features=17, classes=4, seed=0):
@@ -198,6 +199,11 @@ def test_a_tree_deeper_than_any_real_one_is_refused():
         )
 
 
+def growth(**options):
+    """Options of growing trees on all samples."""
+    return TrainingOptions(**{"min_samples_leaf": 1, "max_samples": 1.0, **options})
+
+
 # ---- growing ---------------------------------------------------------------------------------------------
 
 
@@ -207,7 +213,7 @@ def test_growing_does_not_depend_on_threads_and_counts_weights():
     weight[:50], weight[290:] = 3, 0
     setting = {"seed": 4, "min_samples_leaf": 2, "max_samples": 0.5}
     one, other = (
-        grow_forest(x, y, weight, 7, Growth(threads=threads, **setting)) for threads in (1, 3)
+        grow_forest(x, y, weight, 7, growth(threads=threads, **setting)) for threads in (1, 3)
     )
     for name, array in one[0].arrays().items():
         assert np.array_equal(array, other[0].arrays()[name])

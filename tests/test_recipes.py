@@ -7,7 +7,7 @@ import pytest
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
-from pdal_stages.classifier.random_forest import Growth, grow_forest
+from pdal_stages.classifier.random_forest import grow_forest
 from pdal_stages.classifier.recipes import NOT_STATED, RECIPES, describe_recipes, with_recipe
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import limit_to_percentiles
@@ -28,6 +28,13 @@ TEXTS = {
     "weinmann2018-binary": {"count": 100_000, "features": 560, "strategy": "binary"},
     "he2017": {"count": 1000, "features": 6, "trees": 200, "max_depth": "sqrt"},
 }
+
+
+def growth(**options):
+    """Options of growing trees on all samples."""
+    return TrainingOptions(**{"min_samples_leaf": 1, "max_samples": 1.0, **options})
+
+
 EVERYWHERE = {"sampling": "random", "passes": 1, "voxel": 0.0, "prior_weight": 0.0}
 
 
@@ -112,7 +119,7 @@ def test_scaling_is_the_papers_mapping_to_trees():
             expected = values[:, column]
         assert np.allclose(limited[:, column], expected)
     label = (values[:, 0] + values[:, 1] > 8).astype(int)
-    forest, _ = grow_forest(limited, label, np.ones(400, int), 10, Growth(0))
+    forest, _ = grow_forest(limited, label, np.ones(400, int), 10, growth())
     assert (
         forest.predict_proba(values).argmax(axis=1) == forest.predict_proba(limited).argmax(axis=1)
     ).all()
@@ -123,23 +130,21 @@ def test_depth_votes_and_the_number_of_trees():
     values = rng.normal(size=(600, 6)).astype(np.float32)
     label = (values[:, 0] + rng.normal(0, 0.7, 600) > 0).astype(int)
     weight = np.ones(600, int)
-    forest, _ = grow_forest(values, label, weight, 20, Growth(0, max_depth="sqrt"))
+    forest, _ = grow_forest(values, label, weight, 20, growth(max_depth="sqrt"))
     assert forest.depths.max() == 2  # the root of six features
-    voting, _ = grow_forest(
-        values, label, weight, 20, Growth(0, vote="majority", min_samples_leaf=30)
-    )
-    mean, _ = grow_forest(values, label, weight, 20, Growth(0, min_samples_leaf=30))
+    voting, _ = grow_forest(values, label, weight, 20, growth(vote="majority", min_samples_leaf=30))
+    mean, _ = grow_forest(values, label, weight, 20, growth(min_samples_leaf=30))
     shares = voting.predict_proba(values)
     assert np.allclose(shares * 20, np.rint(shares * 20))  # whole votes of 20 trees
     assert not np.allclose(
         mean.predict_proba(values) * 20, np.rint(mean.predict_proba(values) * 20)
     )
     # The grid takes the number whose forest is right about most samples that its trees have not seen.
-    chosen, _ = grow_forest(values, label, weight, (1, 5, 60), Growth(0))
+    chosen, _ = grow_forest(values, label, weight, (1, 5, 60), growth())
     assert chosen.n_trees == 60
     clear = (values[:, 0] > 0).astype(int)
-    assert grow_forest(values, clear, weight, (5, 60), Growth(0))[0].n_trees in (5, 60)
-    whole, _ = grow_forest(values, label, weight, 60, Growth(0))
+    assert grow_forest(values, clear, weight, (5, 60), growth())[0].n_trees in (5, 60)
+    whole, _ = grow_forest(values, label, weight, 60, growth())
     assert np.array_equal(chosen.threshold, whole.threshold)  # of more trees the first ones
 
 

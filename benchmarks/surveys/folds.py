@@ -24,7 +24,7 @@ from pdal_stages.classifier.context_features import HEIGHT, Context, count_share
 from pdal_stages.classifier.feature_forest import CloudFeatures, FeatureForest, Features
 from pdal_stages.classifier.interface import PredictRequest
 from pdal_stages.classifier.model import load_model
-from pdal_stages.classifier.random_forest import Forest, Growth, grow_forest
+from pdal_stages.classifier.random_forest import Forest, grow_forest
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import FOLD_TREES, feature_plan
 from pdal_stages.classifier.training_clouds import label_classes
@@ -94,11 +94,9 @@ class GroupsLeftOut:
     def _grow(
         self, values: npt.NDArray[np.float32], kept: npt.NDArray[np.bool_], trees: int
     ) -> Forest:
-        names = ("seed", "min_samples_leaf", "max_samples", "max_features")
-        growth = Growth(**{name: getattr(OPTIONS, name) for name in names})
         values = np.asfortranarray(values[kept])
         label, weight = self.samples.label[kept], self.samples.weight[kept]
-        return grow_forest(values, label, weight, trees, growth)[0]
+        return grow_forest(values, label, weight, trees, OPTIONS)[0]
 
     def _vote(self, group: str, values: npt.NDArray[np.float32], before: Votes) -> Votes:
         """Return a pass's votes for the clouds that are trained on, by forests that have seen neither the group nor the

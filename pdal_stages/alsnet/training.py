@@ -311,19 +311,13 @@ def _load_start(options: NetworkOptions, names: tuple[str, ...]) -> Model:
     net, wanted = model.algorithm, options.configuration
     if not isinstance(net, AlsNet):
         raise ModelError("training can start from a network only", where=path, found=net.name)
-    if (net.configuration.levels, net.configuration.head) != (wanted.levels, wanted.head):
+    theirs = net.configuration.levels, net.configuration.head, net.inputs
+    if theirs != (wanted.levels, wanted.head, names):
         raise ModelError(
-            "the model to start from has another network",
+            "the model to start from has other inputs or another network",
             where=path,
-            found=f"configuration {net.configuration.name}",
-            cure="Use its configuration",
-        )
-    if net.inputs != names:
-        raise ModelError(
-            "the model to start from has other inputs",
-            where=path,
-            found=", ".join(net.inputs),
-            cure=f"Here they are {', '.join(names)}: change dimensions or coordinates",
+            found=f"configuration {net.configuration.name}, inputs {', '.join(net.inputs)}",
+            cure="Use its configuration and inputs: options configuration, coordinates, dimensions",
         )
     return model
 

@@ -8,9 +8,9 @@ docs/model-file.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,9 @@ from ..base.jit import njit
 from ..base.progress import Progress
 from ..base.threads import map_blocks
 from .interface import ArrayRule
+
+if TYPE_CHECKING:
+    from .training_options import TrainingOptions
 
 #: Levels below the root a tree may have.
 MAX_DEPTH = 10_000
@@ -256,34 +259,12 @@ def float32_at_most(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     return np.where(near > values, np.nextafter(near, np.float32(-np.inf)), near)
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Options of growing trees; see ``TrainingOptions``."""
-
-    seed: int
-    min_samples_leaf: int = 1
-    max_samples: float = 1.0  #: share of the samples drawn for a tree
-    max_features: str = "auto"  #: features tried at each split
-    max_depth: str | None = None
-    vote: str = "mean"
-    threads: int | None = None
-
-    def tree_options(self, features: int) -> dict[str, Any]:
-        """Return the options of scikit-learn's trees for a number of features."""
-        root = max(1, math.isqrt(features))
-        return {
-            "max_features": root if self.max_features == "sqrt" else max(root, features // 10),
-            "max_depth": root if self.max_depth == "sqrt" else None,
-            "min_samples_leaf": self.min_samples_leaf,
-        }
-
-
 def grow_forest(
     values: npt.NDArray[np.float32],
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
     trees: int | Sequence[int],
-    growth: Growth,
+    growth: TrainingOptions,
     progress: Progress | None = None,
 ) -> tuple[Forest, npt.NDArray[np.float64]]:
     """Grow a random forest, each tree on its own bootstrap sample.
@@ -298,27 +279,15 @@ def grow_forest(
         Times a row counts; rows of weight 0 take no part.
     trees : int or sequence of int
         Number of trees; of several numbers the one with the highest out-of-bag accuracy [B16 4.2].
+    growth : TrainingOptions
+        Its seed, threads, vote, and what bounds a tree.
 
     Returns
     -------
     Forest, (features,) float64
         The forest, and the features' importances, which sum to 1, or to 0.
     """
-    from sklearn.tree import DecisionTreeClassifier
-
-    ends, options = np.cumsum(weight), growth.tree_options(values.shape[1])
-    draws = max(1, round(growth.max_samples * int(ends[-1])))
-
-    def grow(number: int) -> tuple[Any, npt.NDArray[np.bool_]]:
-        """Return a tree, and which samples (n,) are out of its bag."""
-        random = np.random.default_rng([growth.seed, number])
-        drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
-        bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
-        seed = int(random.integers(0, 2**31 - 1))
-        tree = DecisionTreeClassifier(random_state=seed, **options)
-        tree.fit(values, label, sample_weight=bag, check_input=False)
-        return tree, (bag == 0) & (weight > 0)
-
+    grow = _tree_grower(values, label, weight, growth)
     counts = [trees] if isinstance(trees, int) else sorted(trees)
     grown: list[Any] = []
     accuracy: dict[int, float] = {}  # out of the bag, by number of trees
@@ -338,6 +307,38 @@ def grow_forest(
     if growth.vote == "majority":
         forest = replace(forest, leaf_counts=_give_to_winners(forest.leaf_counts))
     return forest, importances / (importances.sum() or 1.0)
+
+
+def _tree_grower(
+    values: npt.NDArray[np.float32],
+    label: npt.NDArray[Any],
+    weight: npt.NDArray[np.int64],
+    growth: TrainingOptions,
+) -> Callable[[int], tuple[Any, npt.NDArray[np.bool_]]]:
+    """Return the function that grows a tree by its number; see :func:`grow_forest`."""
+    from sklearn.tree import DecisionTreeClassifier
+
+    features = values.shape[1]
+    root = max(1, math.isqrt(features))
+    options = {
+        "max_features": root if growth.max_features == "sqrt" else max(root, features // 10),
+        "max_depth": root if growth.max_depth == "sqrt" else None,
+        "min_samples_leaf": growth.min_samples_leaf,
+    }
+    ends = np.cumsum(weight)
+    draws = max(1, round((growth.max_samples or 1.0) * int(ends[-1])))
+
+    def grow(number: int) -> tuple[Any, npt.NDArray[np.bool_]]:
+        """Return a tree, and which samples (n,) are out of its bag."""
+        random = np.random.default_rng([growth.seed, number])
+        drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
+        bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
+        seed = int(random.integers(0, 2**31 - 1))
+        tree = DecisionTreeClassifier(random_state=seed, **options)
+        tree.fit(values, label, sample_weight=bag, check_input=False)
+        return tree, (bag == 0) & (weight > 0)
+
+    return grow
 
 
 def _share_right(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,7 +26,7 @@ from .feature_forest import CloudFeatures, FeatureForest, Features
 from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
 from .interface import PredictRequest, weigh
 from .model import Model
-from .random_forest import Forest, Growth, grow_forest
+from .random_forest import Forest, grow_forest
 from .refinement import Blend, describe_refinement, trust
 from .sampling import BLOCK, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
@@ -133,21 +134,13 @@ class ForestTraining:
         bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
         return Features(plan, bins, threshold, options.seed)
 
-    def _growth(self) -> Growth:
-        """Return how trees are grown; by default each draws a third of the samples, in bounds."""
-        options, share = self.options, self.options.max_samples
+    def _growth(self) -> TrainingOptions:
+        """Return the options; by default a tree draws a third of the samples, in bounds."""
+        share = self.options.max_samples
         if share is None:
             per_class = int(self.samples.weight.sum()) / len(self.codes)
             share = min(max(per_class / 3, LEAST_PER_TREE), PER_TREE) / per_class
-        return Growth(
-            options.seed,
-            options.min_samples_leaf,
-            min(1.0, share),
-            options.max_features,
-            options.max_depth,
-            options.vote,
-            options.threads,
-        )
+        return replace(self.options, max_samples=min(1.0, share))
 
     def _features_of_samples(self) -> npt.NDArray[np.float32]:
         """Compute the features (samples, features) cloud by cloud."""
