@@ -54,9 +54,8 @@ class StageError(Exception):
 
     def __reduce__(self):
         """Keep the keyword arguments across process borders (Dask)."""
-        return partial(
-            type(self), self.what, where=self.where, found=self.found, cure=self.cure
-        ), ()
+        more = {"where": self.where, "found": self.found, "cure": self.cure}
+        return partial(type(self), self.what, **more), ()
 
 
 def _sentence(text: str) -> str:

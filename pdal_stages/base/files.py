@@ -63,9 +63,8 @@ def kind_of(path: str | os.PathLike) -> str:
             return kind
     if head.startswith(b"PK\x03\x04"):
         first = head[30 : 30 + int.from_bytes(head[26:28], "little")]
-        return {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}.get(
-            first, "a zip archive"
-        )
+        known = {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}
+        return known.get(first, "a zip archive")
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if text.startswith((b"<!doctype html", b"<html")):
         return HTML
@@ -140,11 +139,8 @@ def _refuse_foreign(path: str | os.PathLike, what: str) -> None:
         if not (stat.S_ISLNK(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
             return
         if status.st_uid not in _trusted() | {os.stat(folder).st_uid}:
-            raise StageError(
-                f"the {what} file is a link or pipe of another user",
-                found=at,
-                cure="Give another name",
-            )
+            problem = f"the {what} file is a link or pipe of another user"
+            raise StageError(problem, found=at, cure="Give another name")
         if stat.S_ISFIFO(status.st_mode):
             return
         at = os.path.join(folder, os.readlink(at))
@@ -231,20 +227,14 @@ def check_outputs(outputs: Iterable[Output], inputs: Iterable[str | os.PathLike]
         real, identity = Path(os.path.realpath(output.path)), _identity(output.path)
         hit = (identity and read.get(identity)) or _numbered(real, names)
         if hit is not None:
-            raise StageError(
-                f"the {output.what} file is one of the inputs",
-                found=str(hit),
-                cure="Give it another name",
-            )
+            problem = f"the {output.what} file is one of the inputs"
+            raise StageError(problem, found=str(hit), cure="Give it another name")
         key = identity or real
         if key in seen:
-            raise StageError(
-                f"the {output.what} file is the {seen[key].what} file too"
-                if output.what != seen[key].what
-                else f"two {output.what} files are the same file",
-                found=output.path,
-                cure="Give each its own name",
-            )
+            problem = f"the {output.what} file is the {seen[key].what} file too"
+            if output.what == seen[key].what:
+                problem = f"two {output.what} files are the same file"
+            raise StageError(problem, found=output.path, cure="Give each its own name")
         seen[key] = output
 
 
@@ -263,9 +253,8 @@ def _numbered(output: Path, inputs: list[Path]) -> Path | None:
         return None
     before, _, after = output.name.partition("#")
     pattern = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}")
-    return next(
-        (p for p in inputs if p.parent == output.parent and pattern.fullmatch(p.name)), None
-    )
+    beside = (path for path in inputs if path.parent == output.parent)
+    return next((path for path in beside if pattern.fullmatch(path.name)), None)
 
 
 #: How the hidden folders' names begin.
@@ -372,9 +361,8 @@ class _Place:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        parent = (
-            Path(tempfile.gettempdir()) if is_stream(path) else Path(os.path.realpath(path)).parent
-        )
+        real = Path(os.path.realpath(path))
+        parent = Path(tempfile.gettempdir()) if is_stream(path) else real.parent
         if str(parent) not in _swept:
             _swept.add(str(parent))
             sweep(parent)
@@ -461,9 +449,8 @@ def sweep(folder: str | os.PathLike) -> None:
 
 def _remove_dead(folder: Path) -> None:
     """Remove a hidden folder unless its writer still runs or it is another user's."""
-    lock = os.open(
-        folder, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_DIRECTORY", 0)
-    )
+    flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_DIRECTORY", 0)
+    lock = os.open(folder, os.O_RDONLY | flags)
     try:
         if os.fstat(lock).st_uid == os.geteuid() and try_lock(lock):
             shutil.rmtree(folder, ignore_errors=True)

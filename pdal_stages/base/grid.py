@@ -204,11 +204,10 @@ def compact_keys(coordinates: npt.NDArray[np.float64], size: float) -> tuple[Int
         batch = slice(start, start + _BATCH)
         key: Any = 0
         for place, (k, length) in enumerate(zip(axes, lengths, strict=True)):
-            number = (
-                cell_numbers(coordinates[batch, k], size) - first[place]
-                if numbers is None
-                else numbers[place][batch]
-            )
+            if numbers is None:
+                number = cell_numbers(coordinates[batch, k], size) - first[place]
+            else:
+                number = numbers[place][batch]
             key = key * length + number
         keys[batch] = key
     steps = [1]

@@ -186,12 +186,9 @@ def supersede_copc(path: str | os.PathLike) -> None:
     if not named_las(path):
         return
     copc = list(records_of(path, b"copc"))
-    roots = [
-        struct.unpack_from("<Q", data, 40)[0]
-        for r, data in copc
-        if r.number == 1 and len(data) >= 48
-    ]
-    if any(r.after and 0 <= roots[-1] - r.data < r.length for r, _ in copc if roots):
+    about = [data for record, data in copc if record.number == 1 and len(data) >= 48]
+    root = struct.unpack_from("<Q", about[-1], 40)[0] if about else 0
+    if any(r.after and 0 <= root - r.data < r.length for r, _ in copc):
         return
     with open(path, "r+b") as file:
         for record, _ in copc:

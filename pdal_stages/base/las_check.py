@@ -62,12 +62,8 @@ def check_readable(path: str | os.PathLike) -> str | None:
     try:
         size, header = Path(path).stat().st_size, read_header(path)
         if header is None:
-            raise StageError(
-                "not a LAS file",
-                where=where,
-                found=f"{size:,} bytes without a LAS header",
-                cure=DAMAGED,
-            )
+            value = f"{size:,} bytes without a LAS header"
+            raise StageError("not a LAS file", found=value, cure=DAMAGED)
         with open(path, "rb") as file:
             problem = _header_problem(header, size) or _record_problem(file, header, size)
             check = _chunk_problem if header.compressed else _count_problem

@@ -40,9 +40,8 @@ def parse_size(text: str) -> int:
         power = " KMGT".index(match[2].upper() or " ")
         size = float(match[1]) * (1024 if match[3] else 1000) ** power
     if size < _LEAST_SIZE:
-        raise OptionError(
-            "an amount of memory is a number and a unit", found=text, cure="For example 4GB"
-        )
+        what = "an amount of memory is a number and a unit"
+        raise OptionError(what, found=text, cure="For example 4GB")
     return int(size)
 
 
@@ -63,10 +62,8 @@ def release_pages(array: np.ndarray) -> None:
     first = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE
     last = (begin + array.nbytes) // mmap.PAGESIZE * mmap.PAGESIZE
     if last > first:
-        libc = ctypes.CDLL(None)
-        libc.madvise(
-            ctypes.c_void_p(first), ctypes.c_size_t(last - first), ctypes.c_int(mmap.MADV_DONTNEED)
-        )
+        place, size = ctypes.c_void_p(first), ctypes.c_size_t(last - first)
+        ctypes.CDLL(None).madvise(place, size, ctypes.c_int(mmap.MADV_DONTNEED))
 
 
 def _available() -> int:

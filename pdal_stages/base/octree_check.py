@@ -73,12 +73,9 @@ def check_copc(path: str | os.PathLike) -> None:
             file.seek(header.offset)
             table = int.from_bytes(file.read(8), "little")
             place = header.offset + 8  # chunks follow each other from here to their table
-            for count, (offset, inside) in sorted(
-                (n for n in nodes.values() if n[0]), key=lambda n: n[1]
-            ):
-                file.seek(
-                    place + header.point_bytes
-                )  # a chunk begins with a point and their number
+            chunks = sorted((n for n in nodes.values() if n[0]), key=lambda n: n[1])
+            for count, (offset, inside) in chunks:
+                file.seek(place + header.point_bytes)  # a chunk begins with a point and the number
                 counted = int.from_bytes(file.read(4), "little")
                 if offset != place or not 0 < inside <= table - place or counted != count:
                     raise ValueError(f"{count:,} points in {inside:,} bytes at {offset:,}")
@@ -105,9 +102,8 @@ def read_ept(path: str) -> dict[str, Any]:
     import urllib.request
 
     try:
-        with (
-            urllib.request.urlopen(path, timeout=60) if "://" in path else open(path, "rb") as file
-        ):
+        remote = "://" in path
+        with urllib.request.urlopen(path, timeout=60) if remote else open(path, "rb") as file:
             about = strict_json(file.read(_LARGEST))
         x0, y0, _, x1, y1, _ = map(float, about["boundsConforming"])
         left, low, _, right, high, _ = map(float, about["bounds"])
@@ -181,11 +177,8 @@ def _walk(root: Any, entries: Callable[[Any], Entries]) -> Nodes:
         first, page = waiting.pop()
         for key, count, place in entries(page):
             level, *at = key
-            if (
-                not 0 <= level <= _DEEPEST
-                or not all(0 <= place < 1 << level for place in at)
-                or count < -1
-            ):
+            there = 0 <= level <= _DEEPEST and all(0 <= number < 1 << level for number in at)
+            if not there or count < -1:
                 raise ValueError(f"node {key} of {count:,} points")
             if count == -1:
                 waiting.append((key, place))

@@ -69,9 +69,7 @@ class Progress(AbstractContextManager):
         text += f", {rate:,.0f} {self.unit}/s" if rate >= 10 else f", {rate:.2g} {self.unit}/s"
         if end:
             text += f", {seconds:.1f} s"
-        elif (
-            self.total and 100 * self.count >= self.total
-        ):  # before 1 % the rate is mostly start-up
+        elif self.total and 100 * self.count >= self.total:  # the rate before is mostly start-up
             text += f", {duration(max(self.total - self.count, 0) / rate)} left"
         self._write(f"\r{text}\x1b[K" if self._terminal else f"{text}\n")
         self._shown = True

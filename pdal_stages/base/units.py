@@ -116,11 +116,9 @@ def named_unit(name: str, option: str) -> float:
     try:
         return NAMED[name.strip().lower()]
     except KeyError:
-        raise OptionError(
-            f"'{option}' is not a known length unit",
-            found=repr(name),
-            cure=f"{suggest(name, NAMED)}Known units: {', '.join(NAMED)}",
-        ) from None
+        cure = f"{suggest(name, NAMED)}Known units: {', '.join(NAMED)}"
+        what = f"'{option}' is not a known length unit"
+        raise OptionError(what, found=repr(name), cure=cure) from None
 
 
 def units_of_wkt(
@@ -159,11 +157,9 @@ def units_of_wkt(
     across = 1.0 if across is None else across
     for meters in (across, upward):
         if meters is not None and not _SMALLEST <= meters <= _LARGEST:
-            raise StageError(
-                "the spatial reference has an implausible unit of length",
-                found=f"{meters:g} m",
-                cure="Set horizontal_unit and vertical_unit",
-            )
+            what = "the spatial reference has an implausible unit of length"
+            cure = "Set horizontal_unit and vertical_unit"
+            raise StageError(what, found=f"{meters:g} m", cure=cure)
     return Units(across, across if upward is None else upward, assumed)
 
 
@@ -195,12 +191,8 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
 
 def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float) -> None:
     """Refuse a thousand points or more without a reference whose extent looks like degrees."""
-    if (
-        count >= 1000
-        and max(-x0, x1) <= 180.0
-        and max(-y0, y1) <= 90.0
-        and max(x1 - x0, y1 - y0) < 0.2
-    ):
+    on_globe = max(-x0, x1) <= 180.0 and max(-y0, y1) <= 90.0
+    if count >= 1000 and on_globe and max(x1 - x0, y1 - y0) < 0.2:
         code = utm_code(x0, y0) or "CODE"
         raise StageError(
             "the coordinates look like degrees, and there is no spatial reference that says "
@@ -255,9 +247,8 @@ class WktNode:
 
     def code(self) -> str:
         """Return the authority's code of this element, as ``EPSG:25832``; empty without one."""
-        codes = [
-            c.values[:2] for c in self.children if c.keyword in ("AUTHORITY", "ID") and c.values[1:]
-        ]
+        named = (c.values[:2] for c in self.children if c.keyword in ("AUTHORITY", "ID"))
+        codes = [values for values in named if len(values) == 2]
         return ":".join(codes[-1]) if codes else ""
 
 

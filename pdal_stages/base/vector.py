@@ -75,16 +75,11 @@ def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
 
 def _interpreter() -> str:
     """Return the path of Python's own program, also inside a program that embeds Python."""
-    names = (f"python3.{sys.version_info.minor}", "python3")
-    inside = (
-        os.path.join(prefix, "bin", name)
-        for prefix in (sys.prefix, sys.base_prefix)
-        for name in names
-    )
-    running = (
-        [sys.executable] if os.path.basename(sys.executable or "").startswith("python") else []
-    )
-    return next((path for path in (*running, *inside) if os.access(path, os.X_OK)), "python3")
+    if os.path.basename(sys.executable or "").startswith("python"):
+        return sys.executable
+    name = f"python3.{sys.version_info.minor}"
+    inside = (os.path.join(prefix, "bin", name) for prefix in (sys.prefix, sys.base_prefix))
+    return next((path for path in inside if os.access(path, os.X_OK)), "python3")
 
 
 #: Between a file and a layer of it, as QGIS writes them.
@@ -138,10 +133,9 @@ class Overlay:
         layers = [str(name) for name, kind in listed if _POLYGONS.search(str(kind))]
         layer = self.layer or (layers[0] if len(layers) == 1 else "")
         if layer not in layers:
+            what = "has no such layer" if self.layer else "must have one layer"
             raise StageError(
-                "the file has no such layer of polygons"
-                if self.layer
-                else "the file must have one layer of polygons",
+                f"the file {what} of polygons",
                 where=self.file,
                 found=", ".join(layers) or "none",
                 cure=f"Name one: {self.file}{_LAYER}NAME={self.code}",
@@ -197,12 +191,9 @@ def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
         forward = pyproj.Transformer.from_crs(theirs, to, always_xy=True)
         west, south, east, north = forward.transform_bounds(*box, direction="INVERSE")
     except Exception as error:  # pyproj's own
-        raise StageError(
-            "the polygons' reference system cannot be made the points'",
-            where=file,
-            found=str(error),
-            cure="Reproject the file first: ogr2ogr -t_srs",
-        ) from None
+        what = "the polygons' reference system cannot be made the points'"
+        cure = "Reproject the file first: ogr2ogr -t_srs"
+        raise StageError(what, where=file, found=str(error), cure=cure) from None
     rim = 0.01 * max(east - west, north - south)
     padded = (west - rim, south - rim, east + rim, north + rim)
     return lambda x, y: forward.transform(x, y), padded

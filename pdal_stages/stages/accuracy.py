@@ -123,13 +123,10 @@ class AccuracyStage(Stage):
         """Compare the points of several files: a table of each, and one of all together."""
         sides = [self._sides(points) for _, points in parts]
         rule = self._rule(sides, report)
+        rule["allow_empty"] = len(parts) > 1
         each = [
             Accuracy.from_labels(
-                side.reference,
-                side.predicted,
-                **rule,
-                reliability=side.reliability,
-                allow_empty=len(parts) > 1,
+                side.reference, side.predicted, **rule, reliability=side.reliability
             )
             for side in sides
         ]
@@ -145,22 +142,19 @@ class AccuracyStage(Stage):
             if self.json:
                 written = accuracy.to_dict()
                 if len(each) > 1:
-                    written["files"] = [
-                        {"name": name, **summary(measures)}
-                        for (name, _), measures in zip(parts, each, strict=True)
-                    ]
+                    named = zip(parts, each, strict=True)
+                    written["files"] = [{"name": name, **summary(a)} for (name, _), a in named]
                 files[0].write_bytes((json.dumps(written, indent=1) + "\n").encode())
             if self.html:
                 self._write_page(files[-1], parts, sides, accuracy, rule)
-        report.figures.update(
-            {
-                "compared": accuracy.points,
-                "left_out": accuracy.left_out_points,
-                **{name: value for name, value in summary(accuracy).items() if name != "points"},
-                "mean_class_recall": accuracy.mean_class_recall,
-                "mean_class_precision": accuracy.mean_class_precision,
-            }
-        )
+        figures = summary(accuracy)
+        report.figures |= {
+            "compared": figures.pop("points"),
+            "left_out": accuracy.left_out_points,
+            **figures,
+            "mean_class_recall": accuracy.mean_class_recall,
+            "mean_class_precision": accuracy.mean_class_precision,
+        }
 
     def _sides(self, points: Points) -> Sides:
         """Return the classes of both sides, of the points that are compared."""
@@ -170,19 +164,15 @@ class AccuracyStage(Stage):
         if "Reliability" in points.arrays:
             reliability = np.asarray(points.arrays["Reliability"])[inside]
         reference, predicted = (
-            points.codes_of(name)[inside] for name in (self.reference, self.dimension)
+            points.codes_of(n)[inside] for n in (self.reference, self.dimension)
         )
         return Sides(reference, predicted, reliability, inside)
 
     def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
         """Return `classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`."""
         ignore = None if self.ignore is None else list(self.ignore.codes)
-        rule: dict[str, Any] = {
-            "classes": self.classes or None,
-            "ignore": ignore,
-            "merge": self.merge,
-            "names": None,
-        }
+        rule: dict[str, Any] = {"classes": self.classes or None, "ignore": ignore, "names": None}
+        rule["merge"] = self.merge
         known: list[int] | None = None
         if self.model_file:
             trained = loaded_model(self.model_file).info["classes"]
@@ -229,20 +219,16 @@ class AccuracyStage(Stage):
     ) -> None:
         from ..reports.accuracy_page import Place, places, write_accuracy_report
 
-        systems = ", ".join(
-            dict.fromkeys(name_of_wkt(points.wkt) or "none given" for _, points in parts)
-        )
+        wkts = [points.wkt for _, points in parts]
+        systems = ", ".join(dict.fromkeys(name_of_wkt(wkt) or "none given" for wkt in wkts))
         settings = {"files": self.files, "reference system": systems, "model": self.model_file}
-        settings |= {
-            k: self.options[k] for k in ("dimension", "reference", "where") if self.options[k]
-        }
+        asked = {name: self.options[name] for name in ("dimension", "reference", "where")}
+        settings |= {name: value for name, value in asked.items() if value}
         settings |= {k: rule[k] for k in ("classes", "ignore", "merge") if rule[k] is not None}
+        model = loaded_model(self.model_file) if self.model_file else None
         importances = None
-        if (
-            self.model_file
-            and (model := loaded_model(self.model_file)).info["passes"][-1]["importances"]
-        ):
-            importances = model.importances("column")  # networks have none
+        if model is not None and model.info["passes"][-1]["importances"]:  # networks have none
+            importances = model.importances("column")
         shown = [
             Place(name, points.xyz[side.inside], side.reference, side.predicted)
             for (name, points), side in zip(parts, sides, strict=True)
@@ -250,7 +236,7 @@ class AccuracyStage(Stage):
         write_accuracy_report(
             path,
             accuracy,
-            places=places(shown, [points.wkt for _, points in parts]),
+            places=places(shown, wkts),
             subtitle="; ".join(map(str, filter(None, [*self.files[:3], systems, self.model_file]))),
             importances=importances,
             settings=settings,

@@ -175,13 +175,11 @@ class Stage(ABC):
     @classmethod
     def all_options(cls) -> tuple[Option, ...]:
         """Return the stage's own options, then those that all stages share."""
-        where = vars(Stage)["where"]
         declared = [value for kind in cls.__mro__ for value in vars(kind).values()]
-        return tuple(
-            replace(value, help=f"{value.help}. {cls.where_help}") if value is where else value
-            for value in declared
-            if isinstance(value, Option)
-        )
+        options = {option.name: option for option in declared if isinstance(option, Option)}
+        where = options["where"]
+        options["where"] = replace(where, help=f"{where.help}. {cls.where_help}")
+        return tuple(options.values())
 
     @classmethod
     def describe_choices(cls) -> str:
@@ -322,14 +320,10 @@ class ClassStage(Stage):
 
     def sees_results_of(self, earlier: Stage) -> bool:
         """Neighbors matter by :attr:`reads_around` and by `ignore`, but not by other classes."""
-        ignored = self.options["ignore"]
-        read = {
-            name.lower() for name in (*self.reads_around, *(s.dimension for s in ignored.spans))
-        }
-        return bool(
-            read & {name.lower() for name in earlier.creates()}
-            or earlier.written_classes() & set(ignored.codes)
-        )
+        ignored, written = self.options["ignore"], {name.lower() for name in earlier.creates()}
+        read = (*self.reads_around, *(span.dimension for span in ignored.spans))
+        ignores = earlier.written_classes() & set(ignored.codes)
+        return bool(ignores) or not written.isdisjoint(name.lower() for name in read)
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""

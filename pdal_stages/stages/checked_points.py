@@ -92,23 +92,17 @@ class CheckedChoice:
 
     def report_to(self, report: Report) -> None:
         """Report which points samples are drawn from."""
-        number = report.figures["checked"] = self._wanted
-        text = (
-            f"{number:,} of {self._points:,} points were checked by a person ({CHECKED}): samples "
-            "are drawn from these"
-        )
+        report.figures["checked"] = self._wanted
+        text = f"{self._wanted:,} of {self._points:,} points were checked by a person ({CHECKED}): "
+        text += "samples are drawn from these"
         if self._known is not None:
             report.figures["anchors"] = self._beside
         if self._beside:
-            text += (
-                f", and from about {self._beside:,} others of which the base is sure: it is kept "
-                "where nobody looked"
-            )
+            text += f", and from about {self._beside:,} others of which the base is sure: it is "
+            text += "kept where nobody looked"
+        elif self._known is not None:
+            text += " alone; nothing keeps the base where nobody looked, as no other point has a "
+            text += f"Reliability of {SURE:g} or more"
         else:
             text += " alone, the others are neighbors"
-            if self._known is not None:
-                text += (
-                    "; nothing keeps the base where nobody looked, as no other point has a "
-                    f"Reliability of {SURE:g} or more"
-                )
         report.notes.append(text)

@@ -165,13 +165,8 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
             table = objects.tables[kind]
             for number in np.flatnonzero(np.isin(table.ids, ids)).tolist():
                 row, column, _ = table.cells[number]
-                beyond = (
-                    west - column.min() * size,
-                    (column.max() + 1) * size - east,
-                    south - row.min() * size,
-                    (row.max() + 1) * size - north,
-                )
-                away = max(away, *beyond)
+                away = max(away, west - column.min() * size, (column.max() + 1) * size - east)
+                away = max(away, south - row.min() * size, (row.max() + 1) * size - north)
         return float(away) + self.halo_m()
 
     def _find(self, points: Points, context: StageContext) -> Objects:

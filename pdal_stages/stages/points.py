@@ -77,10 +77,8 @@ class Points:
         self.report = Report({"points": self.count})
         self.mask = self.used
         if self.where is not None:
-            freed = self.arrays
-            if self.legacy_flags:
-                freed = ChainMap({"Classification": self.class_codes}, cast(dict, freed))
-            self.mask = self.where.evaluate(freed)
+            codes = {"Classification": self.class_codes} if self.legacy_flags else {}
+            self.mask = self.where.evaluate(ChainMap(codes, cast(dict, self.arrays)))
             if self.used is not None:
                 self.mask &= self.used
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
@@ -236,9 +234,8 @@ class Points:
                 chosen |= (self.class_codes == 0) & (self.flag("Overlap") != 0)
         for span in selection.spans:
             name = span.dimension
-            chosen |= span.contains(
-                self.flag(name) if name in _FLAGS else self.dimension(name, meters=False)
-            )
+            values = self.flag(name) if name in _FLAGS else self.dimension(name, meters=False)
+            chosen |= span.contains(values)
         return chosen
 
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:

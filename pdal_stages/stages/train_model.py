@@ -314,7 +314,5 @@ class TrainModel(Stage, settings=TrainingOptions):
             return [(0.0, cloud)]
         column = take_dimensions((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
         parts = {float(value): np.flatnonzero(column == value) for value in np.unique(column)}
-        return [
-            (value, replace(cloud.part(rows), name=f"{name} {value:g}", survey=""))
-            for value, rows in parts.items()
-        ]
+        clouds = {value: cloud.part(rows) for value, rows in parts.items()}
+        return [(v, replace(c, name=f"{name} {v:g}", survey="")) for v, c in clouds.items()]

@@ -63,14 +63,10 @@ class WriteObjects(ObjectOptions, Stage, settings=ObjectSettings):
         """Find objects and write them."""
         from ..reports.object_layers import write_objects
 
-        objects, refused = find_objects(self.cells(points, context), self.settings).without(
-            self.refuse
-        )
+        found = find_objects(self.cells(points, context), self.settings)
+        objects, refused = found.without(self.refuse)
         if self.refuse:
             points.report.figures["refused"] = refused
-        straight = self.outlines == STRAIGHT
-        figures = with_vector(
-            write_objects, self.filename, objects, straight, points.units, points.wkt
-        )
-        points.report.figures |= figures
+        how = self.outlines == STRAIGHT, points.units, points.wkt
+        points.report.figures |= with_vector(write_objects, self.filename, objects, *how)
         return {}
