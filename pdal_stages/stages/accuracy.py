@@ -222,8 +222,8 @@ class AccuracyStage(Stage):
         wkts = [points.wkt for _, points in parts]
         systems = ", ".join(dict.fromkeys(name_of_wkt(wkt) or "none given" for wkt in wkts))
         settings = {"files": self.files, "reference system": systems, "model": self.model_file}
-        asked = {name: self.options[name] for name in ("dimension", "reference", "where")}
-        settings |= {name: value for name, value in asked.items() if value}
+        described = {name: self.options[name] for name in ("dimension", "reference", "where")}
+        settings |= {name: value for name, value in described.items() if value}
         settings |= {k: rule[k] for k in ("classes", "ignore", "merge") if rule[k] is not None}
         model = loaded_model(self.model_file) if self.model_file else None
         importances = None

@@ -70,9 +70,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         "rejected_code (default 1)",
         *(0.5, 0.999),
     )
-    ignore: Selection = ignore_option(
-        "Points that are left out, even as neighbors, and keep their class"
-    )
+    ignore: Selection = ignore_option()
     keep: Selection = keep_option(
         "Points that are neighbors but keep their class, written as for ignore; default: 12, "
         "overlap of strips, which classifying would overwrite"

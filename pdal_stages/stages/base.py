@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
 from ..base.units import named_unit
-from .options import Option, declared_option, option, parse_options
+from .options import (
+    Option,
+    Selection,
+    declared_option,
+    ignore_option,
+    option,
+    parse_options,
+)
 from .points import Points
 from .where_expression import Expression
 
@@ -176,10 +183,10 @@ class Stage(ABC):
     def all_options(cls) -> tuple[Option, ...]:
         """Return the stage's own options, then those that all stages share."""
         declared = [value for kind in cls.__mro__ for value in vars(kind).values()]
-        options = {option.name: option for option in declared if isinstance(option, Option)}
+        options = {each.name: each for each in reversed(declared) if isinstance(each, Option)}
         where = options["where"]
         options["where"] = replace(where, help=f"{where.help}. {cls.where_help}")
-        return tuple(options.values())
+        return tuple(reversed(options.values()))
 
     @classmethod
     def describe_choices(cls) -> str:
@@ -311,6 +318,8 @@ class ClassStage(Stage):
     """Base of stages that change the class of points, and nothing else."""
 
     where_chooses = True
+    where_help = "Points outside keep their class but still serve as neighbors"
+    ignore: Selection = ignore_option()
     #: Dimensions that it reads of a point's neighbors.
     reads_around: ClassVar[frozenset[str]] = frozenset()
 
@@ -320,7 +329,7 @@ class ClassStage(Stage):
 
     def sees_results_of(self, earlier: Stage) -> bool:
         """Neighbors matter by :attr:`reads_around` and by `ignore`, but not by other classes."""
-        ignored, written = self.options["ignore"], {name.lower() for name in earlier.creates()}
+        ignored, written = self.ignore, {name.lower() for name in earlier.creates()}
         read = (*self.reads_around, *(span.dimension for span in ignored.spans))
         ignores = earlier.written_classes() & set(ignored.codes)
         return bool(ignores) or not written.isdisjoint(name.lower() for name in read)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..base.asprs import BRIDGE
 from ..structures.decks import RULES, find_decks
 from .base import ClassStage, StageContext
-from .options import Selection, code_option, ignore_option, keep_option
+from .options import Selection, code_option, keep_option
 from .points import Points, class_counts
 
 #: Leaves beside a deck, as high as it is.
@@ -24,12 +24,8 @@ class Bridges(ClassStage):
         "after Sithole, Vosselman 2006, ISPRS Journal of Photogrammetry and Remote Sensing 61(1), "
         "33-46"
     )
-    where_help = "Points outside keep their class but still serve as neighbors"
     counts = {"decks": "bridge decks (bridges)"}
     code: int = code_option(BRIDGE, "Class code of bridge decks")
-    ignore: Selection = ignore_option(
-        "Points that are left out, even as neighbors, and keep their class"
-    )
     keep: Selection = keep_option()
     reads_around = frozenset({"Ground"})
 

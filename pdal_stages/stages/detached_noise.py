@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from ..base.asprs import NOISE
 from ..terrain.noise import REACH, detached_noise
 from .base import ClassStage, StageContext
-from .options import Selection, code_option, ignore_option, option
+from .options import code_option, option
 from .points import Points, class_counts
 
 
@@ -17,7 +17,6 @@ class DetachedNoise(ClassStage):
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
     algorithm_version = 2
-    where_help = "Points outside are not marked but still serve as neighbors"
     cluster: int = option(
         "integer",
         60,
@@ -43,9 +42,6 @@ class DetachedNoise(ClassStage):
     )
     low_class: int = code_option(NOISE[0], "Class code of low noise")
     high_class: int = code_option(NOISE[1], "Class code of high noise")
-    ignore: Selection = ignore_option(
-        "Points that are left out, even as neighbors, and keep their class"
-    )
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
@@ -58,13 +54,9 @@ class DetachedNoise(ClassStage):
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Mark noise."""
         ignored = points.ignored(self.ignore)
-        noise = detached_noise(
-            *points.axes,
-            mask=None if not ignored.any() else ~ignored,
-            cluster=self.cluster,
-            gap=self.gap,
-            depth=self.depth,
-        )
+        sizes = {name: self.options[name] for name in ("cluster", "gap", "depth")}
+        mask = ~ignored if ignored.any() else None
+        noise = detached_noise(*points.axes, mask=mask, **sizes)
         if points.mask is not None:
             noise[~points.mask] = 0
         codes = points.class_codes.copy()

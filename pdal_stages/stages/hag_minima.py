@@ -37,9 +37,7 @@ class HagMinima(Stage):
         *(0.05, 10_000),
         unit="m",
     )
-    ignore: Selection = ignore_option(
-        "Points that do not form the terrain but still receive heights"
-    )
+    ignore: Selection = ignore_option("Points that do not form the terrain but get heights")
 
     def check(self) -> None:
         """Refuse options that contradict each other."""

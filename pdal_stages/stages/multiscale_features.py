@@ -55,9 +55,7 @@ class MultiscaleFeatures(Stage):
         "JSON file with the thresholds of shape histograms and curvature: read if it exists, "
         "otherwise fitted to these points and written, so that other clouds can use the same ones",
     )
-    ignore: Selection = ignore_option(
-        "Points that are left out, even as neighbors, and get no features"
-    )
+    ignore: Selection = ignore_option("Points left out, even as neighbors: they get no features")
     copt_threshold: float | None = option(
         "number",
         None,

@@ -293,7 +293,9 @@ def code_option(default: int | None, help: str) -> Any:
     return option("integer", default, help, 0, 255)
 
 
-def ignore_option(points: str) -> Any:
+def ignore_option(
+    points: str = "Points that are left out, even as neighbors, and keep their class",
+) -> Any:
     """Declare the option `ignore`, by default noise and withheld points; `points` is its help."""
     words = ": class codes, ranges such as Classification[7:7], or the word withheld"
     return option("selection", UNWANTED, points + words, may_be_empty=True)

@@ -10,7 +10,7 @@ from ..structures import towers
 from ..structures.towers import find_towers
 from ..structures.wires import RULES, find_wires
 from .base import ClassStage, StageContext
-from .options import Selection, code_option, ignore_option, keep_option, option
+from .options import Selection, code_option, keep_option, option
 from .points import Points, class_counts
 
 
@@ -19,16 +19,12 @@ class Wires(ClassStage):
 
     type = "filters.wires"
     summary = "Classify wires, long thin lines in the air, and the towers that carry them"
-    where_help = "Points outside keep their class but still serve as neighbors"
     counts = {"wires": "wires (wires)", "towers": "towers (wires)"}
     code: int = code_option(WIRE, "Class code of wires")
     towers: bool = option(
         "boolean", False, "Also give towers their class, where wires end and meet"
     )
     tower_code: int = code_option(TOWER, "Class code of towers")
-    ignore: Selection = ignore_option(
-        "Points that are left out, even as neighbors, and keep their class"
-    )
     keep: Selection = keep_option()
     reads_around = frozenset({"HeightAboveGround"})
 

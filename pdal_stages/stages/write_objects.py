@@ -63,8 +63,8 @@ class WriteObjects(ObjectOptions, Stage, settings=ObjectSettings):
         """Find objects and write them."""
         from ..reports.object_layers import write_objects
 
-        found = find_objects(self.cells(points, context), self.settings)
-        objects, refused = found.without(self.refuse)
+        every = find_objects(self.cells(points, context), self.settings)
+        objects, refused = every.without(self.refuse)
         if self.refuse:
             points.report.figures["refused"] = refused
         how = self.outlines == STRAIGHT, points.units, points.wkt
