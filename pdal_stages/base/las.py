@@ -172,6 +172,16 @@ def laszip_record(file: BinaryIO, header: LasHeader) -> bytes:
     return b""
 
 
+def chunk_table(file: BinaryIO, header: LasHeader) -> tuple[int, int]:
+    """Return where a LAZ file says where its table of chunks is, and what it says."""
+    at = file.seek(header.offset)
+    table = int.from_bytes(file.read(8), "little", signed=True)
+    if table == -1:  # a stream that could not be rewound has it at its end
+        at = file.seek(-8, os.SEEK_END)
+        table = int.from_bytes(file.read(8), "little", signed=True)
+    return at, table
+
+
 #: How the record begins where points are compressed one by one, without chunks and a table of them
 #: (LASzip 1).
 POINTWISE = b"\1\0"

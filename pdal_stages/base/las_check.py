@@ -21,6 +21,7 @@ from .las import (
     POINTWISE,
     WAVES,
     LasHeader,
+    chunk_table,
     laszip_record,
     read_header,
     records,
@@ -260,13 +261,8 @@ def _chunk_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | No
     coding = laszip_record(file, header)
     if header.count and coding.startswith(POINTWISE):  # only decoding all points would tell
         return None
-    file.seek(header.offset)
-    place = file.read(8)
-    if place == b"\xff" * 8:  # a stream that could not be rewound has it at its end
-        file.seek(size - 8)
-        place = file.read(8)
-    table, begin = int.from_bytes(place, "little", signed=True), header.offset + 8
-    inside = len(place) == 8 and begin <= table <= size - 8
+    (_, table), begin = chunk_table(file, header), header.offset + 8
+    inside = begin <= table <= size - 8
     if not header.count:  # an empty file may have 8 bytes
         end = table - 8 if inside else _end_of_points(header, size)
         return _uncounted(end - begin) if end > begin else None

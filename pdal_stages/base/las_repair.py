@@ -24,7 +24,9 @@ from .las import (
     POINTWISE,
     LasHeader,
     Record,
+    chunk_table,
     laszip_record,
+    number_type,
     read_header,
     records,
     records_of,
@@ -205,13 +207,8 @@ def _moved_table(path: str, header: LasHeader, shift: int) -> dict[int, bytes]:
     with open(path, "rb") as file:
         if not header.compressed or laszip_record(file, header).startswith(POINTWISE):
             return {}
-        at = header.offset
-        file.seek(at)
-        (place,) = struct.unpack("<q", file.read(8))
-        if place == -1:  # a stream that could not be rewound has it at its end
-            at = file.seek(-8, os.SEEK_END)
-            (place,) = struct.unpack("<q", file.read(8))
-    return {at: struct.pack("<q", place + shift)}
+        at, table = chunk_table(file, header)
+    return {at: struct.pack("<q", table + shift)}
 
 
 #: Bytes of one description.
@@ -222,7 +219,6 @@ MOST_ENTRIES = 65_535 // ENTRY
 #: triples of these.
 _INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
 _TYPES = (*_INTEGERS, "float", "double")
-_BYTES = (1, 1, 2, 2, 4, 4, 8, 8, 4, 8)
 #: Dimensions that PDAL or laspy read from every point format, in lower case without underscores,
 #: and PDAL's other names of them; ``where`` is no name of a dimension.
 _OF_ALL_FORMATS = frozenset(
@@ -316,7 +312,7 @@ def _described(header: LasHeader, data: bytes) -> list[tuple[str, bytes]]:
             )
         if kind:
             entries.append((title, entry))
-            size += ((kind - 1) // 10 + 1) * _BYTES[(kind - 1) % 10]
+            size += ((kind - 1) // 10 + 1) * number_type(_TYPES[(kind - 1) % 10]).itemsize
         else:  # of which the options are the number
             entries += [(f"{title or _UNDESCRIBED}_{n}", one_byte) for n in range(entry[3])]
             size += entry[3]
