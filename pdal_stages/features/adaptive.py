@@ -67,9 +67,9 @@ NOTHING_FITTED = Fitted()
 #: Queries computed at a time for a whole cloud.
 CHUNK = 4096
 
-#: Columns of :attr:`Search.choices`: the first candidate among radii and ks, the one behind the last,
-#: the members that a candidate needs, and 1 where the entropy of dimensionality chooses, 0 where the
-#: eigenentropy does.
+#: Columns of :attr:`Search.choices`: the first candidate among radii and ks, the one behind the
+#: last, the members that a candidate needs, and 1 where the entropy of dimensionality chooses, 0
+#: where the eigenentropy does.
 CHOICE = rows_of("first", "end", "members", "by_dimensionality")
 
 

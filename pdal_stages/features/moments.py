@@ -189,8 +189,8 @@ def eigenentropy(l1, l2, l3):
 
 
 #: Rows of a table of moments about the queries: the number of points, sums of coordinates and of
-#: their products, the lowest and highest z, the radius that was chosen for the query, and the meters
-#: to the farthest point that matters to the choice.
+#: their products, the lowest and highest z, the radius that was chosen for the query, and the
+#: meters to the farthest point that matters to the choice.
 M = rows_of(
     *("N", "SX", "SY", "SZ", "SXX", "SXY", "SXZ", "SYY", "SYZ", "SZZ", "LOW", "HIGH"),
     *("RADIUS", "REACH"),

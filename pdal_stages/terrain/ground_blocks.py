@@ -128,7 +128,7 @@ def around_blocks(
     use: NDArray[np.bool_],
     options: FilterOptions,
 ) -> NDArray[np.float64]:
-    """Return the points that must be known around blocks: the lowest of each cell (n, 3), meters."""
+    """Return the points (n, 3) that must be known around blocks: the lowest of each cell."""
     low = lowest_of_cells(x, y, z, use, options.cell)
     return np.column_stack([axis[low] for axis in (x, y, z)])
 
@@ -182,8 +182,8 @@ def cells_of_block(
     j, i = np.nonzero(there)
     cells = np.empty(len(j), _record(len(openings)))
     for name, values in (
-        ("lowest", raster.lowest), ("floor", raster.floor), ("ground", raster.ground), ("held", held),
-        ("place", raster.place), ("means", means), ("opened", opened),
+        ("lowest", raster.lowest), ("floor", raster.floor), ("ground", raster.ground),
+        ("held", held), ("place", raster.place), ("means", means), ("opened", opened),
     ):  # fmt: skip
         cells[name] = values[there]
     cells["column"], cells["row"] = i + left, j + bottom

@@ -29,7 +29,8 @@ class LowRules(NamedTuple):
     #: others of the 5 x 5 columns around that must be level with one of these, or it is noise too,
     min_support: int = 2
     min_support_share: float = 0.2  #: and this share more of those that hold points
-    level_m: float = 1.0  #: level columns differ by at most this; such ground is at most this much higher than the place,
+    #: level columns differ by at most this; such ground is at most this much higher than the place,
+    level_m: float = 1.0
     max_rise: float = 0.05  #: and this much more per meter away
     link: int = 3  #: cells of a minimum grid that are at most this far from each other are linked
     max_step_m: float = 0.35  #: across a step of at most this height: a curb,
