@@ -1,10 +1,12 @@
-"""What ``pdal-stages adapt`` gains on surveys that the shipped model has not seen: whole jobs, before and after.
+"""What ``pdal-stages adapt`` gains on surveys that the shipped model has not seen.
 
-    python benchmarks/surveys/adapting.py --data DIR --models MODELS [--json FILE] [--surveys Seville ...]
+    python benchmarks/surveys/adapting.py --data DIR --models MODELS [--json FILE] \\
+        [--surveys Seville ...]
 
-Each survey is classified by the model that has not seen it (MODELS is what ``leave_one_out.py --save`` filled), that model
-is adapted to the survey, which shows no labels, and the survey is classified again. Scored as in ``leave_one_out.py``, with
-all that ``classify`` does: noise and decks.
+Each survey is classified by the model that has not seen it (MODELS is what ``leave_one_out.py
+--save`` filled), that model is adapted to the survey, which shows no labels, and the survey is
+classified again. Scored as in ``leave_one_out.py``, with all that ``classify`` does: noise and
+decks.
 """
 
 from __future__ import annotations
@@ -77,14 +79,16 @@ def _confusion(survey: str, file: str, target: str) -> np.ndarray:
 def table(rows: list[dict[str, Any]]) -> str:
     """As Markdown."""
     lines = [
-        "| survey left out | points scored | OA | adapted | gain | F1 of vegetation | of buildings | adapting, CPU s |",
+        "| survey left out | points scored | OA | adapted | gain | F1 of vegetation | of buildings "
+        "| adapting, CPU s |",
         "|---|---:|---:|---:|---:|---|---|---:|",
     ]
     for row in rows:
         one, two = row["before"], row["after"]
         pairs = [f"{one['f1'][code]:.1f} -> {two['f1'][code]:.1f}" for code in (5, 6)]
         lines.append(
-            f"| {row['survey']} | {row['points']:,} | {one['oa']:.2f} | {two['oa']:.2f} | {two['oa'] - one['oa']:+.2f} | "
+            f"| {row['survey']} | {row['points']:,} | {one['oa']:.2f} | {two['oa']:.2f} | "
+            f"{two['oa'] - one['oa']:+.2f} | "
             f"{' | '.join(pairs)} | {row['adapting']:.0f} |"
         )
     before, after = (

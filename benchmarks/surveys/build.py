@@ -1,4 +1,4 @@
-"""Train a shipped model from the open clouds; the same bits every time, as long as the stages compute the same.
+"""Train a shipped model from the open clouds; the same code gives the same bits every time.
 
 python benchmarks/surveys/build.py --data DIR --out pdal_stages/models/standard.model
 """
@@ -35,13 +35,14 @@ def main() -> None:
     digest = hashlib.sha256(args.out.read_bytes()).hexdigest()
     size = args.out.stat().st_size / 1e6
     print(
-        f"{args.out}: {size:.2f} MB, sha256 {digest[:16]}, {time.process_time() - started:.0f} CPU s"
+        f"{args.out}: {size:.2f} MB, sha256 {digest[:16]}, "
+        f"{time.process_time() - started:.0f} CPU s"
     )
     if args.tests:
         scores = []
         for cloud in (load_test(args.data, name) for name in TESTS):
-            found = model.predict(cloud.xyz, cloud.dimensions).classification
-            scores.append(score(found, cloud))
+            classes = model.predict(cloud.xyz, cloud.dimensions).classification
+            scores.append(score(classes, cloud))
         args.tests.write_text(json.dumps(scores, indent=1) + "\n")
 
 

@@ -1,4 +1,4 @@
-"""Write the card of the shipped model and its tables by survey: docs/models.md, docs/results/surveys.md.
+"""Write the shipped model's card and its tables: docs/models.md, docs/results/surveys.md.
 
     python benchmarks/surveys/card.py
 
@@ -26,7 +26,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 
 def class_table(runs: list[dict[str, Any]]) -> str:
-    """Return precision and recall of each class by landscape as Markdown, all surveys weighing alike."""
+    """Return precision and recall by class and landscape as Markdown; surveys weigh alike."""
     heads = " | ".join(f"{name}: precision | recall" for name in NAMES.values())
     lines = [f"| landscape | {heads} |", f"|---|{'---:|' * 2 * len(NAMES)}"]
     for landscape in dict.fromkeys(survey.landscape for survey in SURVEYS.values()):
@@ -52,10 +52,10 @@ def _percent(part: float, whole: float) -> str:
 
 def list_tests(tests: list[dict[str, Any]]) -> str:
     """Return the scores of the shipped model on test parts, as a sentence."""
-    found = " and ".join(f"{run['cloud']} {run['oa']:.1f} %" for run in tests)
+    scored = " and ".join(f"{run['cloud']} {run['oa']:.1f} %" for run in tests)
     return (
         "On test parts of two towns whose other parts it was trained on, it is right in "
-        f"{found} (scored once).\nElsewhere expect the figures of the groups."
+        f"{scored} (scored once).\nElsewhere expect the figures of the groups."
     )
 
 
@@ -70,7 +70,8 @@ def survey_list(runs: list[dict[str, Any]]) -> str:
         origin = ", ".join(sorted({SOURCES[file]["repository"] for file in survey.files}))
         numbers = f"{density[name]} | {survey.samples:,}"
         lines.append(
-            f"| {name} | {survey.what} | {survey.group} | {numbers} | (c) {survey.license} | {origin} |"
+            f"| {name} | {survey.what} | {survey.group} | {numbers} | (c) {survey.license} | "
+            f"{origin} |"
         )
     return "\n".join(lines)
 

@@ -1,5 +1,7 @@
-"""The labeled surveys as they are trained on and scored, and copies of them that are thinner, without return numbers, or
-have one return of each pulse."""
+"""The labeled surveys as they are trained on and scored, and thinner or poorer copies of them.
+
+Poorer: without return numbers, or with one return of each pulse.
+"""
 
 from __future__ import annotations
 
@@ -24,14 +26,14 @@ def slug(name: str) -> str:
 
 
 def model_without(folder: Path, survey: str) -> Path:
-    """Return the file of the model that has seen nothing of the survey's group (`leave_one_out.py --save`)."""
+    """Return the model that knows nothing of the survey's group (`leave_one_out.py --save`)."""
     return folder / f"{slug(SURVEYS[survey].group)}.model"
 
 
 def true_classes(
     survey: LabeledSurvey, x: np.ndarray, y: np.ndarray, codes: np.ndarray, height: np.ndarray
 ) -> np.ndarray:
-    """(n,) uint8 what errors are counted against: ours of a survey's codes, 0 where the class is not known."""
+    """Return the classes (n,) uint8 that errors are counted against; 0 where they are not known."""
     truth = _relabeled(survey, codes)
     for given, least in survey.tall.items():
         # Else vegetation would be judged only where it is none.
@@ -43,7 +45,7 @@ def true_classes(
 
 
 def mislabeled(survey: LabeledSurvey, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Which points lie where the labels were looked at and are wrong, (n,) bool."""
+    """Return which points (n,) lie where the labels were looked at and are wrong."""
     inside = np.zeros(len(x), np.bool_)
     for west, south, east, north in survey.mislabeled:
         inside |= (x >= west) & (x <= east) & (y >= south) & (y <= north)
@@ -82,7 +84,7 @@ class Cloud:
     dimensions: dict[str, np.ndarray]
 
     def part(self, rows: np.ndarray, name: str, xyz: np.ndarray | None = None) -> Cloud:
-        """Some of the points, with heights of their own; `xyz`: where they are now."""
+        """Return some of the points, with heights of their own; `xyz`: where they are now."""
         return with_heights(
             Cloud(
                 self.survey,
@@ -95,7 +97,7 @@ class Cloud:
         )
 
     def taken(self, rows: np.ndarray) -> Cloud:
-        """Some of the points, with the heights they have."""
+        """Return some of the points, with the heights they have."""
         return replace(
             self,
             xyz=self.xyz[rows],
@@ -106,7 +108,7 @@ class Cloud:
 
     @property
     def density(self) -> float:
-        """Points per square meter of the 4 m cells that hold more than one, the median."""
+        """Median of the points per square meter of 4 m cells that hold more than one."""
         _, number = np.unique(np.floor(self.xyz[:, :2] / 4.0), axis=0, return_counts=True)
         return float(np.median(number[number > 1]) / 16.0)
 
@@ -114,7 +116,7 @@ class Cloud:
 def published(
     data: Path, known: LabeledSurvey
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """All of a survey's points: (n, 3) coordinates, (n,) the survey's own codes, and the return numbers."""
+    """Return a survey's coordinates (n, 3), its own codes (n,), and its return numbers."""
     parts = [laspy.read(data / name) for name in known.files]
     xyz = np.concatenate([np.column_stack([p.x, p.y, p.z]) for p in parts]).astype(float)
     codes = np.concatenate([np.asarray(p[known.dimension]) for p in parts]).astype(np.uint8)
@@ -136,7 +138,7 @@ def load_test(data: Path, survey: str) -> Cloud:
 
 
 def load(data: Path, survey: str, known: LabeledSurvey | None = None) -> Cloud:
-    """Return a survey as it was published, with heights above filtered ground; `known`: other files of it."""
+    """Return a survey as published, with heights above filtered ground; `known`: other files."""
     known = known or SURVEYS[survey]
     xyz, code, dimensions = published(data, known)
     kept = ~np.isin(code, known.dropped)
@@ -165,7 +167,7 @@ def with_heights(cloud: Cloud) -> Cloud:
 
 
 def thinned(cloud: Cloud, density: float) -> Cloud | None:
-    """A copy of so many points per square meter, chosen by their coordinates; None if it is hardly denser itself."""
+    """Return a copy of this density, chosen by coordinates; None if it is hardly denser itself."""
     share = density / cloud.density
     if share > 0.87:
         return None
@@ -174,7 +176,7 @@ def thinned(cloud: Cloud, density: float) -> Cloud | None:
 
 
 def without_returns(cloud: Cloud) -> Cloud:
-    """A copy that has no return numbers."""
+    """Return a copy that has no return numbers."""
     none = np.zeros(len(cloud.xyz), np.uint8)
     return replace(
         cloud,
@@ -184,7 +186,7 @@ def without_returns(cloud: Cloud) -> Cloud:
 
 
 def one_return(cloud: Cloud, last: bool) -> Cloud:
-    """A copy with the first or the last return of each pulse alone, without numbers: as some files are delivered."""
+    """Return a copy with the first or last return of each pulse alone, as some are delivered."""
     number, of = cloud.dimensions["ReturnNumber"], cloud.dimensions["NumberOfReturns"]
     kept = number >= of if last else number <= 1
     name = f"{cloud.name}, {'last' if last else 'first'} returns"

@@ -1,12 +1,13 @@
 """What corrections are worth: a simulated operator on surveys that the model has not seen.
 
     python benchmarks/surveys/leave_one_out.py --data DIR --save MODELS
-    python benchmarks/surveys/corrections.py --data DIR --models MODELS [--surveys Seville Delft] [--json FILE]
+    python benchmarks/surveys/corrections.py --data DIR --models MODELS \\
+        [--surveys Seville Delft] [--json FILE]
 
-Three times he reviews the classified file, corrects the five worst patches that he has not seen to the true classes
-(which he knows), marks them as looked at, and trains on top of the model with all that he has checked so far; then the
-file is classified again. The accuracy is of the ground that he touched in no round, the same ground after each. All by
-the commands.
+Three times he reviews the classified file, corrects the five worst patches that he has not seen to
+the true classes (which he knows), marks them as looked at, and trains on top of the model with all
+that he has checked so far; then the file is classified again. The accuracy is of the ground that he
+touched in no round, the same ground after each. All by the commands.
 """
 
 from __future__ import annotations

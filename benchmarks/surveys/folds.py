@@ -1,8 +1,8 @@
 """Models that have not seen one group of the surveys, at little more than the cost of one model.
 
-The features of a point do not depend on who is left out, so they are computed once, for every point of every copy, and
-kept in a folder. Each model is trained as the shipped one is: a later pass reads what forests without the survey (and
-without the group) say of it.
+The features of a point do not depend on who is left out, so they are computed once, for every point
+of every copy, and kept in a folder. Each model is trained as the shipped one is: a later pass reads
+what forests without the survey (and without the group) say of it.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ class GroupsLeftOut:
             labeled, len(self.classes), OPTIONS.count, OPTIONS.seed, surveys
         )
         self.group_of = np.array([SURVEYS[name].group for name in surveys])
-        #: Surveys of one fold are left out together for the votes that a later pass reads, as the trainer does it.
+        #: Surveys of one fold are left out together for the votes that a later pass reads, as the
+        #: trainer does it.
         self.fold_of = np.array([names.index(name) % VOTE_FOLDS for name in surveys])
         self.group = self.group_of[self.samples.cloud]
         self.fold = self.fold_of[self.samples.cloud]
@@ -99,10 +100,11 @@ class GroupsLeftOut:
         return grow_forest(values, label, weight, trees, OPTIONS)[0]
 
     def _vote(self, group: str, values: npt.NDArray[np.float32], before: Votes) -> Votes:
-        """Return a pass's votes for the clouds that are trained on, by forests that have seen neither the group nor the
-        cloud's fold.
+        """Return a pass's votes for the clouds that are trained on, by forests that have seen
+        neither the group nor the cloud's fold.
 
-        `values` are what the pass reads of the samples, `before` the votes of the pass before it, if there is one.
+        `values` are what the pass reads of the samples, `before` the votes of the pass before it,
+        if there is one.
         """
         votes, trees = {}, max(1, round(FOLD_TREES * TREES))
         sampled = np.unique(self.samples.cloud[self.group != group])

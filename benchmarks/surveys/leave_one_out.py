@@ -1,11 +1,11 @@
-"""Leave groups of surveys out: each survey classified by a model that has seen nothing of its group.
+"""Leave groups of surveys out: a survey's model has seen nothing of its group.
 
     python benchmarks/surveys/leave_one_out.py --data DIR --json FILE --save MODELS
 
-Groups are whole countries and landscapes (`surveys.GROUPS`). Every survey is scored at its own density and thinned to 1
-point per square meter. OA and F1 over ground, vegetation and building; low vegetation and what is none of the three is
-not scored. The figure to raise is the mean over groups of the mean OA over their surveys; beside it stand buildings in
-surveys without buildings.
+Groups are whole countries and landscapes (`surveys.GROUPS`). Every survey is scored at its own
+density and thinned to 1 point per square meter. OA and F1 over ground, vegetation and building; low
+vegetation and what is none of the three is not scored. The figure to raise is the mean over groups
+of the mean OA over their surveys; beside it stand buildings in surveys without buildings.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def group_means(runs: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def false_buildings(runs: list[dict[str, Any]]) -> dict[str, float]:
-    """Return the percentage of points called building by survey, of forests and slopes without any building."""
+    """Return the percentage called building by survey, of forests and slopes without any."""
     out = {}
     for run in runs:
         survey = SURVEYS[run["survey"]]
@@ -127,7 +127,8 @@ def group_table(runs: list[dict[str, Any]]) -> str:
     cells = " | ".join(f"**{np.mean(list(means.values())):.2f}**" for means in each)
     lines.append(f"| **mean of the groups** | | {cells} |")
     cells = " | ".join(
-        f"{np.mean(list(one.values())):.2f} % ({max(one, key=lambda k: one[k])}: {max(one.values()):.2f} %)"
+        f"{np.mean(list(one.values())):.2f} % ({max(one, key=lambda k: one[k])}: "
+        f"{max(one.values()):.2f} %)"
         for one in false
     )
     lines.append(f"| building in {len(false[0])} forests without any: mean (worst) | | {cells} |")
@@ -138,7 +139,8 @@ def survey_table(runs: list[dict[str, Any]]) -> str:
     """Return a line for each survey as flown, with its OA when thinned, as Markdown."""
     heads = " | ".join(f"OA at {density:g}/m²" for density in THINNED)
     lines = [
-        f"| survey | points/m² | OA | {heads} | F1 ground | vegetation | building | what costs most |",
+        f"| survey | points/m² | OA | {heads} | F1 ground | vegetation | building | what costs "
+        "most |",
         "|---|---:|---:|" + "---:|" * len(THINNED) + "---:|---:|---:|---|",
     ]
     thin = [{run["survey"]: f"{run['oa']:.1f}" for run in at(runs, one)} for one in THINNED]
@@ -157,16 +159,19 @@ def calibrates(survey: LabeledSurvey) -> bool:
 
 
 def calibrate(judged: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Calibration:
-    """Return how often the models were right at which reliability, of surveys whose labels tell what vegetation is.
+    """Return how often models are right at which reliability, where vegetation is labeled.
 
-    Rocks and scrub are left out: models that have seen no such land are surely wrong there, and the shipped one has seen it.
-    `judged` has classes, truth and reliability (n,) of the scored points by survey.
+    Rocks and scrub are left out: models that have seen no such land are surely wrong there, and the
+    shipped one has seen it. `judged` has classes, truth and reliability (n,) of the scored points
+    by survey.
     """
     names = [name for name in judged if calibrates(SURVEYS[name])]
     out = Calibration(
-        about=f"{len(names)} surveys ({', '.join(names)}), each classified by a model that had not seen its group"
+        about=f"{len(names)} surveys ({', '.join(names)}), each classified by a model that had not "
+        "seen its group"
     )
-    # Between all points alike and all surveys alike: limits should hold in a survey, not in the sum of all.
+    # Between all points alike and all surveys alike: limits should hold in a survey, not in the sum
+    # of all.
     points = np.array([float(len(judged[name][0])) for name in names])
     weight = points**-0.25 * points.sum() / (points**0.75).sum()
     for name, of_point in zip(names, weight, strict=True):

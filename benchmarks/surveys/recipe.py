@@ -1,4 +1,4 @@
-"""How the shipped models are trained: which copies of which surveys, which features, which forests."""
+"""How the shipped models are trained: copies of surveys, features, forests."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ from pdal_stages.stages.preprocessing import PREPARATION
 
 #: Points per square meter of thinned copies.
 DENSITIES = (8.0, 2.0, 0.6)
-#: Points per square meter, at most, of copies that have one return of each pulse, the first or the last.
+#: Points per square meter, at most, of copies that have one return of each pulse, the first or the
+#: last.
 ONE_RETURN = (12.0, 3.0)
 #: Height in meters below which a label of something standing is not believed.
 BELOW = 0.3
-#: Points of a copy at most: a square of it, each copy's somewhere else, wide enough for whole houses.
+#: Points of a copy at most: a square of it, each copy's somewhere else, wide enough for whole
+#: houses.
 MOST = 45_000
 #: The same of surveys that give few samples.
 MOST_OF_FEW = 16_000
@@ -50,8 +52,11 @@ OPTIONS = TrainingOptions(
 
 
 def copies(cloud: Cloud) -> Iterator[Cloud]:
-    """Yield a survey and its thinned copies; where it has return numbers, each once more without these, and copies with one
-    return of each pulse."""
+    """Yield a survey and its thinned copies.
+
+    Where it has return numbers, each comes once more without these, and there are copies with one
+    return of each pulse.
+    """
     made = [cloud, *(thinned(cloud, density) for density in DENSITIES)]
     for one in made:
         if one is None:
@@ -66,7 +71,7 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
 
 
 def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
-    """Return a survey's copy of this number as it is trained on: a square of it, with a mask of samples.
+    """Return a survey's copy of this number as it is trained on: a square, with a mask of samples.
 
     The mask has as many points of each class as the survey gives from a copy, chosen by their
     coordinates.
@@ -88,7 +93,7 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
 
 
 def contradicted(cloud: Cloud | TrainingCloud) -> np.ndarray:
-    """Return which points (n,) are labeled as standing (4, 5, 6), but are Ground and lower than :data:`BELOW`.
+    """Return which points (n,) are labeled as standing, but are Ground and below :data:`BELOW`.
 
     These are feet of walls and courtyards.
     """
@@ -118,12 +123,12 @@ def square(cloud: Cloud, most: int, number: int) -> np.ndarray:
 
 
 def training_clouds(data: Path, survey: str) -> list[TrainingCloud]:
-    """What a survey gives to train on."""
+    """Return the copies of a survey that are trained on."""
     return [training_cloud(copy, number) for number, copy in enumerate(copies(load(data, survey)))]
 
 
 def train_on(data: Path, surveys: Iterable[str], options: TrainingOptions = OPTIONS) -> Model:
-    """The model of these surveys."""
+    """Return the model of these surveys."""
     model = train([one for name in surveys for one in training_clouds(data, name)], options)
     model.record_preprocessing(PREPARATION)
     return model

@@ -2,9 +2,10 @@
 
     python benchmarks/surveys/review.py --data DIR --models MODELS
 
-MODELS is the folder that leave_one_out.py --save filled. Each survey is classified, by the command, with the model that
-has not seen its group. The table: points expected wrong beside those that are, and the share of the wrong points in the
-patches that come first, up to a tenth of the area, beside what knowing the truth would find.
+MODELS is the folder that leave_one_out.py --save filled. Each survey is classified, by the command,
+with the model that has not seen its group. The table: points expected wrong beside those that are,
+and the share of the wrong points in the patches that come first, up to a tenth of the area, beside
+what knowing the truth would find.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Classified:
 
 
 def classified(data: Path, name: str, model: Path, kept: Path) -> Classified:
-    """A survey's files, classified by the command; kept in a folder as long as the model stays the same."""
+    """Return a survey's files, classified by the command; kept as long as the model is the same."""
     path = kept / f"{slug(name)}.npz"
     if not path.exists() or path.stat().st_mtime < model.stat().st_mtime:
         with tempfile.TemporaryDirectory() as folder:
@@ -89,7 +90,10 @@ def _classify(data: Path, name: str, model: Path, folder: Path) -> dict[str, np.
 
 
 def judged(one: Classified) -> tuple[int, int, float, float, float]:
-    """Points judged, wrong, expected wrong; share of the wrong in the first tenth of the area, by the list and at best."""
+    """Return points judged, wrong, expected wrong, and the shares of the wrong in the first tenth.
+
+    These are of the area, by the list and at best.
+    """
     known = (one.truth > 0) & np.isin(one.codes, (2, 3, 4, 5, 6))
     codes, wrong = one.codes[known], one.codes[known] != one.truth[known]
     xyz, reliability = one.xyz[known], one.reliability[known]
@@ -104,7 +108,7 @@ def judged(one: Classified) -> tuple[int, int, float, float, float]:
 
 
 def _first(cells: ReviewCells, true: np.ndarray) -> float:
-    """Share of the wrong points in the patches that come first, up to a tenth of the area; of the last as much as fits."""
+    """Return the share of the wrong points in the patches first in line, a tenth of the area."""
     patches = find_patches(cells)
     if not len(patches):
         return 0.0
@@ -127,7 +131,8 @@ def main() -> None:
     options.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
     args = options.parse_args()
     print(
-        "| survey | points judged | wrong | expected | in the first 10 % | at best |\n|---|---:|---:|---:|---:|---:|"
+        "| survey | points judged | wrong | expected | in the first 10 % | at best "
+        "|\n|---|---:|---:|---:|---:|---:|"
     )
     for name in args.surveys:
         model = model_without(args.models, name)

@@ -1,5 +1,4 @@
-"""Where each cloud comes from: `sources.csv` names the public repository, the path in it, the commit, and the SHA-256 of
-the file."""
+"""Where each cloud comes from: `sources.csv` names repository, path, commit and SHA-256."""
 
 from __future__ import annotations
 
@@ -26,7 +25,8 @@ def check(data: Path, files: Iterable[str]) -> None:
             wrong.append(f"{path} is missing: it is {origin}")
         elif (found := hashlib.sha256(path.read_bytes()).hexdigest()) != source["sha256"]:
             wrong.append(
-                f"{path} is another file, sha256 {found[:10]}, not {source['sha256'][:10]}: take {origin}"
+                f"{path} is another file, sha256 {found[:10]}, not {source['sha256'][:10]}: take "
+                f"{origin}"
             )
     if wrong:
         raise SystemExit(

@@ -1,7 +1,8 @@
-"""The open, labeled surveys that models are trained on and judged by, and what their labels mean.
+"""The open, labeled surveys that models are trained on and judged by; what their labels mean.
 
-Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring. Low vegetation (3) is
-left out: in these surveys most of it lies on the ground, and where it begins is a matter of taste.
+Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring.
+Low vegetation (3) is left out: in these surveys most of it lies on the ground, and where it begins
+is a matter of taste.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ class LabeledSurvey:
     what, license, landscape : str
         For the card.
     group : str
-        Surveys of one group are left out of training together when models are judged: one country's flights over one kind
-        of landscape, so that a model meets a sensor, an agency's labels and a way to build that it has never seen.
+        Surveys of one group are left out of training together when models are judged: one country's
+        flights over one kind of landscape, so that a model meets a sensor, an agency's labels and a
+        way to build that it has never seen.
     dropped : tuple of int
         Codes that do not even serve as neighbors: noise, points added by computer.
     tall : mapping
@@ -40,10 +42,11 @@ class LabeledSurvey:
     returns : bool
         Whether it records return numbers.
     samples : int
-        Of each class from each copy, at most: fewer from what is alike all over, or has one building.
+        Of each class from each copy, at most: fewer from what is alike all over, or has one
+        building.
     mislabeled : tuple of boxes
-        West, south, east, north of where the labels were looked at and are wrong: nothing is learned from them, and
-        errors are not counted.
+        West, south, east, north of where the labels were looked at and are wrong: nothing is
+        learned from them, and errors are not counted.
     """
 
     files: tuple[str, ...]
@@ -62,7 +65,7 @@ class LabeledSurvey:
     mislabeled: tuple[tuple[float, float, float, float], ...] = ()
 
     def tells(self, label: int) -> bool:
-        """Whether points of a class that are there can be told by the labels: vegetation may share a code with the rest."""
+        """Return whether labels tell a class: vegetation may share a code with the rest."""
         return label != VEGETATION or label in self.labels.values() or self.tall_scored
 
 
