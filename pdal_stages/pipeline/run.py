@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -182,9 +182,20 @@ class Pipeline:
         for ours in self.expanded.ours:
             ours.reports, ours.failure = [], None
         callbacks = runtime.Callbacks()
-        stages = callbacks.check_ground(self.expanded.stages)
+        plain = self.expanded.stages
+        stages = callbacks.check_ground(plain)
+        writers = list(filter(is_writer, plain))
+        alone = len(writers) == 1 and writers[0] is plain[-1]
         try:
-            result, final_names = self._run(stages, arrays, loglevel)
+            result, final_names = execute_whole(
+                merge_filters(stages),
+                [output.path for output in writers_outputs(plain)],
+                readers_files(plain, las=True),
+                self._add_missing_reports,
+                counted=alone,
+                arrays=arrays,
+                loglevel=loglevel,
+            )
         except StageError as error:
             called = [runtime.BY_LABEL.get(str(stage.get("module"))) for stage in stages]
             failure = next((held.failure for held in called if held and held.failure), None)
@@ -198,35 +209,11 @@ class Pipeline:
         self.arrays, self.log_lines = result.arrays, pdal_env.log_lines(result.log)
         return result.count
 
-    def _run(
-        self, run: list[dict[str, Any]], arrays: bool, loglevel: int
-    ) -> tuple[pdal_env.Execution, dict[str, str]]:
-        """Run plain stages, and rename their outputs; return the result and final names by path."""
-        stages = self.expanded.stages
-        outputs = [output.path for output in writers_outputs(stages)]
-        writers = list(filter(is_writer, stages))
-        alone = len(writers) == 1 and writers[0] is stages[-1] and "where" not in writers[0]
-        sources = readers_files(stages, las=True)
-
-        def finish(written: Path, final: Path, number: int) -> None:
-            count = result.count if alone and "#" not in outputs[0] else None
-            check_complete(written, final, writers[number], count)
-            las_output.finish(written, sources, plane_unit(stages, result.metadata))
-
-        with whole_files(*outputs, check=finish) as partials:
-            run = with_outputs(run, list(partials))
-            for number, stage in enumerate(run):
-                if is_writer(stage):
-                    run[number] = las_output.uncompressed_writer(stage, run[:number])
-            with pdal_env.deferred_interrupts():
-                result = pdal_env.execute(merge_filters(run), arrays=arrays, loglevel=loglevel)
-                pdal_env.check_interrupt()
-            compressed = las_output.compress(partials)
-            for ours in self.expanded.ours:
-                if not ours.reports:  # newer PDAL leaves filters out where there are no points
-                    ours.reports.append(runtime.run_on_nothing(ours.stage))
-        names = {str(path): final for path, final in zip(partials, outputs, strict=True)}
-        return result, names | {old: names.get(new, new) for old, new in compressed.items()}
+    def _add_missing_reports(self) -> None:
+        """Report on no points for our stages that were not called: newer PDAL leaves them out."""
+        for ours in self.expanded.ours:
+            if not ours.reports:
+                ours.reports.append(runtime.run_on_nothing(ours.stage))
 
     def _check_inputs(self) -> None:
         """Open all inputs and check headers of LAS files, which PDAL may read as if whole."""
@@ -277,6 +264,57 @@ class Pipeline:
             near = suggest(named[0], [*stage_types(), *theirs])
             error.cure = f"{near}List the stages there are with: pdal-stages drivers"
         return error
+
+
+def execute_whole(
+    stages: list[dict[str, Any]],
+    outputs: Sequence[str],
+    sources: Sequence[str],
+    check: Callable[[], None],
+    *,
+    counted: bool = True,
+    **options: Any,
+) -> tuple[pdal_env.Execution, dict[str, str]]:
+    """Run plain stages in this process; their outputs appear whole or not at all.
+
+    Parameters
+    ----------
+    stages : list of dict
+    outputs : sequence of str
+        The final names of the files, in the order of their writers.
+    sources : sequence of str
+        The LAS files that the outputs are made from.
+    check : callable
+        Called when all is written, before any output gets its name; it may refuse.
+    counted : bool
+        Whether each file must hold all points that come out, but for a writer with a `where`.
+    **options
+        Those of :func:`.pdal.execute`.
+
+    Returns
+    -------
+    Execution, dict
+        The result, and final names by the paths that PDAL wrote to.
+    """
+    writers = list(filter(is_writer, stages))
+
+    def finish(partial: Path, final: Path, number: int) -> None:
+        every = counted and "where" not in writers[number] and "#" not in outputs[number]
+        check_complete(partial, final, writers[number], result.count if every else None)
+        las_output.finish(partial, sources, plane_unit(stages, result.metadata))
+
+    with whole_files(*outputs, check=finish) as partials:
+        run = with_outputs(stages, list(partials))
+        for number, stage in enumerate(run):
+            if is_writer(stage):
+                run[number] = las_output.uncompressed_writer(stage, run[:number])
+        with pdal_env.deferred_interrupts():
+            result = pdal_env.execute(run, **options)
+            pdal_env.check_interrupt()
+        compressed = las_output.compress(partials)
+        check()
+    names = {str(path): final for path, final in zip(partials, outputs, strict=True)}
+    return result, names | {old: names.get(new, new) for old, new in compressed.items()}
 
 
 def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override] = ()) -> Pipeline:

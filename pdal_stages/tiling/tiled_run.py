@@ -448,6 +448,12 @@ class _Run:
             task_of = partial(self._tile_task, number)
             for job in self._do(label, self._unkept(squares), task_of):
                 self.messages_before.append(job.record.get("messages", []))
+            reasons = {job.reason for job in squares}
+            if len(waiting) >= _HOPELESS and len(reasons) == 1 and "" not in reasons:
+                raise StageError(
+                    "all tiles failed for the same reason, so the run was stopped",
+                    found=reasons.pop(),
+                )
             for job in blocks:
                 job.fail_with(job.jobs)
             for _ in self._do("ground by blocks", self._unkept(blocks), self._block_task):

@@ -23,8 +23,8 @@ from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import LAS_WRITERS
 from ..pipeline.las_chunks import laspy_header, read_chunks
+from ..pipeline.run import execute_whole
 from ..pipeline.runtime import Callbacks
-from ..pipeline.spatial_reference import plane_unit
 from ..stages.points import class_counts
 from .checkpoint import load_arrays, written
 from .inputs import InputSource
@@ -171,31 +171,17 @@ def run_tail(
     The readers read `sources`, or parts of them. The `outputs` get their names once all are
     complete, and only while the run with the temporary folder `scratch` exists.
     """
-    writers = [stage for stage in tail if stage["type"].startswith("writers.")]
 
-    def finish(partial: Path, final: Path, number: int) -> None:
+    def check() -> None:
         if not Path(scratch).is_dir():  # the run was killed, and another one may be writing here
             raise StageError("the run that this belonged to has ended", found=scratch)
-        check_complete(
-            partial, final, writers[number], None if "where" in writers[number] else run.count
-        )
-        las_output.finish(partial, sources, plane_unit(stages, run.metadata))
 
     flags = las_output.files_with_flags_to_split([*readers, *tail])
     callbacks = Callbacks()
-    with whole_files(*outputs, check=finish) as partials:
-        stages, last = read_with(callbacks, readers, new, flags)
-        stages.append({"type": "filters.merge", "inputs": [last]})
-        waiting = iter(partials)
-        for stage in tail:
-            stage = {k: v for k, v in stage.items() if k != "inputs"}
-            if stage["type"].startswith("writers."):
-                stage = las_output.uncompressed_writer(
-                    {**stage, "filename": str(next(waiting))}, readers
-                )
-            stages.append(stage)
-        run = pdal_env.execute(stages, arrays=False)
-        las_output.compress(partials)
+    stages, last = read_with(callbacks, readers, new, flags)
+    stages.append({"type": "filters.merge", "inputs": [last]})
+    stages += [{k: v for k, v in stage.items() if k != "inputs"} for stage in tail]
+    run, _ = execute_whole(stages, outputs, sources, check, arrays=False)
     return {"outputs": written(outputs), "written": run.count}
 
 
