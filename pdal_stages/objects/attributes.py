@@ -19,7 +19,7 @@ SURE = "sure"
 CHECK = "check"
 #: Why an object is to be checked.
 REASONS = (
-    "no ground near", "small", "narrow", "low", "rough roof", "unsure points", "no facade",
+    "no ground near", "small", "narrow", "low", "unsure points", "no facade",
     "few points", "thin crown", "wide crown", "short", "not straight",
 )  # fmt: skip
 
@@ -32,8 +32,6 @@ class CheckRules:
     min_building_area: float = 10.0  #: sheds are kept, yet often something else
     min_building_width: float = 2.0  #: side of the square that it must hold; wires do not
     min_building_height: float = 2.2  #: of the ridge: a door's height
-    min_planar_share: float = 0.3  #: cells of a roof in a plane; less looks like vegetation
-    rough_from_area: float = 30.0  #: smaller roofs hold too few cells for planes
     facade_to_area: float = 50.0  #: larger buildings may hide their walls from the laser
     min_facade: float = 1.5  #: height between points of a cell at the edge that shows a wall
     min_tree_points: int = 10
@@ -116,7 +114,6 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
             "small": area < RULES.min_building_area,
             "narrow": not scipy.ndimage.binary_erosion(inside, square).any(),
             "low": ridge < RULES.min_building_height,
-            "rough roof": planar < RULES.min_planar_share and area >= RULES.rough_from_area,
             "no facade": facade == 0 and area < RULES.facade_to_area,
         },
     )
