@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.asprs import NAMES, UNINFORMATIVE, class_name
+from ..base.asprs import HIGH, LOW, MEDIUM, NAMES, UNINFORMATIVE
 from ..base.errors import StageError
 
 #: Largest label: that of uint16; Classification itself ends at 255.
@@ -107,11 +107,10 @@ class Merge:
             if target in NAMES and to[target] == target:
                 codes.add(target)
             if len(codes) > 1:
-                words = {class_name(code).split()[-1] for code in codes}
-                # Low, medium and high vegetation are vegetation; other classes share no word.
-                common = len(words) == 1 and all(code in NAMES for code in codes)
                 listed = ", ".join(map(str, sorted(codes)))
-                names[target] = words.pop().capitalize() if common else f"Classes {listed}"
+                names[target] = (
+                    "Vegetation" if codes <= {LOW, MEDIUM, HIGH} else f"Classes {listed}"
+                )
         return cls(to, names)
 
     @property
