@@ -257,9 +257,10 @@ class Survey:
             self.grid = TileGrid(self.grid.size, earlier["origin"])
         square = 1
         if len(plan.rounds) > 1:
-            halo = max(part.halo_m for part in plan.rounds[:-1]) / self.unit
+            halo = max(part.halo_m for part in plan.rounds) / self.unit
             square = tiles_per_square(self.options, self.density, self.grid.size, halo)
-        self.squares = self.grid.scaled(earlier["square"] if earlier else square)
+        self.tiles_per_square = round(earlier["square"]) if earlier else square
+        self.squares = self.grid.scaled(self.tiles_per_square)
 
     def _read_headers(self) -> None:
         odd: list[str] = []
@@ -333,7 +334,7 @@ class Survey:
     @property
     def layout(self) -> dict[str, float]:
         """The grids, for a run that resumes this one with another amount of free memory."""
-        square = round(self.squares.size / self.grid.size)
+        square = self.tiles_per_square
         return {"tile": self.grid.size, "origin": self.grid.origin, "square": square}
 
     def place(self) -> None:

@@ -194,8 +194,10 @@ def messages_on_folders(
     return messages
 
 
-def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> list[str]:
-    """Return warnings and notes of tiles and of the first round, once each, frequent ones first."""
+def messages_of(
+    tiles: list[Job], squares: list[Job], before: list[list[str]], most_points: int
+) -> list[str]:
+    """Return warnings and notes of tiles and earlier rounds, once each, frequent ones first."""
     done = [job for job in tiles if job.state == "done"]
     counts: Counter[str] = Counter()
     for lines in ([j.record.get("messages", []) for j in done if j.record.get("points")], before):
@@ -210,7 +212,7 @@ def messages_of(tiles: list[Job], before: list[list[str]], most_points: int) -> 
     messages = [f"{text} ({count_of(n, 'tile')})" for text, n in counts.most_common(_MOST_MESSAGES)]
     if len(counts) > _MOST_MESSAGES:
         messages.append(f"and {len(counts) - _MOST_MESSAGES} more; see --report")
-    if short := [job.name for job in done if job.record.get("short")]:
+    if short := [job.name for job in [*done, *squares] if job.record.get("short")]:
         messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
             "or terrain reach farther "

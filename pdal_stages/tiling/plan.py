@@ -66,7 +66,7 @@ class TilePlan:
 
     readers: list[dict[str, Any]]  #: as written
     head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its halo
-    rounds: list[Round]  #: the head in parts; the last one runs on the tiles
+    rounds: list[Round]  #: the head in parts; the last one, which may be empty, runs on the tiles
     #: Stages that process single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
     sees_m: float  #: meters around a tile within which points may matter
@@ -91,18 +91,22 @@ class TilePlan:
 
     @property
     def halo_m(self) -> float:
-        """Return the halo of a tile in meters."""
-        return self.rounds[-1].halo_m
+        """Return the widest halo in meters, but for the first of several rounds."""
+        return max(part.halo_m for part in self.rounds[1:] or self.rounds)
 
     @property
     def blocks(self) -> Blocks | None:
         """Return the blocks of the far-reaching stage, if there is one."""
         return next((part.blocks for part in self.rounds if part.blocks), None)
 
-    def for_one_tile(self) -> TilePlan:
-        """Return the plan for inputs that a single tile holds: nothing lies around it."""
-        count = len(self.head)
-        return replace(self, rounds=[Round(0, count, [0.0] * count, [0.0] * count, self.halo_m)])
+    def adapt(self, tiles: int, tiles_per_square: int) -> TilePlan:
+        """Return the plan for a number of tiles; nothing lies around a single one."""
+        count, rounds = len(self.head), self.rounds
+        if tiles == 1:
+            rounds = [Round(0, count, [0.0] * count, [0.0] * count, self.halo_m)]
+        elif tiles_per_square == 1 and len(rounds) > 1 and rounds[-1].begin == count:
+            rounds = rounds[:-1]  # the last squares are tiles
+        return replace(self, rounds=rounds)
 
 
 @dataclass(frozen=True)
@@ -258,7 +262,12 @@ def _rounds(readers: list[_Step], head: list[_Step], reaches: list[float]) -> li
         if blocks is not None:
             reaches = [*reaches[:at], 0.0, *reaches[at + 1 :]]
         open_ended = open_ended or (step.ours is not None and step.ours.open_ended)
-    return [*rounds, _round(head, reaches, begin, len(head))]
+    rounds.append(_round(head, reaches, begin, len(head)))
+    kept = _kept(readers, head)
+    if kept and rounds[-1].halo_m > _FAR_M:  # on squares, of which tiles then take their points
+        rounds[-1] = replace(rounds[-1], kept=kept)
+        rounds.append(_round(head, reaches, len(head), len(head)))
+    return rounds
 
 
 def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:

@@ -84,7 +84,7 @@ class _HeadRun:
         ours = [stage for stage in ready[part.begin : part.end] if stage is not None]
         pipeline = Pipeline(stages, whole=False, ready=ours)
         self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
-        if self._is_last:  # class codes of earlier rounds may still be changed
+        if part.end == len(plan.head):  # class codes of earlier rounds may still be changed
             check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
         for number, stage in self.expanded.items():
             used_m = part.used_m[self.steps[number] - part.begin]

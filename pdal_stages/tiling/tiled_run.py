@@ -208,7 +208,9 @@ class _Run:
             "peak_mb_of_a_worker": self.peak_mb,
         }
         most = survey.options.most_points
-        messages = survey.messages + messages_of(self.tiles, self.messages_before, most)
+        messages = survey.messages + messages_of(
+            self.tiles, self.squares, self.messages_before, most
+        )
         changed = survey.changed()
         return TiledRun(self.tiles, self.outputs, survey.unreadable, changed, messages, summary)
 
@@ -325,8 +327,7 @@ class _Run:
             if bad := [s.path for s in survey.near(tile, sees) if s.path in survey.unreadable]:
                 job.fail(f"an input here cannot be read: {bad[0]}", bad[0])
             self.tiles.append(job)
-        if len(self.tiles) == 1:
-            self.plan = plan.for_one_tile()
+        self.plan = plan.adapt(len(self.tiles), survey.tiles_per_square)
         if survey.per == "tile":
             named = outputs_for(plan, survey.paths, [job.name for job in self.tiles])
             for job, paths in zip(self.tiles, named, strict=True):
@@ -466,7 +467,7 @@ class _Run:
     def _points_of_squares(self) -> dict[tuple[int, int], int]:
         """Return the squares that have points, and how many."""
         points: Counter[tuple[int, int]] = Counter()
-        factor = round(self.survey.squares.size / self.survey.grid.size)
+        factor = self.survey.tiles_per_square
         for job in self.tiles:
             points[job.tile[0] // factor, job.tile[1] // factor] += job.points
         return points
@@ -489,8 +490,9 @@ class _Run:
                 squares[place] = squares.get(place) or self._square_job(number, place)
             return [squares[place] for place in places]
 
+        far = self.farthest if self.plan.rounds[number + 1].halo_m else 0.0
         for job in users:
-            box = grid.box(job.tile, self.farthest)
+            box = grid.box(job.tile, far)
             job.jobs = squares_in(box) if part.kept else []
         if part.blocks is None:
             return list(squares.values()), []
