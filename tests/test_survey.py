@@ -71,13 +71,6 @@ def whole(survey):
     return survey / "whole.laz"
 
 
-@pytest.fixture(scope="module")
-def fresh(survey):
-    """The four files in tiles, undisturbed."""
-    assert run(survey, survey / "in", survey / "fresh/", "--tile", 45) == 0
-    return contents(survey / "fresh")
-
-
 def values(*paths: Path) -> dict[str, np.ndarray]:
     """What was made of points, in an order of their own."""
     read = [laspy.read(path) for path in paths]
@@ -212,29 +205,6 @@ def test_a_cloud_beyond_the_memory_is_cut(survey, classify, whole, tmp_path):
     clouds.same_points(tmp_path / "cut.laz", whole)
     code, _, err = classify(survey / "town.laz", tmp_path / "cut.laz", "--memory", "0.2GB")
     assert code == 1 and "not enough memory" in err and "--memory" in err
-
-
-def test_ctrl_c_says_what_is_done_and_how_to_go_on(survey, classify, fresh, tmp_path, monkeypatch):
-    from pdal_stages.tiling import tiled_run as run
-
-    real, calls = run.run_tile, []
-
-    def some(context, tile, *rest):
-        calls.append(tile)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return real(context, tile, *rest)
-
-    monkeypatch.setattr(run, "run_tile", some)
-    code, out, err = classify(survey / "in", tmp_path / "out/", "--tile", 45)
-    assert (
-        code == 130 and "3 of 6 tiles done" in err and "--resume" in err and "pdal-stages" in err
-    ), err
-    assert re.search(r"\d of 4 files written", err)
-    monkeypatch.undo()
-    code, out, err = classify(survey / "in", tmp_path / "out/", "--resume")
-    assert code == 0 and "3 kept from an earlier run" in out, out + err
-    assert contents(tmp_path / "out") == fresh
 
 
 # ---- memory, and time left -------------------------------------------------------------------------------
