@@ -52,37 +52,14 @@ def random_net(inputs=("Z",), classes=3, configuration=TINY, spacing=3.0, seed=0
 
 def model_of(net, codes=(2, 5, 6)):
     """A network as a model, as training would leave it."""
+    from test_classifier_modelfile import manifest
+
     from pdal_stages.classifier.model import Model
 
-    info = {
-        "strategy": "multiclass",
-        "target": None,
-        "background": None,
-        "classes": [
-            {
-                "code": c,
-                "name": str(c),
-                "labels": [c],
-                "available": 9,
-                "samples": 9,
-                "duplicates": 0,
-            }
-            for c in codes
-        ],
-        "training": {
-            "clouds": [{"name": "a.laz", "points": 9}],
-            "count": 9,
-            "seed": 0,
-            "samples": 27,
-        },
-        "accuracy": {"cross_validation": None},
-        "preparation": [],
-        "algorithms": {},
-        "voxel": 0.0,
-        "densities": {"low": 1.0, "high": 9.0},
-        "passes": [{"importances": None}],
-        "created_by": {"pdal_stages": "0.1.0"},
-    }
+    classes = [
+        {**manifest()["classes"][0], "code": c, "name": str(c), "labels": [c]} for c in codes
+    ]
+    info = {**manifest(), "classes": classes, "passes": [{"importances": None}]}
     return Model((net,), [(c, str(c)) for c in codes], info)
 
 

@@ -11,7 +11,6 @@ from pdal_stages.alsnet.batches import (
     ball_query,
     build_pyramid,
     farthest_point_sampling,
-    halo_m,
     interpolation_weights,
     join_pyramids,
     random_order,
@@ -140,80 +139,7 @@ def test_points_are_in_four_batches_on_average():
     assert 3.8 < coverage(batches)[inside].mean() < 4.2
 
 
-@given(st.integers(0, 2**32))
-@settings(max_examples=15, deadline=None)
-def test_batches_do_not_depend_on_the_order_of_the_points(seed):
-    random = np.random.default_rng(seed)
-    xyz = np.round(random.random((1500, 3)) * 30, 1)  # many at the same place
-    inputs = random.integers(0, 3, (1500, 1))
-    shuffled = random.permutation(len(xyz))
-    one, other = Batches(xyz, 200, 5.0, inputs), Batches(xyz[shuffled], 200, 5.0, inputs[shuffled])
-    assert np.array_equal(one.centers, other.centers)
-    for number in range(len(one)):
-        a, b = one.members(number), shuffled[other.members(number)]
-        assert np.array_equal(xyz[a], xyz[b])
-        assert np.array_equal(inputs[a], inputs[b])
-
-
-def test_a_tile_with_its_halo_has_the_batches_of_the_whole():
-    xyz, _, _ = scene(20_000, 80.0)
-    dense = (xyz[:, 0] > 40) & (xyz[:, 0] < 42)
-    xyz = np.concatenate(
-        [
-            xyz,
-            np.repeat(xyz[dense], 9, axis=0)
-            + np.random.default_rng(0).random((9 * dense.sum(), 3)),
-        ]
-    )
-    spacing = 4.0
-    whole = Batches(xyz, 200, spacing)
-    low, high = np.array([30.0, 30.0]), np.array([45.0, 50.0])
-    own = ((xyz[:, :2] >= low) & (xyz[:, :2] < high)).all(axis=1)
-    around = ((xyz[:, :2] >= low - halo_m(spacing)) & (xyz[:, :2] < high + halo_m(spacing))).all(
-        axis=1
-    )
-    rows = np.flatnonzero(around)
-    tile = Batches(xyz[rows], 200, spacing)
-
-    def holding(batches, mine, back):
-        out = {}
-        for number in batches.holding(np.flatnonzero(mine)).tolist():
-            members = batches.members(number)
-            if mine[members].any():
-                out[tuple(batches.centers[number])] = back[members].tolist()
-        return out
-
-    assert holding(whole, own, np.arange(len(xyz))) == holding(tile, own[rows], rows)
-    assert (
-        len(np.unique(whole.sizes)) == 1 and len(whole) > (80 / spacing) ** 2
-    )  # some cells were quartered
-
-
 # ---- pyramids -----------------------------------------------------------------------------------------------
-
-
-def test_pyramid_shapes_and_who_is_where():
-    xyz, _, _ = scene(256, 6.0)
-    local = xyz - xyz.mean(axis=0)
-    local = local[random_order(local)]
-    pyramid = build_pyramid(local, np.zeros((256, 1), np.float32), TINY)
-    n, rows = len(local), local
-    for level, step in zip(TINY.levels, pyramid.steps, strict=True):
-        assert step.groups.shape == (level.centers, level.samples)
-        assert step.offsets.shape == (level.centers, level.samples, 3)
-        assert step.nearest.shape == step.weights.shape == (n, 3)
-        assert np.linalg.norm(step.offsets, axis=2).max() <= 1.0 + 1e-5
-        np.testing.assert_allclose(step.weights.sum(axis=1), 1.0, rtol=1e-5)
-        # a center is its own nearest coarse point
-        center = rows[step.groups[0, 0]] - step.offsets[0, 0] * level.radius
-        assert np.linalg.norm(rows - center, axis=1).min() < 1e-5
-        own = farthest_point_sampling(
-            rows,
-            level.centers,
-            0 if step is not pyramid.steps[0] else int(np.argmin((rows[:, :2] ** 2).sum(axis=1))),
-        )
-        assert np.array_equal(step.nearest[own, 0], np.arange(level.centers))
-        rows, n = rows[own], level.centers
 
 
 def test_stacked_pyramids_do_not_mix():

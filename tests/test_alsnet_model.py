@@ -5,11 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 from alsnet_scenes import TINY, coverage, model_of, random_net, scene
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pdal_stages import load_model
-from pdal_stages.alsnet.batches import Batches, build_pyramid, random_order
+from pdal_stages.alsnet.batches import Batches, build_pyramid
 from pdal_stages.alsnet.classifier import AlsNet, make_pyramid, normalize_inputs
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import model_file
@@ -59,32 +57,6 @@ def test_a_level_equals_a_computation_by_hand():
         scores = net.weights["scores"][:, :-1] @ row + net.weights["scores"][:, -1]
         expected.append(np.exp(scores) / np.exp(scores).sum())
     np.testing.assert_allclose(net.network(pyramid), expected, rtol=1e-4)
-
-
-@given(st.integers(0, 2**32), st.integers(1, 300))
-@settings(max_examples=20, deadline=None)
-def test_probabilities_belong_to_points_not_to_their_order(seed, n):
-    net = random_net(("Z",))
-    random = np.random.default_rng(seed)
-    xyz = np.round(random.random((n, 3)) * [8.0, 8.0, 3.0], 1)
-    shuffled = random.permutation(n)
-
-    def probabilities(points):
-        order = random_order(points)
-        out = np.empty((len(points), 3))
-        out[order] = net.network(
-            build_pyramid(points[order], points[order, 2:].astype(np.float32), TINY)
-        )
-        return out
-
-    whole = probabilities(xyz)
-    assert whole.shape == (n, 3)
-    np.testing.assert_allclose(whole.sum(axis=1), 1.0, rtol=1e-9)
-    other = probabilities(xyz[shuffled])
-    # points at one and the same place may swap, so rows are compared by place
-    for row in np.unique(xyz, axis=0)[:50]:
-        here, there = (xyz == row).all(axis=1), (xyz[shuffled] == row).all(axis=1)
-        assert np.array_equal(np.sort(whole[here], axis=0), np.sort(other[there], axis=0))
 
 
 # ---- clouds -----------------------------------------------------------------------------------------------

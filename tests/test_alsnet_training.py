@@ -281,16 +281,6 @@ def test_transfer_from_something_else_is_refused(tmp_path):
         fit(start_from=str(forest))
 
 
-@needs_torch
-def test_a_class_only_in_the_ground_held_out_is_an_error(monkeypatch):
-    from pdal_stages.alsnet import training_data
-
-    xyz, labels, values = scene()
-    monkeypatch.setattr(training_data, "hold_out", lambda xyz, position, *_: position == 2)
-    with pytest.raises(OptionError, match=r"class 6 .* outside the ground held out"):
-        fit([TrainingCloud(xyz, labels, values)], validation=0.5)
-
-
 # ---- checkpoints that lie ------------------------------------------------------------------------------------
 
 

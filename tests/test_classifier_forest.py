@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.ensemble import RandomForestClassifier
-from sklearn.tree import DecisionTreeClassifier
 
 from pdal_stages import TrainingOptions
 from pdal_stages.base.errors import ModelError
@@ -76,21 +75,6 @@ def test_equals_sklearn_on_any_forest(seed, trees, rows, depth, leaf):
     assert np.allclose(forest.predict_proba(query), oracle(forest, query), atol=1e-12)
 
 
-def test_values_on_either_side_of_a_threshold():
-    x, y = data(features=3)
-    reference = RandomForestClassifier(5, random_state=0, n_jobs=1).fit(x, y)
-    forest = Forest.from_sklearn(reference.estimators_, 3)
-    limits = np.concatenate(
-        [t.tree_.threshold[t.tree_.feature >= 0] for t in reference.estimators_]
-    )
-    near = limits.astype(np.float32)
-    query = np.stack(
-        [near, np.nextafter(near, np.float32(np.inf)), np.nextafter(near, np.float32(-np.inf))],
-        axis=1,
-    )
-    assert np.array_equal(forest.predict_proba(query), reference.predict_proba(query))
-
-
 def test_infinite_and_nan_values_do_not_break_the_walk():
     x, y = data()
     forest = Forest.from_sklearn(
@@ -99,24 +83,6 @@ def test_infinite_and_nan_values_do_not_break_the_walk():
     odd = np.full((40, 17), np.nan, np.float32)
     odd[:10], odd[10:20] = np.inf, -np.inf
     assert np.allclose(forest.predict_proba(odd).sum(axis=1), 1.0)
-
-
-def test_wrong_number_of_features_is_an_error():
-    x, y = data()
-    forest = Forest.from_sklearn(
-        RandomForestClassifier(2, random_state=0).fit(x, y).estimators_, 17
-    )
-    with pytest.raises(ModelError, match="17 features"):
-        forest.predict_proba(x[:, :16])
-
-
-def test_fractional_sample_weights_are_refused():
-    x, y = data()
-    tree = DecisionTreeClassifier(max_depth=2).fit(
-        x, y, sample_weight=np.random.default_rng(0).random(len(y))
-    )
-    with pytest.raises(ModelError, match="whole-number"):
-        Forest.from_sklearn([tree], 17)
 
 
 # ---- arrays that are no forest ---------------------------------------------------------------------------

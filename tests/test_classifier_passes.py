@@ -9,7 +9,7 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
-from pdal_stages.classifier import auto_context, model_file, train_forest
+from pdal_stages.classifier import auto_context, model_file
 from pdal_stages.classifier.training_options import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 
@@ -123,13 +123,6 @@ def test_empty_and_lone(two):
     assert lone.report.figures["classified"] == 1
 
 
-def test_binary():
-    model = learned(strategy="binary", target=6)
-    xyz, label, dimensions = scene(seed=3)
-    found = model.predict(xyz, dimensions).classification
-    assert set(np.unique(found)) == {1, 6} and (found == np.where(label == 6, 6, 1)).mean() > 0.9
-
-
 def test_the_file_holds_all_passes(three, other, tmp_path):
     xyz, _, dimensions = other
     three.save(tmp_path / "m")
@@ -194,17 +187,3 @@ def test_what_is_read_by_default_and_under_a_base(two):
     assert replace(alone, seed=3).context == DEFAULT_CONTEXT
     model = learned(context=None)
     assert model.passes[1].context.tokens == DEFAULT_CONTEXT and model.plan.halo_m >= 16.0
-
-
-def test_of_many_samples_a_tree_draws_some(monkeypatch):
-    def drawn(**more):
-        return learned(**more).info["training"]["max_samples"]
-
-    assert drawn() == 1.0  # 150 of each class
-    monkeypatch.setattr(train_forest, "PER_TREE", 60)
-    few = learned()
-    assert few.info["training"]["max_samples"] == 0.4
-    assert drawn(max_samples=0.9) == 0.9 and drawn(count=60) == 1.0
-    asked = learned(max_samples=0.4)
-    for one, same in zip(few.passes, asked.passes, strict=True):
-        assert np.array_equal(one.forest.threshold, same.forest.threshold)

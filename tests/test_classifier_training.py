@@ -5,7 +5,6 @@ import pytest
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError
-from pdal_stages.classifier import train_forest
 from pdal_stages.classifier.prediction import Prediction
 
 SMALL = {
@@ -38,6 +37,10 @@ def scene(seed=0, n=6000, origin=(0.0, 0.0, 0.0)):
         "NumberOfReturns": random.integers(1, 4, n).astype(np.uint8),
     }
     return xyz + origin, label, dimensions
+
+
+def learn(clouds, **more):
+    return train(clouds, TrainingOptions(**SMALL, **more), progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -153,15 +156,6 @@ def test_a_missing_dimension_names_itself_and_its_maker(trained, other):
         trained.predict(xyz, {"HeightAboveGround": np.zeros(3)})
 
 
-def test_intensity(other):
-    xyz, label, dimensions = scene()
-    options = TrainingOptions(**{**SMALL, "dimensions": "HeightAboveGround,Intensity"})
-    model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
-    assert model.plan.names[-2:] == model.required_dimensions == ("HeightAboveGround", "Intensity")
-    xyz, label, dimensions = other
-    assert accuracy(model.predict(xyz, dimensions), label) > 0.85
-
-
 # ---- training ------------------------------------------------------------------------------------------
 
 
@@ -218,38 +212,23 @@ def test_several_clouds_are_sampled_together_but_are_not_neighbors():
     assert np.array_equal(alone.algorithm.forest.threshold, twice.algorithm.forest.threshold)
 
 
-def test_errors_say_what_was_found(monkeypatch):
+@pytest.mark.parametrize(
+    ("labels", "more", "text"),
+    [
+        (lambda label: label, {"classes": [2, 9]}, r"class 9 .* has no samples .*2: "),
+        (np.ones_like, {}, r"at least two classes .*1: 500"),
+        (lambda label: label[:-1], {}, "differ in number"),
+        (lambda label: np.full_like(label, 7), {}, r"no points to train on.* 7, 18 are left out"),
+    ],
+)
+def test_errors_say_what_was_found(labels, more, text):
     xyz, label, dimensions = scene(n=500)
-    cloud = TrainingCloud(xyz, label, dimensions)
-    with pytest.raises(OptionError, match=r"class 9 .* has no samples .*2: "):
-        train([cloud], TrainingOptions(**SMALL, classes=[2, 9]), progress=False)
-    with pytest.raises(OptionError, match=r"at least two classes .*1: 500"):
-        train(
-            [TrainingCloud(xyz, np.ones(500, int), dimensions)],
-            TrainingOptions(**SMALL),
-            progress=False,
-        )
-    with pytest.raises(OptionError, match="differ in number"):
-        train(
-            [TrainingCloud(xyz, label[:-1], dimensions)], TrainingOptions(**SMALL), progress=False
-        )
+    with pytest.raises(OptionError, match=text):
+        learn([TrainingCloud(xyz, labels(label), dimensions)], **more)
     with pytest.raises(OptionError, match="no points to train on"):
-        train([], TrainingOptions(**SMALL), progress=False)
-    with pytest.raises(OptionError, match=r"no points to train on.* 7, 18 are left out"):
-        train(
-            [TrainingCloud(xyz, np.full(500, 7), dimensions)],
-            TrainingOptions(**SMALL),
-            progress=False,
-        )
+        learn([])
     with pytest.raises(OptionError, match="mask"):
-        train(
-            [TrainingCloud(xyz, label, dimensions, mask=label)],
-            TrainingOptions(**SMALL),
-            progress=False,
-        )
-    monkeypatch.setattr(train_forest, "free_memory", lambda: 1000)
-    with pytest.raises(OptionError, match="do not fit into the free memory"):
-        train([cloud], TrainingOptions(**SMALL), progress=False)
+        learn([TrainingCloud(xyz, label, dimensions, mask=label)])
 
 
 def test_binary():

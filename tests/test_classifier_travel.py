@@ -137,24 +137,6 @@ def test_surveys_weigh_alike():
     )
 
 
-def test_more_points_than_are_put_in_order_at_a_time(monkeypatch):
-    from pdal_stages.classifier import sampling
-
-    xyz, label, _ = scene(0, 6000)
-    position = np.searchsorted((2, 5, 6), label).astype(np.int16)
-    monkeypatch.setattr(sampling, "MOST", 300)
-    first = draw_samples([(xyz, position)], 3, 100, 0)
-    assert [first.counts(k)["samples"] for k in range(3)] == [100] * 3
-    p = np.random.default_rng(0).permutation(len(xyz))
-    other = draw_samples(
-        [(xyz[p][:2000], position[p][:2000]), (xyz[p][2000:], position[p][2000:])], 3, 100, 0
-    )
-    chosen = [np.vstack([part[r] for part, r in ((xyz, first.row),)]), None]
-    parts = (xyz[p][:2000], xyz[p][2000:])
-    rows = np.array([parts[c][r] for c, r in zip(other.cloud, other.row, strict=True)])
-    assert np.array_equal(rows, chosen[0])
-
-
 # ---- noise, one at a time ------------------------------------------------------------------------------
 
 

@@ -13,7 +13,6 @@ import pytest
 
 import pdal_stages
 from pdal_stages import load_model
-from pdal_stages.base.errors import ModelError
 from pdal_stages.classifier import model_file
 from pdal_stages.classifier.model_file import shipped
 from pdal_stages.cli import main
@@ -89,13 +88,6 @@ def test_a_new_feature_is_one_entry_and_one_line_and_changes_no_model(cloud, tmp
     assert found["classes"] == load_model(FROZEN).predict(cloud[0]).classification.tolist()
 
 
-def test_a_manifest_names_every_feature(cloud):
-    (one, _) = load_model(FROZEN).manifest()["passes"]
-    assert "features" not in one and one["neighborhoods"] == ["c1", "k10"]
-    assert one["feature_names"][:2] == ["Linearity_c1", "Planarity_c1"]
-    assert one["feature_names"][-1] == "SurfaceVariationStd_k10"
-
-
 def test_columns_in_another_order_are_read_by_their_names(cloud, tmp_path):
     """A file whose columns are in reverse order, with the trees that go with them, gives the same classes."""
     model = load_model(FROZEN)
@@ -111,16 +103,6 @@ def test_columns_in_another_order_are_read_by_their_names(cloud, tmp_path):
     model_file.write(tmp_path / "reverse.model", manifest, arrays)
     found = load_model(tmp_path / "reverse.model").predict(cloud[0]).classification
     assert np.array_equal(found, model.predict(cloud[0]).classification)
-
-
-def test_a_feature_of_another_release_is_refused_by_its_name(tmp_path):
-    model = load_model(FROZEN)
-    manifest = model.manifest()
-    manifest["passes"][0]["feature_names"][0] = "Colour_c1"
-    arrays = [one.arrays() for one in model.passes]
-    model_file.write(tmp_path / "new.model", manifest, arrays)
-    with pytest.raises(ModelError, match=r"this release does not have.*Colour_c1"):
-        load_model(tmp_path / "new.model")
 
 
 def test_the_table_of_features_is_the_registry():
@@ -141,16 +123,6 @@ def test_models_of_other_algorithms_warn_and_say_what_to_do(cloud):
 def test_shipped_models_are_of_the_algorithms_of_this_release():
     for name in shipped():
         assert load_model(name).outdated == [], f"build {name} anew: docs/models.md"
-
-
-def test_a_shipped_model_that_is_damaged_is_not_suggested_in_its_own_place(tmp_path, monkeypatch):
-    (tmp_path / "standard.model").write_bytes(b"cut short")
-    monkeypatch.setattr(model_file, "shipped", lambda: {"standard": tmp_path / "standard.model"})
-    with pytest.raises(ModelError, match="cut short or damaged") as caught:
-        load_model("standard")
-    assert "Did you mean" not in str(caught.value)
-    with pytest.raises(ModelError, match="Did you mean 'standard'"):
-        load_model("standrd")
 
 
 def test_the_shipped_model_is_described_in_words(capsys):

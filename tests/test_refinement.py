@@ -22,7 +22,7 @@ from pdal_stages.classifier import model_file
 from pdal_stages.classifier.auto_context import classify
 from pdal_stages.classifier.context_features import count_shares
 from pdal_stages.classifier.interface import PredictRequest
-from pdal_stages.classifier.refinement import EVEN, Blend, trust
+from pdal_stages.classifier.refinement import Blend
 from pdal_stages.classifier.training_clouds import label_classes
 from pdal_stages.features import FeatureEngine
 
@@ -70,13 +70,6 @@ def test_blended_equals_the_rule(said, grown, labeled, trusted):
 def test_without_trust_the_base_stands(said, grown):
     assert np.allclose(Blend(BEFORE, BEFORE, 0.0)(said, grown), said, atol=1e-12)
     assert np.allclose(Blend(BEFORE, BEFORE, 1.0)(said, grown), grown, atol=1e-9)
-
-
-def test_trust_grows_with_labels():
-    assert trust(0) == 0.0 and trust(EVEN) == 0.5
-    assert all(
-        a < b < 1.0 for a, b in zip(map(trust, range(99)), map(trust, range(1, 100)), strict=True)
-    )
 
 
 @pytest.fixture(scope="module")
@@ -148,23 +141,6 @@ def test_odd_numbers_anywhere_in_a_manifest(base, tmp_path):
                 refused += 1
                 assert "odd.model" in str(error), (at, odd)
     assert refused > 500
-
-
-def test_any_order_and_any_part(base):
-    model = on_top(base)
-    xyz, _, dimensions = scene(seed=7, n=4000)
-    whole = model.predict(xyz, dimensions, probabilities=True).probabilities
-    order = np.random.default_rng(1).permutation(len(xyz))
-    turned = model.predict(
-        xyz[order],
-        {k: np.asarray(v)[order] for k, v in dimensions.items()},
-        probabilities=True,
-        threads=1,
-    ).probabilities
-    assert np.array_equal(turned, whole[order])
-    where = xyz[:, 0] < np.median(xyz[:, 0])
-    part = model.predict(xyz, dimensions, where, probabilities=True).probabilities
-    assert np.array_equal(part[where], whole[where])
 
 
 def test_a_class_without_labels_is_kept(base):

@@ -8,7 +8,6 @@ from block_scene import QUICK_TRAINING
 
 import pdal_stages as ps
 from pdal_stages.base.errors import DimensionError
-from pdal_stages.classifier import train_forest
 from pdal_stages.cli import main
 
 QUICK = {"feature_set": "Linearity,HeightRange", "trees": 8, "passes": 1, "dimensions": ""}
@@ -51,25 +50,6 @@ def test_training_by_pipeline_prints_its_score(tmp_path, write_las, run_job):
     }
     code, _, err = run_job([tmp_path / "a.laz", {**writer, "count": 100, **QUICK}])
     assert code == 0 and "blocks held out" in err
-
-
-@pytest.mark.pdal
-def test_each_file_is_held_out_whole(tmp_path, write_las, monkeypatch):
-    """The fold of every sample is that of its file, whatever lies beside it."""
-    seen = []
-    split = train_forest.split
-    monkeypatch.setattr(
-        train_forest,
-        "split",
-        lambda xy, fold, *more: seen.append((xy, fold)) or split(xy, fold, *more),
-    )
-    files = [
-        write_las(tmp_path / f"t{n}.laz", scene(n, 70.0 * n), point_format=1) for n in range(7)
-    ]
-    assert main(words(tmp_path, *files)) == 0
-    xy, fold = seen[0]
-    file = np.floor_divide(xy[:, 0], 70.0).astype(int)
-    assert len(seen) == 5 and np.array_equal(fold, file % 5) and set(file) == set(range(7))
 
 
 @pytest.mark.pdal

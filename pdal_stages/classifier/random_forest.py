@@ -234,12 +234,9 @@ def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.N
     shares = tree.value[:, 0, :]
     # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are
     # whole.
-    exact = shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]
-    counts = np.rint(exact)
-    if tree.n_outputs != 1 or np.abs(counts - exact).max(initial=0) > 1e-3 or counts.max() >= 2**32:
-        raise ModelError(
-            "these trees were not grown with whole-number sample weights and one output"
-        )
+    counts = np.rint(
+        shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]
+    )
     left, right = tree.children_left, tree.children_right
     levels = [np.zeros(1, np.int64)]
     while len(splits := levels[-1][left[levels[-1]] >= 0]):
