@@ -65,7 +65,7 @@ def test_a_level_equals_a_computation_by_hand():
 def test_averages_equal_a_hand_computation():
     xyz, _, dimensions = scene(1500, 20.0)
     net = net_with()
-    request = PredictRequest(xyz, dimensions, variance=True)
+    request = PredictRequest(xyz, dimensions)
     ((_, mean, variance),) = net.predict(request)
     columns = normalize_inputs(xyz, dimensions, net.inputs, net.mean, net.scale)
     np.testing.assert_allclose(

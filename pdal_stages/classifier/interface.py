@@ -51,8 +51,6 @@ class PredictRequest:
     memory_mb: float = 256.0  #: for work under way
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
-    #: whether the variance over a network's batches is wanted
-    variance: bool = False
     device: str = "cpu"  #: where a network is applied
     report: Report = field(
         default_factory=Report

@@ -323,7 +323,6 @@ class Model:
             options.memory_mb,
             None if work.stands_for_others else progress,
             work.grid,
-            options.variance,
             options.device,
         )
         if request.count:

@@ -8,20 +8,13 @@ applied without the network's modules.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..base.errors import ModelError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from ..base.files import Output
     from .interface import PassClassifier
-    from .model import Model
-    from .training_clouds import TrainingCloud
-    from .training_options import TrainingOptions
 
 #: The kind of a forest on features.
 FOREST = "random_forest"
@@ -29,69 +22,44 @@ FOREST = "random_forest"
 REFINED_FOREST = "refined_forest"
 
 
-class Trainer(Protocol):
-    """Module that trains one kind of classifier."""
-
-    #: dimensions that training uses where the points have them -> the dimensions that each is
-    #: computed from
-    optional_inputs: Mapping[str, tuple[str, ...]]
-
-    def own_options(self, options: Any) -> Any:
-        """Return the checked options that only this kind has; None where it has none."""
-
-    def inputs(self, options: TrainingOptions) -> tuple[str, ...]:
-        """Return the dimensions that the classifier will read."""
-
-    def outputs(self, options: TrainingOptions) -> list[Output]:
-        """Return the files that training writes beside the model."""
-
-    def train(
-        self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool
-    ) -> Model:
-        """Train a model on clouds that are prepared already."""
-
-
-class Preprocessing(Protocol):
-    """Module that knows the stages that compute what a model reads, such as heights."""
-
-    def check(self, preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Return the stages in one spelling; ModelError for one that no model may carry."""
-
-    def algorithm_versions(self, preparation: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-        """Return the version of each stage's algorithm in this release, by its type."""
-
-    def preparation_of(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        """Return the stages that compute these dimensions, as far as they are heights."""
-
-    def made_of_coordinates(
-        self,
-        preparation: Sequence[Mapping[str, Any]],
-        xyz: npt.NDArray[np.float64],
-        usable: npt.NDArray[np.bool_] | None = None,
-        threads: int | None = None,
-        classes: npt.NDArray[np.uint8] | None = None,
-    ) -> dict[str, npt.NDArray[Any]]:
-        """Return the dimensions (n,) that the stages compute from coordinates (n, 3) in meters."""
-
-
 class _Kind(NamedTuple):
     classifier: Callable[[], type[PassClassifier]]
-    trainer: Callable[[], Trainer]
+    trainer: Callable[[], Any]
 
 
 _kinds: dict[str, _Kind] = {}
-_preprocessing: list[Callable[[], Preprocessing]] = []
+_preprocessing: list[Callable[[], Any]] = []
 
 
 def register_kind(
-    name: str, classifier: Callable[[], type[PassClassifier]], trainer: Callable[[], Trainer]
+    name: str, classifier: Callable[[], type[PassClassifier]], trainer: Callable[[], Any]
 ) -> None:
-    """Register a kind of classifier by the name that manifests and the option `algorithm` use."""
+    """Register a kind of classifier by the name that manifests and the option `algorithm` use.
+
+    Its trainer is a module with
+
+    - ``optional_inputs``: dimensions that training uses where the points have them, each with the
+      dimensions that it is computed from;
+    - ``own_options(options)``: the checked options that only this kind has, or None;
+    - ``inputs(options)``: the dimensions that the classifier will read;
+    - ``outputs(options)``: the files that training writes beside the model;
+    - ``train(clouds, options, progress)``: a ``Model``, trained on clouds that are prepared.
+    """
     _kinds[name] = _Kind(classifier, trainer)
 
 
-def register_preprocessing(load: Callable[[], Preprocessing]) -> None:
-    """Register the module that knows the stages which compute a model's dimensions."""
+def register_preprocessing(load: Callable[[], Any]) -> None:
+    """Register the module that knows the stages which compute a model's dimensions.
+
+    It has
+
+    - ``check(preparation)``: the stages in one spelling; ModelError for one that no model may have;
+    - ``algorithm_versions(preparation)``: the version of each stage's algorithm in this release;
+    - ``preparation_of(names)``: the stages that compute these dimensions, as far as they are
+      heights;
+    - ``made_of_coordinates(preparation, xyz, usable, threads, classes)``: the dimensions (n,) that
+      the stages compute from coordinates (n, 3) in meters.
+    """
     _preprocessing.append(load)
 
 
@@ -112,11 +80,11 @@ def classifier_of(name: str) -> type[PassClassifier]:
     return _kinds[kind].classifier()
 
 
-def trainer_of(name: str) -> Trainer:
+def trainer_of(name: str) -> Any:
     """Return the module that trains a kind, one of :func:`kinds`."""
     return _kinds[name].trainer()
 
 
-def preprocessing() -> Preprocessing:
+def preprocessing() -> Any:
     """Return the module that was registered."""
     return _preprocessing[-1]()

@@ -70,7 +70,10 @@ def train(
                 found=f"shape {np.shape(labels)}",
             )
         if dimensions is None:
-            options = _use_default_dimensions(options)
+            if tuple(options.dimensions) == DEFAULT_DIMENSIONS:
+                supported = trainer_of(options.algorithm).optional_inputs
+                more = (name for name in OPTIONAL_DIMENSIONS if name in supported)
+                options = replace(options, dimensions=(*DEFAULT_DIMENSIONS, *more))
             preparation = preprocessing().preparation_of(required_dimensions(options.inputs))
             usable = ~np.isin(np.asarray(labels), options.ignore)
             dimensions = preprocessing().made_of_coordinates(
@@ -81,15 +84,6 @@ def train(
     if options.base is None:
         model.record_preprocessing(preparation)
     return model
-
-
-def _use_default_dimensions(options: TrainingOptions) -> TrainingOptions:
-    """Return options with the optional dimensions of the kind, where the defaults are asked for."""
-    if tuple(options.dimensions) != DEFAULT_DIMENSIONS:
-        return options
-    supported = trainer_of(options.algorithm).optional_inputs
-    more = (name for name in OPTIONAL_DIMENSIONS if name in supported)
-    return replace(options, dimensions=(*DEFAULT_DIMENSIONS, *more))
 
 
 def _train_prepared(

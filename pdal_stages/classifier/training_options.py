@@ -51,12 +51,6 @@ def _check_tree_numbers(what: str, value: Any) -> tuple[int, ...]:
     return tuple(sorted({checks.whole(what, each, 1, 10_000) for each in _listed(value)}))
 
 
-def _check_name(what: str, value: Any) -> str:
-    if not isinstance(value, str):
-        raise OptionError(f"{what} must be the name of a dimension", found=repr(value)[:60])
-    return value
-
-
 def _check_folds(what: str, value: Any) -> int:
     if (folds := checks.whole(what, value, 0, 1000)) == 1:
         raise OptionError(f"{what} must be 0 or at least 2", found=1)
@@ -214,7 +208,6 @@ class TrainingOptions(Settings):
         "Dimension, such as the number of a tile or flight, whose points of the same value are "
         "held out together, so that "
         "the score is for tiles or flights that the model has not seen",
-        check=_check_name,
     )
     passes: Any = setting(
         None,
