@@ -52,10 +52,6 @@ def train(
         Instead of a temporary one.
     progress : bool
         Whether to show progress on stderr.
-
-    Raises
-    ------
-    OptionError, DimensionError
     """
     if isinstance(labels, TrainingOptions):
         options, labels = labels, None
