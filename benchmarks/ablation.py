@@ -313,13 +313,12 @@ ROWS: dict[str, dict[str, Row]] = {
     "wires": {
         "as it is": Row(),
         "any neighbors": rule(wires, max_neighbors=10**6),
-        "ends are not lengthened": rule(wires, min_filled_side=99),
+        "thick layers": rule(wires, max_thickness_m=9.0),
         "the air around may be full": rule(wires, max_around_ratio=1e9),
-        "less may be seen below": rule(wires, min_seen_ratio=0.0),
-        "sides may differ": rule(wires, min_side_ratio=0.0),
-        "lines may hide": rule(wires, min_clear_share=0.0),
-        "any length": rule(wires, min_length_m=0.0),
+        "a third of the air may be full": rule(wires, max_around_ratio=0.34),
+        "any length": rule(wires, min_length_m=1.0),
         "no gaps": rule(wires, hop_m=1.0),
+        "no bend": rule(wires, max_bend=0.0),
     },
     "towers": {
         "as it is": Row(),
