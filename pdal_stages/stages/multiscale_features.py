@@ -72,10 +72,7 @@ class MultiscaleFeatures(Stage):
         unit="m",
     )
     memory: int = option(
-        "integer",
-        512,
-        "Memory for blocks of points, in addition to the cloud itself",
-        minimum=16,
+        *("integer", 512, "Memory for blocks of points, in addition to the cloud itself", 16),
         unit="MB",
     )
 
