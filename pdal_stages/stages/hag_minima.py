@@ -31,11 +31,7 @@ class HagMinima(Stage):
         unit="m",
     )
     resolution: float = option(
-        "number",
-        0.5,
-        "Side of the fine cells on which the terrain is evaluated",
-        *(0.05, 10_000),
-        unit="m",
+        "number", 0.5, "Side of the fine cells of the terrain", 0.05, 10_000, unit="m"
     )
     ignore: Selection = ignore_option("Points that do not form the terrain but get heights")
 

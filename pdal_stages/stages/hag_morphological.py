@@ -62,11 +62,7 @@ class HagMorphological(FarReaching):
         unit="m",
     )
     threshold: float = option(
-        "number",
-        0.5,
-        "Maximum distance of a ground point from the ground surface",
-        *(0, 1000),
-        unit="m",
+        "number", 0.5, "Maximum distance of ground points from the surface", 0, 1000, unit="m"
     )
     scalar: float = option(
         "number", 1.25, "Added to the threshold per unit of the terrain's slope", 0, 1000
