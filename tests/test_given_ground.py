@@ -12,7 +12,6 @@ from pdal_stages.classifier.model import load_model
 from pdal_stages.cli import main
 from pdal_stages.pipeline.expansion import settle_upstream
 from pdal_stages.stages.registry import stage_from
-from pdal_stages.terrain.classified_ground import reach_of_given
 from pdal_stages.terrain.heights import filtered_ground
 from pdal_stages.terrain.smrf import FilterOptions
 
@@ -70,7 +69,7 @@ def test_points_as_far_as_its_reach_decide():
     xyz, codes = clip("woods")
     whole = filtered_ground(xyz, given=codes == 2, openings=(5, 17))
     middle = np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20
-    near = np.flatnonzero(np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20 + reach_of_given(OPTIONS))
+    near = np.flatnonzero(np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20 + OPTIONS.reach_of_given)
     assert len(near) < 0.9 * len(xyz)
     near = np.random.default_rng(0).permutation(near)
     part = filtered_ground(xyz[near], given=codes[near] == 2, openings=(5, 17))

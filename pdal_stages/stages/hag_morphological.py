@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import GROUND
 from ..base.errors import NoTerrainError
-from ..terrain.classified_ground import reach_of_given
 from ..terrain.ground_blocks import (
     BLOCK_SIDE,
     GroundCells,
@@ -28,7 +26,7 @@ from .options import Selection, ignore_option, option
 from .points import Points
 
 #: The options of the filter.
-_FILTER = tuple(field.name for field in fields(FilterOptions))
+_FILTER = ("cell", "slope", "window", "threshold", "scalar", "openings")
 #: Cells along the side of squares of a block that a tile reads by themselves.
 _PART = 256
 
@@ -90,7 +88,9 @@ class HagMorphological(FarReaching):
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
-        self._filter = FilterOptions(**{name: self.options[name] for name in _FILTER})
+        self._filter = FilterOptions(
+            **{name: self.options[name] for name in _FILTER}, slope_too=self.terrain_slope
+        )
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""
@@ -108,7 +108,7 @@ class HagMorphological(FarReaching):
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
         if self.given_ground:
-            return reach_of_given(self._filter) * self.cell
+            return self._filter.reach_of_given * self.cell
         return self._filter.reach_of_points * self.cell
 
     def blocks(self) -> Blocks | None:
@@ -162,7 +162,6 @@ class HagMorphological(FarReaching):
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
             **vars(self._filter),
-            slope_too=self.terrain_slope,
             threads=self.threads,
             cells=context.blocks,
             figures=points.report.figures,

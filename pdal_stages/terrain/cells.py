@@ -1,9 +1,5 @@
-"""Cells of grids anchored to absolute coordinates: what lies lowest in them, which belong together,
-sums around them.
-
-Points are cut into pieces whose rasters are small wherever points lie: groups far apart, and
-squares with surroundings.
-"""
+"""Points in cells of grids that are anchored to absolute coordinates: the lowest ones, vertical
+layers, sums around cells."""
 
 from __future__ import annotations
 
@@ -17,13 +13,13 @@ from ..base.grid import begins_run, cell_keys, cell_numbers
 HOLE = np.float32(np.inf)
 #: Heights beyond this, in meters, are no terrain, and too much for the sums.
 HIGHEST = 1e6
-#: Levels of a cell are so many meters apart, at least.
+#: Least distance of the vertical layers of a cell, in meters.
 GAP = 1.0
 
 
 def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
-    """Sums of whole numbers (h, w, ...) over the square that goes `reach` cells to every side of
-    each cell."""
+    """Sum whole numbers (h, w, ...) over the square that goes `reach` cells to every side of each
+    cell."""
     sums = np.asarray(values)
     for axis in (0, 1):
         total = np.moveaxis(np.cumsum(sums, axis, np.int64), axis, 0)
@@ -35,8 +31,8 @@ def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
 
 
 def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDArray[np.float64]]:
-    """Three arrays of one length, from three or from one of shape (n, 3); StageError where shapes
-    differ."""
+    """Return three arrays of one length, from three or from one of shape (n, 3); StageError where
+    shapes differ."""
     if y is None and z is None:
         xyz = np.asarray(x, np.float64)
         if xyz.ndim != 2 or xyz.shape[1] != 3:
@@ -44,18 +40,18 @@ def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDAr
                 "points must be an array of shape (n, 3), or x, y and z", found=xyz.shape
             )
         return [np.ascontiguousarray(column) for column in xyz.T]
-    made = [np.ascontiguousarray(np.asarray(a, np.float64)) for a in (x, y, z)]
-    if not (made[0].shape == made[1].shape == made[2].shape and made[0].ndim == 1):
+    axes = [np.ascontiguousarray(np.asarray(a, np.float64)) for a in (x, y, z)]
+    if not (axes[0].shape == axes[1].shape == axes[2].shape and axes[0].ndim == 1):
         raise StageError(
             "x, y and z must be one-dimensional and of one length",
-            found=tuple(a.shape for a in made),
+            found=tuple(a.shape for a in axes),
         )
-    return made
+    return axes
 
 
 def usable(*axes: NDArray[np.float64], mask: ArrayLike | None = None) -> NDArray[np.bool_]:
-    """Which points (n,) have finite coordinates, and are of the mask where one is given; StageError
-    where that differs."""
+    """Return which points (n,) have finite coordinates, and are in the mask where there is one;
+    StageError where its shape differs."""
     use = np.logical_and.reduce([np.isfinite(axis) for axis in axes])
     if mask is None:
         return use
@@ -74,8 +70,8 @@ def lowest_points(
     cell: NDArray[np.int64],
     count: int,
 ) -> NDArray[np.int64]:
-    """Numbers of the points that are the lowest of each of `count` cells, by the numbers of these;
-    -1 where there is none.
+    """Return the indices of the lowest points of each of `count` cells, by the numbers of these; -1
+    where a cell has none.
 
     Of points of one height the first by x, then y, is taken, so that order does not matter.
     """
@@ -100,18 +96,18 @@ def lowest_of_cells(
 
     Coordinates are finite, in meters.
     """
-    mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
-    x, y, z = x[mine], y[mine], z[mine]
+    usable_ones = np.flatnonzero(use & (np.abs(z) < HIGHEST))
+    x, y, z = x[usable_ones], y[usable_ones], z[usable_ones]
     key = cell_keys(cell_numbers(x, cell), cell_numbers(y, cell))
     cells, number = np.unique(key, return_inverse=True)
-    return mine[lowest_points(x, y, z, number, len(cells))]
+    return usable_ones[lowest_points(x, y, z, number, len(cells))]
 
 
 def levels(
     z: NDArray[np.float64], cell: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Points (n,) in the order of their cells' numbers (small ones) and of their heights, and which
-    begin a level of a cell.
+    """Order points (n,) by the numbers of their cells (small ones) and by height; return the order,
+    and which begin a vertical layer of a cell.
 
     A cell's points are parted where a gap is wide: the ground and the deck over it, a roof and what
     it stands on. The lowest points of levels are levels again, each by itself, so they stand for

@@ -13,8 +13,7 @@ from .cells import HOLE
 
 @device
 def root_of(parent, member):
-    """The member that stands for a set, in sets that are joined one by one; the way to it gets
-    shorter for who asks next."""
+    """Return the member that stands for a set, and shorten the path to it."""
     while parent[member] != member:
         parent[member] = parent[parent[member]]
         member = parent[member]
@@ -23,8 +22,8 @@ def root_of(parent, member):
 
 @njit
 def number_sets(one, other, number):
-    """Number alike the members (n,) of each set that the pairs join, in the order of first members;
-    how many sets there are.
+    """Number alike the members (n,) of each set that pairs join, in the order of first members;
+    return the number of sets.
 
     By hand: scipy.sparse.csgraph takes 0.4 s to be imported.
     """
@@ -42,22 +41,22 @@ def number_sets(one, other, number):
 
 @njit
 def _linked(padded, offsets, steps, reach, number):
-    """Number the measured cells of each linked set alike; returns how many sets there are."""
+    """Number alike the measured cells of each linked set; return the number of sets."""
     h, w = number.shape
     parent = np.arange(h * w)
     for j in range(h):
         for i in range(w):
-            here, mine = padded[j, i + reach], root_of(parent, j * w + i)
+            here, root = padded[j, i + reach], root_of(parent, j * w + i)
             if here == HOLE:
                 continue
             for k in range(len(steps)):
                 b, a = j + offsets[k, 0], i + offsets[k, 1]
                 if (
-                    abs(padded[b, a + reach] - here) <= steps[k] and parent[b * w + a] != mine
+                    abs(padded[b, a + reach] - here) <= steps[k] and parent[b * w + a] != root
                 ):  # nor a hole
                     other = root_of(parent, b * w + a)
-                    mine, other = min(mine, other), max(mine, other)
-                    parent[other] = mine
+                    root, other = min(root, other), max(root, other)
+                    parent[other] = root
     count = 0
     for j in range(h):
         for i in range(w):
@@ -76,8 +75,8 @@ def linked_cells(
     reach: float,
     step: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Number of each cell's set (h, w), -1 in holes; sizes of the sets (n,), and their
-    :func:`longest_sides`.
+    """Return the number of each cell's set (h, w), -1 in holes; the sizes of the sets (n,), and
+    their :func:`longest_sides`.
 
     Cells at most `reach` away from each other are linked across a `step` of meters, by the distance
     in cells.
@@ -99,8 +98,8 @@ def linked_cells(
 def longest_sides(
     label: NDArray[np.int64], places: Sequence[NDArray[np.int64]], count: int
 ) -> NDArray[np.int64]:
-    """Of each of `count` sets of places, the difference of its last and first along each axis: the
-    largest one."""
+    """Return the longest side of each of `count` sets of places: the largest difference along an
+    axis."""
     sides = np.zeros((len(places), count), np.int64)
     for side, at in zip(sides, places, strict=True):
         first, last = np.full((2, count), at[0] if len(at) else 0)

@@ -1,10 +1,11 @@
-"""Blocks of the ground's raster: made once of the lowest points far around and of all points
-inside; tiles put them together."""
+"""Blocks of the ground's raster, computed once from the lowest points far around and all points
+inside; tiles join them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from ..base.grid import GridWindow, cell_keys, cell_numbers, group_by_key
 from .cells import HIGHEST, HOLE, lowest_of_cells
 from .openings import FILL_RINGS
 from .smrf import (
-    NEAR,
     CellMeans,
     FilterOptions,
     GroundPoints,
@@ -21,7 +21,7 @@ from .smrf import (
     ground_raster,
     means_of,
 )
-from .surface import GroundRaster, around, heights_above, surface
+from .surface import GroundRaster, cells_around, heights_above, surface
 from .surface import reach as planes_reach
 
 #: Side of a block in cells.
@@ -29,32 +29,33 @@ BLOCK_SIDE = 1024
 
 
 def reach_of_block(options: FilterOptions) -> int:
-    """How far around a block, in cells, lowest points matter."""
-    return options.reach + _beside(options)
+    """Return how far around a block, in cells, lowest points matter."""
+    return options.reach + _reach_of_ground(options)
 
 
-def _beside(options: FilterOptions) -> int:
-    """How far around a block, in cells, it must be known which cells are ground: points are told
-    from a surface."""
-    return planes_reach(options.levels(NEAR)) + 4
+def _reach_of_ground(options: FilterOptions) -> int:
+    """Return how far around a block, in cells, it must be known which cells are ground: the
+    provisional surface of its points is fitted through these."""
+    return planes_reach(options.near_levels) + 4
 
 
-class GroundCells(NamedTuple):
-    """Cells of a :class:`.surface.GroundRaster`, one by one: all with a height, an opening, or
-    ground points."""
+@dataclass(frozen=True)
+class GroundCells:
+    """The cells of a :class:`.surface.GroundRaster` that have a height, an opening, or ground
+    points, as records."""
 
     cells: NDArray[np.void]  #: (n,) records, see `_record`
 
     def in_parts(self, side: int) -> dict[str, NDArray]:
-        """All by name, for files: those of squares of so many columns and rows by themselves."""
+        """Return the cells of each square of `side` columns and rows by the square's name, for
+        files."""
         column, row = (self.cells[name].astype(np.int64) // side for name in ("column", "row"))
         parts = group_by_key(cell_keys(column, row))
         return {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
 
     @staticmethod
     def names_within(side: int, west: int, south: int, east: int, north: int) -> set[str]:
-        """Names of the arrays of :meth:`in_parts` that are needed for the cells of these columns
-        and rows."""
+        """Return the names of the arrays of :meth:`in_parts` that hold these columns and rows."""
         columns, rows = (
             range(low // side, high // side + 1) for low, high in ((west, east), (south, north))
         )
@@ -62,12 +63,12 @@ class GroundCells(NamedTuple):
 
     @staticmethod
     def of_blocks(blocks: Iterable[Mapping[str, NDArray]], openings: int) -> GroundCells:
-        """The cells that arrays of :meth:`in_parts` hold, of filters with so many openings."""
+        """Join arrays of :meth:`in_parts`, of a filter with that number of openings."""
         parts = (part for block in blocks for part in block.values())
         return GroundCells(np.concatenate([np.empty(0, _record(openings)), *parts]))
 
-    def on(self, window: GridWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
-        """The cells of a window on its raster, and what their ground points say."""
+    def raster(self, window: GridWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
+        """Return the raster of a window, and the means of its ground points."""
         shape = window.height, window.width
         cells = self.cells[window.contains(self.cells["column"], self.cells["row"])]
         at = cells["row"] - window.bottom, cells["column"] - window.left
@@ -90,8 +91,8 @@ class GroundCells(NamedTuple):
 
 
 def _record(openings: int) -> np.dtype:
-    """Of a cell: as in a :class:`.surface.GroundRaster`; whether it holds ground points, and their
-    mean place."""
+    """Return the type of a cell's record: as in a :class:`.surface.GroundRaster`; whether it holds
+    ground points, and their mean place."""
     return np.dtype(
         [
             *((name, np.int32) for name in ("column", "row")),
@@ -110,13 +111,13 @@ def by_block(
     use: NDArray[np.bool_],
     cell: float,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Those of points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds them;
-    meters."""
-    mine = np.flatnonzero(use & (np.abs(z) < HIGHEST))
-    column, row = (cell_numbers(axis[mine], cell) // BLOCK_SIDE for axis in (x, y))
+    """Return the points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds
+    them; meters."""
+    rows = np.flatnonzero(use & (np.abs(z) < HIGHEST))
+    column, row = (cell_numbers(axis[rows], cell) // BLOCK_SIDE for axis in (x, y))
     parts = group_by_key(cell_keys(column, row))
     return {
-        (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[mine[p]] for axis in (x, y, z)])
+        (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[rows[p]] for axis in (x, y, z)])
         for p in parts
     }
 
@@ -128,7 +129,7 @@ def around_blocks(
     use: NDArray[np.bool_],
     options: FilterOptions,
 ) -> NDArray[np.float64]:
-    """Return the points (n, 3) that must be known around blocks: the lowest of each cell."""
+    """Return the points that blocks around need: the lowest of each cell (n, 3), meters."""
     low = lowest_of_cells(x, y, z, use, options.cell)
     return np.column_stack([axis[low] for axis in (x, y, z)])
 
@@ -139,52 +140,70 @@ def cells_of_block(
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
 ) -> GroundCells:
-    """The cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
+    """Compute the cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
 
     `outer` is (n, 3) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the
     block, and few more. `points` are all that may be ground in the block, in parts (n, 3).
     """
-    own = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
-    cell, openings = options.cell, options.opening_radii
+    core = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     # Openings reach into cells without points.
-    spill = max([*openings, 0]) + FILL_RINGS + 2
-    margin = max(spill, _beside(options))
-
-    def usable(xyz: NDArray[np.float64]) -> GroundPoints:
-        x, y, z = np.ascontiguousarray(xyz.T)
-        return GroundPoints.of(x, y, z, np.ones(len(x), bool), cell)
-
-    low = usable(outer)
-    if not own.padded(margin).contains(low.column, low.row).any():
-        return GroundCells.of_blocks([], len(openings))
-    raster, _ = ground_raster(low, options, margin=spill, wanted=own.padded(margin))
-    inside = low.some(own.contains(low.column, low.row))
-    needed = around(raster.window, inside.column, inside.row)
-    planes = surface(raster, options.levels(NEAR), needed)
-    # With a ring around: points blend the four cells round them.
-    kept = own.padded(1).intersect(raster.window)
+    spill = max([*options.opening_radii, 0]) + FILL_RINGS + 2
+    margin = max(spill, _reach_of_ground(options))
+    low = _in_cells(outer, options)
+    if not core.padded(margin).contains(low.column, low.row).any():
+        return GroundCells.of_blocks([], len(options.openings))
+    raster, _ = ground_raster(low, options, margin=spill, wanted=core.padded(margin))
+    inside = low.take(core.contains(low.column, low.row))
+    needed = cells_around(raster.window, inside.column, inside.row)
+    planes = surface(raster, options.near_levels, needed)
+    # With a ring around: points blend the four cells around them.
+    kept = core.padded(1).intersect(raster.window)
     raster, planes = raster.cut(kept), planes[kept.slices_in(raster.window)].copy()
-    left, bottom, _, _ = kept
-    count, means = np.zeros(raster.shape, np.int64), np.zeros((*raster.shape, 3))
-    for xyz in points:
-        some = usable(xyz)
+    means = _ground_means(points, planes, kept, options)
+    return GroundCells(_records(raster, core, means, options.opening_radii))
+
+
+def _in_cells(xyz: NDArray[np.float64], options: FilterOptions) -> GroundPoints:
+    """Return points (n, 3), all of which may be ground, with their cells."""
+    x, y, z = np.ascontiguousarray(xyz.T)
+    return GroundPoints.in_cells(x, y, z, np.ones(len(x), bool), options.cell)
+
+
+def _ground_means(
+    parts: Iterable[NDArray[np.float64]],
+    planes: NDArray[np.float64],
+    window: GridWindow,
+    options: FilterOptions,
+) -> CellMeans:
+    """Find the ground among the points of parts (n, 3) by the planes (h, w, 3) of a window, and
+    return its means by cell."""
+    cell, corner = options.cell, window[:2]
+    count, place = np.zeros(window.shape, np.int64), np.zeros((*window.shape, 3))
+    for xyz in parts:
+        points = _in_cells(xyz, options)
         height, gradient = np.empty((2, len(xyz)))
-        heights_above(*some[:3], cell, left, bottom, planes, height, gradient)
-        is_ground = options.is_ground(some.use, height, gradient)
-        add_ground(*some[:3], is_ground, some.column, some.row, cell, left, bottom, count, means)
-    held = means_of(count, means)
-    opened = np.empty((*raster.shape, len(openings)), np.float32)
-    for k, radius in enumerate(openings):
+        heights_above(*points[:3], cell, corner, planes, height, gradient)
+        is_ground = options.is_ground(points.use, height, gradient)
+        add_ground(points, is_ground, cell, corner, count, place)
+    return means_of(count, place), place
+
+
+def _records(
+    raster: GroundRaster, core: GridWindow, means: CellMeans, radii: list[int]
+) -> NDArray[np.void]:
+    """Return the records (n,) of the cells of a raster that lie in the core and are not empty."""
+    held, places = means
+    opened = np.empty((*raster.shape, len(radii)), np.float32)
+    for k, radius in enumerate(radii):
         opened[..., k] = raster.opened[radius]
-    there = np.zeros(raster.shape, bool)
-    there[own.intersect(kept).slices_in(kept)] = True
-    there &= np.isfinite(raster.lowest) | held | np.isfinite(opened).any(axis=-1)
-    j, i = np.nonzero(there)
-    cells = np.empty(len(j), _record(len(openings)))
-    for name, values in (
-        ("lowest", raster.lowest), ("floor", raster.floor), ("ground", raster.ground),
-        ("held", held), ("place", raster.place), ("means", means), ("opened", opened),
-    ):  # fmt: skip
-        cells[name] = values[there]
-    cells["column"], cells["row"] = i + left, j + bottom
-    return GroundCells(cells)
+    filled = np.zeros(raster.shape, bool)
+    filled[core.intersect(raster.window).slices_in(raster.window)] = True
+    filled &= np.isfinite(raster.lowest) | held | np.isfinite(opened).any(axis=-1)
+    j, i = np.nonzero(filled)
+    cells = np.empty(len(j), _record(len(radii)))
+    for name in ("lowest", "floor", "ground", "place"):
+        cells[name] = getattr(raster, name)[filled]
+    for name, values in (("held", held), ("means", places), ("opened", opened)):
+        cells[name] = values[filled]
+    cells["column"], cells["row"] = i + raster.window.left, j + raster.window.bottom
+    return cells

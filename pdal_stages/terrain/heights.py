@@ -1,9 +1,9 @@
 """Height above filtered ground: a progressive morphological filter with identical results in tiles.
 
-After SMRF [P13]: the grid of lowest points is opened with growing windows; a cell that an opening
-lowers by more than `slope` times the window's radius is an object; what is left is ground, a
-surface is fitted through it, and a point is ground if it lies within `threshold` plus `scalar`
-times the terrain's slope of the surface. Unlike there:
+After SMRF [P13]: the minimum grid is opened with growing windows; a cell that an opening lowers by
+more than `slope` times the window's radius is an object; a provisional surface is fitted through
+the other cells, and a point is ground if it lies within `threshold` plus `scalar` times the
+terrain's slope of it. Unlike there:
 
 * the grid is anchored to absolute coordinates and every step reaches a bounded way, so that a tile
   with its halo gets the bits of the whole cloud, and so does any order of the points;
@@ -25,33 +25,41 @@ classification of airborne LIDAR data. ISPRS Journal of Photogrammetry and Remot
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.grid import GridWindow
 from ..base.threads import map_blocks
-from .cells import HIGHEST, columns, usable
-from .classified_ground import given_pieces
+from .cells import HIGHEST, HOLE, columns, usable
 from .ground_blocks import GroundCells
-from .openings import above_opening, opening_names
+from .openings import FILL_RINGS, above_opening, fill_holes, opening_names, openings_of
 from .pieces import patches
 from .smrf import (
-    FAR,
-    NEAR,
     CellMeans,
     FilterOptions,
     GroundPoints,
     add_ground,
     ground_raster,
     means_of,
+    minimum_grid,
 )
-from .surface import GroundRaster, around, heights_above, surface
+from .surface import GroundRaster, cells_around, heights_above, surface
 
 #: Points handed to a thread at a time.
 _SPAN = 1 << 17
+
+
+class _Piece(NamedTuple):
+    """A piece of a cloud and its ground."""
+
+    rows: Any  #: indices of its points, and of those around that matter; or a slice
+    core: Any  #: which of these belong to the piece, or a slice
+    raster: GroundRaster
+    means: CellMeans | None = None  #: means of the ground points, where they are known
 
 
 def filtered_ground(
@@ -60,19 +68,13 @@ def filtered_ground(
     z: ArrayLike | None = None,
     *,
     mask: ArrayLike | None = None,
-    cell: float = 1.0,
-    slope: float = 0.1,
-    window: float = 18.0,
-    threshold: float = 0.5,
-    scalar: float = 1.25,
-    openings: Sequence[float] = (),
-    slope_too: bool = False,
+    given: ArrayLike | None = None,
+    cells: GroundCells | None = None,
     threads: int | None = None,
     figures: dict[str, Any] | None = None,
-    cells: GroundCells | None = None,
-    given: ArrayLike | None = None,
+    **options: Any,
 ) -> dict[str, NDArray]:
-    """Height of every point above the ground that a progressive morphological filter finds.
+    """Compute heights above the ground that a progressive morphological filter finds.
 
     Parameters
     ----------
@@ -80,162 +82,177 @@ def filtered_ground(
         Coordinates in meters; or `x` alone, of shape (n, 3).
     mask : array_like of bool, shape (n,), optional
         Points that may be ground, e.g. all but noise; the others only receive heights.
-    cell : float, default 1
-        Side of the grid's cells, meters.
-    slope : float, default 0.1
-        Rise over run: a window of radius r removes what it lowers by more than `slope` times r.
-    window : float, default 18
-        Radius of the largest window, meters: half the width of the largest object that is removed.
-    threshold, scalar : float, default 0.5 and 1.25
-        A point is ground within `threshold` + `scalar` times the terrain's slope of the surface,
-        meters.
-    openings : sequence of float
-        Windows, in meters, of openings of the minimum grid above which heights are wanted too.
-    slope_too : bool
-        Whether the slope of the terrain is wanted.
+    given : array_like of bool, shape (n,), optional
+        Points that are the ground: nothing is filtered, they alone form the surface. They are
+        ``Ground``, and so are others within the tolerance of the surface.
+    cells : GroundCells, optional
+        Cells of known ground (:func:`.ground_blocks.cells_of_block`), all within the
+        `reach_of_cells` of :class:`.FilterOptions` of the points, which then need no others around.
     threads : int, optional
         None or 0: every available core.
     figures : dict, optional
         Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
-        ``without_terrain`` (points with no usable point near; their height is 0),
-        ``unused_points``.
-    cells : GroundCells, optional
-        Cells whose ground was found before (:func:`.ground_blocks.cells_of_block`), all within the
-        `reach_of_cells` of :class:`.FilterOptions` of the points, which then need no others around
-        them.
-    given : array_like of bool, shape (n,), optional
-        Points that are the ground: nothing is filtered, they alone form the surface. They are
-        ``Ground``, and so are others within the tolerance of the surface.
+        ``without_terrain`` (points with no ground near; their height is 0), ``unused_points``.
+    **options
+        `cell` (1): side of the grid's cells; `slope` (0.1): a window of radius r removes what it
+        lowers by more than `slope` times r; `window` (18): radius of the largest window, half the
+        width of the largest object that is removed; `threshold` (0.5) and `scalar` (1.25): a point
+        is ground within `threshold` + `scalar` times the terrain's slope of the surface;
+        `openings` (): windows of openings of the minimum grid above which heights are wanted too;
+        `slope_too` (False): whether the terrain's slope is wanted. Lengths in meters.
 
     Returns
     -------
     dict of str to ndarray, shape (n,)
-        ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 where the filter calls a point
-        ground), ``Slope`` (float64, degrees), ``HeightAboveOpening_<window>`` (float32) on request.
-        NaN where a coordinate is not finite.
+        ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 for ground), ``Slope`` (float64,
+        degrees), ``HeightAboveOpening_<window>`` (float32). NaN where a coordinate is not finite.
 
     Raises
     ------
-    OptionError
-        For sizes that are not positive, or a window of too many cells.
-    StageError
-        If shapes differ or coordinates are too large.
+    OptionError, StageError
+        For wrong options, shapes that differ, and coordinates that are too large.
     """
-    options = FilterOptions(cell, slope, window, threshold, scalar, openings)
+    settings = FilterOptions(**options)
     x, y, z = columns(x, y, z)
     finite, use = usable(x, y, z), usable(x, y, z, mask=mask)
-    known = None if given is None else usable(x, y, z, mask=given)
-    all_finite = bool(finite.all())
-    if not all_finite:
-        x, y, z, use = x[finite], y[finite], z[finite], use[finite]
-        known = None if known is None else known[finite]
     use &= np.abs(z) < HIGHEST
-    counts = {"without_terrain": 0} | ({"pits": 0} if cells is None and given is None else {})
-    out: dict[str, NDArray] = {
-        "HeightAboveGround": np.zeros(len(x)),
-        "Ground": np.zeros(len(x), np.uint8),
-        **({"Slope": np.zeros(len(x))} if slope_too else {}),
-        **{name: np.zeros(len(x), np.float32) for name in opening_names(openings)},
-    }
-    if len(x):
-        points = GroundPoints.of(x, y, z, use, cell)
-        pieces: Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]
-        if known is not None:
-            pieces = given_pieces(points, options, known & use)
-        elif cells is not None:
-            pieces = _from_cells(points, options, cells)
-        else:
-            pieces = _found(points, options, counts)
-        for of, own, raster, means in pieces:
-            found = _measured(
-                points.some(of), own, raster, means, options, slope_too, threads, counts
-            )
-            for name, values in found.items():
-                out[name][of if isinstance(of, slice) else of[own]] = values[own]
-        if known is not None:
-            out["Ground"][known & use] = 1
-    if figures is not None:
-        figures["ground_points"] = int(np.count_nonzero(out["Ground"]))
-        figures.update(counts, unused_points=int(len(finite) - np.count_nonzero(use)))
-    if not all_finite:
-        for name, values in out.items():
-            whole = np.full(len(finite), 0 if name == "Ground" else np.nan, values.dtype)
-            whole[finite] = values
-            out[name] = whole
-    return out
+    rows = slice(None) if finite.all() else np.flatnonzero(finite)
+    ground = None if given is None else (usable(x, y, z, mask=given) & use)[rows]
+    points = GroundPoints.in_cells(x[rows], y[rows], z[rows], use[rows], settings.cell)
+    counts = {} if figures is None else figures
+    out = _heights(points, settings, ground, cells, threads, counts)
+    counts["unused_points"] = int(len(x) - np.count_nonzero(use))
+    return out if finite.all() else {k: _spread(v, rows, len(x)) for k, v in out.items()}
 
 
-def _found(
-    points: GroundPoints, options: FilterOptions, counts: dict[str, int]
-) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
-    """Numbers of the points of pieces, which of each are its own, and the ground found there."""
-    for of, own in patches(points.column, points.row, options.reach_of_points, options.link):
-        raster, pits = ground_raster(points.some(of), options)
-        counts["pits"] += len(pits) if isinstance(own, slice) else int(np.count_nonzero(own[pits]))
-        yield of, own, raster, None
+def _spread(values: NDArray, rows: Any, count: int) -> NDArray:
+    """Return the values of some rows among `count`; NaN, or 0 for whole numbers, elsewhere."""
+    whole = np.full(count, 0 if values.dtype == np.uint8 else np.nan, values.dtype)
+    whole[rows] = values
+    return whole
 
 
-def _from_cells(
-    points: GroundPoints, options: FilterOptions, cells: GroundCells
-) -> Iterator[tuple[Any, Any, GroundRaster, CellMeans | None]]:
-    """Yield pieces of the cloud with the ground raster that an earlier round computed."""
-    for of, own in patches(points.column, points.row, 0, options.link):
-        window = GridWindow.enclosing(points.column[of], points.row[of]).padded(
-            options.reach_of_cells
-        )
-        yield of, own, *cells.on(window, options.opening_radii)
-
-
-def _measured(
+def _heights(
     points: GroundPoints,
-    own,
-    raster: GroundRaster,
-    means: CellMeans | None,
     options: FilterOptions,
-    slope_too: bool,
+    ground: NDArray[np.bool_] | None,
+    cells: GroundCells | None,
     threads: int | None,
     counts: dict[str, int],
 ) -> dict[str, NDArray]:
-    """Heights of points above the ground of a raster, and what they say of that themselves, where
-    no `means` say it."""
-    x, y, z, use, column, row = points
-    cell, (left, bottom, _, _) = options.cell, raster.window
-    needed = around(raster.window, column, row)
-    planes = surface(raster, options.levels(NEAR), needed)
-    height, gradient = np.empty((2, len(x)))
+    """Compute the heights of points above ground that is given, known or filtered; add `counts`."""
+    count = len(points.x)
+    out: dict[str, NDArray] = {
+        "HeightAboveGround": np.zeros(count),
+        "Ground": np.zeros(count, np.uint8),
+        **({"Slope": np.zeros(count)} if options.slope_too else {}),
+        **{name: np.zeros(count, np.float32) for name in opening_names(options.openings)},
+    }
+    counts |= {"without_terrain": 0} | ({"pits": 0} if cells is None and ground is None else {})
+    if ground is not None:
+        pieces = _given_pieces(points, options, ground)
+    elif cells is not None:
+        pieces = _known_pieces(points, options, cells)
+    else:
+        pieces = _filtered_pieces(points, options, counts)
+    for piece in pieces if count else ():
+        dimensions = _measure(points.take(piece.rows), piece, options, threads, counts)
+        rows = piece.rows if isinstance(piece.rows, slice) else piece.rows[piece.core]
+        for name, values in dimensions.items():
+            out[name][rows] = values[piece.core]
+    if ground is not None:
+        out["Ground"][ground] = 1
+    counts["ground_points"] = int(np.count_nonzero(out["Ground"]))
+    return out
 
+
+def _filtered_pieces(
+    points: GroundPoints, options: FilterOptions, counts: dict[str, int]
+) -> Iterator[_Piece]:
+    """Yield pieces of the cloud with the ground that the filter finds, and count low outliers."""
+    for rows, core in patches(points.column, points.row, options.reach_of_points, options.link):
+        raster, low = ground_raster(points.take(rows), options)
+        counts["pits"] += len(low) if isinstance(core, slice) else int(np.count_nonzero(core[low]))
+        yield _Piece(rows, core, raster)
+
+
+def _known_pieces(
+    points: GroundPoints, options: FilterOptions, cells: GroundCells
+) -> Iterator[_Piece]:
+    """Yield pieces of the cloud with the ground raster that an earlier round computed."""
+    for rows, core in patches(points.column, points.row, 0, options.link):
+        window = GridWindow.enclosing(points.column[rows], points.row[rows])
+        window = window.padded(options.reach_of_cells)
+        yield _Piece(rows, core, *cells.raster(window, options.opening_radii))
+
+
+def _given_pieces(
+    points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_]
+) -> Iterator[_Piece]:
+    """Yield pieces of the cloud with the raster of the points (n,) that are `ground`: surveyed,
+    edited, or found by another program."""
+    margin = 2 + FILL_RINGS + max([0, *options.opening_radii])
+    for rows, core in patches(points.column, points.row, options.reach_of_given, options.link):
+        part = points.take(rows)
+        window = GridWindow.enclosing(part.column, part.row).padded(margin)
+        held, place = means = _means(part, ground[rows], options.cell, window)
+        heights = np.where(held, place[..., 2], HOLE).astype(np.float32)
+        opened = {}
+        if options.openings:  # of all points, without low outliers
+            _, lowest, _ = minimum_grid(part, window, options.cell)
+            opened = dict(openings_of(fill_holes(lowest), {*options.opening_radii}))
+        yield _Piece(rows, core, GroundRaster(window, heights, place, held, heights, opened), means)
+
+
+def _means(
+    points: GroundPoints, is_ground: NDArray[np.bool_], cell: float, window: GridWindow
+) -> CellMeans:
+    """Return which cells of a window hold points that are ground, and their means."""
+    count, place = np.zeros(window.shape, np.int64), np.zeros((*window.shape, 3))
+    add_ground(points, is_ground, cell, window[:2], count, place)
+    return means_of(count, place), place
+
+
+def _measure(
+    points: GroundPoints,
+    piece: _Piece,
+    options: FilterOptions,
+    threads: int | None,
+    counts: dict[str, int],
+) -> dict[str, NDArray]:
+    """Compute the dimensions of the points of a piece; 0 where no ground is near.
+
+    Points are ground or not by the provisional surface; heights are measured from the surface
+    through the means of these points.
+    """
+    x, y, z, _, column, row = points
+    raster, cell, corner = piece.raster, options.cell, piece.raster.window[:2]
+    needed = cells_around(raster.window, column, row)
+    planes = surface(raster, options.near_levels, needed)
+    height, gradient = np.empty((2, len(x)))
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
 
-    def above(span):
-        heights_above(
-            x[span], y[span], z[span], cell, left, bottom, planes, height[span], gradient[span]
-        )
+    def measure_from_surface(s: slice) -> None:
+        heights_above(x[s], y[s], z[s], cell, corner, planes, height[s], gradient[s])
 
-    list(map_blocks(above, spans, threads))
-    is_ground = options.is_ground(use, height, gradient)
-    if means is None:
-        count = np.zeros(raster.shape, np.int64)
-        place = np.zeros(raster.place.shape)
-        add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, place)
-        raster = raster._replace(ground=means_of(count, place), place=place)
-    else:
-        raster = raster._replace(ground=means[0], place=means[1])
-    surface(raster, options.levels(FAR), needed, planes)
-    list(map_blocks(above, spans, threads))
+    list(map_blocks(measure_from_surface, spans, threads))
+    is_ground = options.is_ground(points.use, height, gradient)
+    held, place = piece.means or _means(points, is_ground, cell, raster.window)
+    raster = replace(raster, ground=held, place=place)
+    surface(raster, options.far_levels, needed, planes)
+    list(map_blocks(measure_from_surface, spans, threads))
     nowhere = np.isnan(height)
-    counts["without_terrain"] += int(np.count_nonzero(nowhere[own]))
+    counts["without_terrain"] += int(np.count_nonzero(nowhere[piece.core]))
     height[nowhere] = gradient[nowhere] = 0.0
-    found: dict[str, NDArray] = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
-    if slope_too:
-        found["Slope"] = np.degrees(np.arctan(gradient))
+    out: dict[str, NDArray] = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
+    if options.slope_too:
+        out["Slope"] = np.degrees(np.arctan(gradient))
     for name, radius in zip(opening_names(options.openings), options.opening_radii, strict=True):
-        values = found[name] = np.empty(len(x), np.float32)
+        values = out[name] = np.empty(len(x), np.float32)
         opening = raster.opened[radius]
 
-        def over(span, opening=opening, values=values):
-            above_opening(
-                x[span], y[span], z[span], cell, left, bottom, opening, height[span], values[span]
-            )
+        def measure_from_opening(s: slice, opening=opening, values=values) -> None:
+            above_opening(x[s], y[s], z[s], cell, corner, opening, height[s], values[s])
 
-        list(map_blocks(over, spans, threads))
-    return found
+        list(map_blocks(measure_from_opening, spans, threads))
+    return out

@@ -20,17 +20,16 @@ from .openings import highest_around
 
 class LowRules(NamedTuple):
     """Thresholds of low outliers; a NamedTuple, as kernels read it. Columns are those of the
-    raster: 1 m for the ground filter, 1.5 m for noise."""
+    raster: of 1 m for the ground filter, 1.5 m for noise."""
 
     near: int = 9  #: columns to each side through which the plane is fitted
     min_columns: int = 12  #: that a plane needs
     far_m: float = 30.0  #: where ground as deep is searched: the width of a block of houses
     min_company: int = 4  #: columns of such ground that show that a deep place is ground
-    #: others of the 5 x 5 columns around that must be level with one of these, or it is noise too,
+    #: others of the 5 x 5 columns around that differ by `level_m` at most, or it may be noise too,
     min_support: int = 2
     min_support_share: float = 0.2  #: and this share more of those that hold points
-    #: level columns differ by at most this; such ground is at most this much higher than the place,
-    level_m: float = 1.0
+    level_m: float = 1.0  #: such ground is this much higher than the place at most,
     max_rise: float = 0.05  #: and this much more per meter away
     link: int = 3  #: cells of a minimum grid that are at most this far from each other are linked
     max_step_m: float = 0.35  #: across a step of at most this height: a curb,

@@ -23,9 +23,9 @@ from .cells import columns, usable
 
 
 class MinimaTerrain:
-    """The coarse terrain of a cloud, read with :meth:`at`; parameters as of :func:`hag_minima`.
+    """Coarse terrain of a cloud, which :meth:`at` evaluates; parameters as of :func:`hag_minima`.
 
-    Its `figures` count ``cells`` (with points), ``interpolated_cells`` (empty ones that were
+    The `figures` count ``cells`` (with points), ``interpolated_cells`` (empty ones that were
     needed), ``farthest_fill`` (distance to the nearest filled cell, the worst case),
     ``unused_points`` (not finite, or excluded by the mask).
     """
@@ -56,7 +56,7 @@ class MinimaTerrain:
         }
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Terrain height where points fall: bilinear, at the center of their fine cell; NaN for
+        """Return the terrain height of points: bilinear, at the center of their fine cell; NaN for
         those not finite.
 
         NoTerrainError if no point formed a terrain.
@@ -81,7 +81,8 @@ class MinimaTerrain:
         return out
 
     def _filled(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Values of the cells `keys`; empty ones from the filled ones about as near as the nearest.
+        """Return the values of the cells `keys`; empty ones from the filled ones about as near as
+        the nearest.
 
         Weights are one over the fourth power of the distance between cell centers. [W18] does not
         say what becomes of empty cells.
@@ -110,15 +111,15 @@ _FILL = 1.5
 
 
 def _corners(x, y, cell: float, resolution: float):
-    """Keys of the four coarse cells round the middle of each point's fine cell (4, n), and where
-    between them it lies."""
+    """Return the keys of the four coarse cells around the middle of each point's fine cell (4, n),
+    and where between them it lies."""
     u, v = ((np.floor(axis / resolution) + 0.5) * (resolution / cell) - 0.5 for axis in (x, y))
     i, j = cell_numbers(u, 1.0), cell_numbers(v, 1.0)
     return np.array([cell_keys(i + a, j + b) for b in (0, 1) for a in (0, 1)]), u - i, v - j
 
 
 def _places(keys: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Columns and rows (n, 2) of keys."""
+    """Return the columns and rows (n, 2) of keys."""
     return np.column_stack([(keys & 0xFFFFFFFF) - 2**31, keys >> 32]).astype(np.float64)
 
 
@@ -131,7 +132,7 @@ def hag_minima(
     resolution: float = 0.5,
     mask: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """Height of every point above the coarse terrain of the cloud [W18 section 3.2].
+    """Compute the height of every point above the coarse terrain of the cloud [W18 section 3.2].
 
     Parameters
     ----------
@@ -175,7 +176,7 @@ def terrain_reach(
     cell: float,
     resolution: float,
 ) -> float:
-    """How far around a box lies all that decides the terrain under the wanted points.
+    """Return how far around a box all lies that decides the terrain under the wanted points.
 
     A height takes the four coarse cells around a point; an empty one is filled from all cells
     within its nearest filled one's distance and 1.5 cells. All of these must be known whole. What
@@ -188,8 +189,8 @@ def terrain_reach(
     if not wanted.any():
         return 0.0
     if not forms.any():  # farther than what was read
-        around = max(box[0] - x.min(), box[1] - y.min(), x.max() - box[2], y.max() - box[3], 0.0)
-        return float(around + box[2] - box[0])
+        beyond = max(box[0] - x.min(), box[1] - y.min(), x.max() - box[2], y.max() - box[3], 0.0)
+        return float(beyond + box[2] - box[0])
     filled = _places(
         np.unique(cell_keys(cell_numbers(x[forms], cell), cell_numbers(y[forms], cell)))
     )
@@ -203,6 +204,7 @@ def terrain_reach(
 
 
 def check_sizes(cell: float, resolution: float) -> None:
+    """Refuse sizes that are not positive, and fine cells that are larger than coarse ones."""
     for name, value in (("cell", cell), ("resolution", resolution)):
         checks.number(f"'{name}'", value, 0, above=True)
     if resolution > cell:

@@ -15,6 +15,7 @@ absolute grid, by counts and extremes, so that neither the order of points nor t
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,8 @@ from .low_outliers import limits_below_ground
 from .low_outliers import reach as low_reach
 from .pieces import patches
 
-LOW, HIGH = NOISE
+LOW: int = NOISE[0]
+HIGH: int = NOISE[1]
 #: Side of a voxel in meters.
 SIDE = 1.5
 #: Columns along the side of a block in which the density is measured.
@@ -134,7 +136,7 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
         -(-(int(v.max()) + 2 - start) // whole) * whole
         for v, start in ((column, left), (row, bottom))
     )
-    voxels, voxel = Voxels.of(row - bottom, column - left, cell_numbers(z, SIDE), w)
+    voxels, voxel = Voxels.from_places(row - bottom, column - left, cell_numbers(z, SIDE), w)
     per_column, spacing = density(voxels)
     suspect = small_clusters(voxels, per_column, spacing, cluster)
     place = voxels.keys >> BITS
@@ -151,9 +153,9 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     hung, hung_suspect = np.full(h * w, np.nan), np.zeros(h * w, bool)
     hung[place[hangs]], hung_suspect[place[hangs]] = highest[hangs], suspect[hangs]
     verdict = np.zeros(len(place), np.uint8)
-    rasters = (a.reshape(h, w) for a in (top, hung, hung_suspect))
     gaps = gap + RULES.gap_growth * np.maximum(0.0, spacing - RULES.dense_m)
-    _mark_high(place, lowest, suspect, gaps, *rasters, RULES, verdict)
+    hanging = hung.reshape(h, w), hung_suspect.reshape(h, w)
+    _mark_high(place, lowest, suspect, gaps, top.reshape(h, w), hanging, RULES, verdict)
     suspect &= verdict == 0
     np.minimum.at(low, place[suspect], lowest[suspect])
     limit = limits_below_ground(low.reshape(h, w), base.reshape(h, w), SIDE, depth)
@@ -161,7 +163,8 @@ def _judge(x, y, z, column, row, cluster, gap, depth):
     return verdict[voxel]
 
 
-class Voxels(NamedTuple):
+@dataclass(frozen=True)
+class Voxels:
     """Voxels that hold points, by row, column and layer."""
 
     keys: NDArray[np.int64]  #: (n,) ascending
@@ -169,7 +172,9 @@ class Voxels(NamedTuple):
     width: int  #: columns of the raster, whose rim is empty
 
     @classmethod
-    def of(cls, row, column, layer, width: int, counts=None) -> tuple[Voxels, NDArray[np.int64]]:
+    def from_places(
+        cls, row, column, layer, width: int, counts=None
+    ) -> tuple[Voxels, NDArray[np.int64]]:
         """Return the voxels of points, or of voxels with `counts` points; and the index of the
         voxel of each."""
         keys, voxel = np.unique(
@@ -257,7 +262,7 @@ def small_clusters(
             break
         # With one empty column on every side.
         width = (voxels.width >> scale) + 2
-        wider, index = Voxels.of(
+        wider, index = Voxels.from_places(
             (row >> scale) + 1, (column >> scale) + 1, layer, width, voxels.counts
         )
         small[thin] = _small(wider, 1.0, most)[index[thin]]
@@ -265,11 +270,11 @@ def small_clusters(
 
 
 @njit
-def _mark_high(place, lowest, suspect, gaps, top, hung, hung_suspect, rules, verdict):
+def _mark_high(place, lowest, suspect, gaps, top, hanging, rules, verdict):
     """Mark the suspects that lie above everything near by their `gaps` (n,), and are not part of a
     line."""
     h, w = top.shape
-    u, v, dz = np.empty((3, (2 * rules.far + 1) ** 2))
+    near = np.empty((3, (2 * rules.far + 1) ** 2))
     for k in range(len(place)):
         if not suspect[k]:
             continue
@@ -286,14 +291,19 @@ def _mark_high(place, lowest, suspect, gaps, top, hung, hung_suspect, rules, ver
                 break
             r = min(2 * r, rules.far)
         alone = seen >= rules.min_columns and lowest[k] - highest >= gaps[k]
-        if alone and not _in_line(hung, hung_suspect, j, i, lowest[k], u, v, dz, rules):
+        if alone and not _in_line(hanging, j, i, lowest[k], near, rules):
             verdict[k] = HIGH
 
 
 @device
-def _in_line(hung, hung_suspect, j, i, z, u, v, dz, rules):
+def _in_line(hanging, j, i, z, near, rules):
     """Tell whether hanging voxels are strung along a line through a place, as wires are, or single
-    points of them."""
+    points of them.
+
+    `hanging` are the heights (h, w) of hanging voxels, and which are suspects; `near` (3, m) is
+    working memory.
+    """
+    (hung, hung_suspect), (u, v, dz) = hanging, near
     h, w = hung.shape
     n = suspects = 0
     for b in range(max(j - rules.far, 0), min(j + rules.far + 1, h)):

@@ -27,13 +27,13 @@ FILL_RINGS = 3
 
 
 def opening_radius(window: float, cell: float) -> int:
-    """Radius in cells of a window of about `window` meters, the middle cell counted."""
+    """Return the radius in cells of a window of about `window` meters, the middle cell counted."""
     return max(1, round((window / cell - 1) / 2))
 
 
 def opening_radii(largest: int) -> list[int]:
-    """Radii in cells: each is larger than the one before by a fifth, by 1 or 2 cells: or slopes
-    would drop as objects do."""
+    """Return radii in cells, each larger than the one before by a fifth, but by 1 or 2 cells:
+    with larger steps slopes would drop as objects do."""
     radii = [1]
     while (radius := radii[-1] + min(max(1, radii[-1] // 5), 2)) < largest:
         radii.append(radius)
@@ -41,14 +41,14 @@ def opening_radii(largest: int) -> list[int]:
 
 
 def _steps(radius: int) -> tuple[int, int]:
-    """How many squares and diamonds of radius 1 add up to an octagon: tan(22.5 degrees) of them are
-    squares."""
+    """Return the numbers of squares and diamonds of radius 1 that add up to an octagon:
+    tan(22.5 degrees) of them are squares."""
     squares = int(0.41421356 * radius)
     return squares, radius - squares
 
 
 def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray[Any]:
-    """Maximum (h, w) over so many squares and diamonds round each cell.
+    """Return the maximum (h, w) over these numbers of squares and diamonds around each cell.
 
     Each line of an octagon is a running maximum on the flat raster with a margin round it, by
     doubling: a maximum of 2m cells is that of two of m. Two diagonals and a cross of five cells
@@ -85,33 +85,46 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
 
 
 @njit
-def _fill_ring(heights):
-    """Fill holes that touch known cells with their mean (h, w); those at an edge count twice those
-    at a corner."""
+def _fill_ring(heights, known):
+    """Fill the holes that touch `known` cells (n,) with the mean of their known neighbors; return
+    the filled cells (m,).
+
+    Cells are numbered row by row. Neighbors at an edge count twice those at a corner.
+    """
     h, w = heights.shape
-    out = heights.copy()
-    for j in range(h):
-        for i in range(w):
-            if heights[j, i] != HOLE:
-                continue
-            total, weights = 0.0, 0
-            for b in range(max(j - 1, 0), min(j + 2, h)):
-                for a in range(max(i - 1, 0), min(i + 2, w)):
-                    if heights[b, a] != HOLE:
-                        weight = 2 if a == i or b == j else 1
-                        total += weight * np.float64(heights[b, a])
-                        weights += weight
-            if weights > 0:
-                out[j, i] = np.float32(total / weights)
-    return out
+    filled, n = np.empty(min(8 * len(known), heights.size - len(known)), np.int64), 0
+    for cell in known:
+        j, i = cell // w, cell % w
+        for b in range(max(j - 1, 0), min(j + 2, h)):
+            for a in range(max(i - 1, 0), min(i + 2, w)):
+                if heights[b, a] == HOLE:
+                    heights[b, a] = -HOLE  # until all means are known
+                    filled[n] = b * w + a
+                    n += 1
+    means = np.empty(n, np.float32)
+    for k in range(n):
+        j, i = filled[k] // w, filled[k] % w
+        total, weights = 0.0, 0
+        for b in range(max(j - 1, 0), min(j + 2, h)):
+            for a in range(max(i - 1, 0), min(i + 2, w)):
+                if np.isfinite(heights[b, a]):
+                    weight = 2 if a == i or b == j else 1
+                    total += weight * np.float64(heights[b, a])
+                    weights += weight
+        means[k] = np.float32(total / weights)
+    for k in range(n):
+        heights[filled[k] // w, filled[k] % w] = means[k]
+    return filled[:n]
 
 
 def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the raster (h, w) with the holes up to `FILL_RINGS` cells from measured ones filled,
     ring by ring; meters."""
+    filled = raster.copy()
+    known = np.flatnonzero(raster != HOLE)
     for _ in range(FILL_RINGS):
-        raster = _fill_ring(raster)
-    return raster
+        known = _fill_ring(filled, known)
+    return filled
 
 
 def openings_of(
@@ -174,15 +187,19 @@ def objects_of(
 
 
 def opening_names(windows: Sequence[float]) -> list[str]:
-    """Dimensions of the windows: ``HeightAboveOpening_5``; a decimal point becomes ``_``."""
+    """Name the dimensions of windows: ``HeightAboveOpening_5``; a decimal point becomes ``_``."""
     return [f"HeightAboveOpening_{window:g}".replace(".", "_") for window in windows]
 
 
 @njit
-def above_opening(x, y, z, cell, left, bottom, opening, fallback, out):
-    """z minus the opening, bilinear between the centers of measured cells; `fallback` where there
-    is none."""
+def above_opening(x, y, z, cell, corner, opening, fallback, out):
+    """Compute z minus the opening (h, w), bilinear between the centers of measured cells.
+
+    `corner` is the first column and row of the raster; `fallback` (n,) stands where no cell is
+    near.
+    """
     h, w = opening.shape
+    left, bottom = corner
     for p in range(len(x)):
         u, v = x[p] / cell - 0.5, y[p] / cell - 0.5
         i, j = int(np.floor(u)), int(np.floor(v))

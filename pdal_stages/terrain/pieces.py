@@ -28,10 +28,10 @@ BLOCKS_PER_LINK = 4
 def patches(
     column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int
 ) -> Iterator[tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]]:
-    """Yield (points, own): the points of a piece and those round it that matter, and which of them
-    are its own.
+    """Yield the indices of the points of a piece and of those around it that matter, and which of
+    them belong to the piece.
 
-    Every point is some piece's own. Points more than `reach` cells away, along either axis, do not
+    Every point belongs to one piece. Points more than `reach` cells away, along either axis, do not
     matter; nor do points that no chain of others connects with steps of at most `link` cells. One
     piece, all points, where the whole is small enough.
     """
@@ -49,13 +49,13 @@ def patches(
         if window.width * window.height <= LARGEST_RASTER:
             yield group, slice(None)
             continue
-        for own in group_by_key(cell_keys(c // SQUARE_SIDE, r // SQUARE_SIDE)):
-            inside = GridWindow.enclosing(c[own], r[own]).padded(reach).contains(c, r)
-            near, mine = np.flatnonzero(inside), np.zeros(len(c), bool)
-            mine[own] = True
+        for members in group_by_key(cell_keys(c // SQUARE_SIDE, r // SQUARE_SIDE)):
+            inside = GridWindow.enclosing(c[members], r[members]).padded(reach).contains(c, r)
+            near, core = np.flatnonzero(inside), np.zeros(len(c), bool)
+            core[members] = True
             for part in _groups(c[near], r[near], link):
-                if mine[near[part]].any():
-                    yield group[near[part]], mine[near[part]]
+                if core[near[part]].any():
+                    yield group[near[part]], core[near[part]]
 
 
 def refuse_scattered(counts: Collection[int]) -> None:
@@ -77,11 +77,11 @@ def refuse_scattered(counts: Collection[int]) -> None:
 def _groups(
     column: NDArray[np.int64], row: NDArray[np.int64], link: int
 ) -> list[NDArray[np.int64]]:
-    """Points that belong together: all within `link` cells of each other, and few that are a little
-    farther apart."""
+    """Group points: all within `link` cells of each other, and few that are a little farther
+    apart."""
     side = -(-link // BLOCKS_PER_LINK)
     rings = -(-link // side)
-    blocks, of = np.unique(cell_keys(column // side, row // side), return_inverse=True)
+    blocks, block = np.unique(cell_keys(column // side, row // side), return_inverse=True)
     pairs = []
     for b in range(rings + 1):
         for a in range(-rings if b else 1, rings + 1):
@@ -89,4 +89,4 @@ def _groups(
             pairs.append([np.flatnonzero(there), at[there]])
     label = np.empty(len(blocks), np.int64)
     number_sets(*np.concatenate(pairs, axis=1), label)
-    return group_by_key(label[of])
+    return group_by_key(label[block])

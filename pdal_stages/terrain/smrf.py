@@ -1,9 +1,8 @@
-"""Which cells of a minimum grid are ground: of all the points there are, or of a block of cells and
-what lies around it.
+"""The progressive morphological filter [P13]: it classifies the cells of a minimum grid into ground
+and objects.
 
-All of a progressive morphological filter that looks far away is done here, on a raster; see
-:mod:`.heights`. In tiles it is done once for each block of a grid of blocks, out of the lowest
-points of cells, and tiles put the blocks together.
+Every step that looks far away is done here, on a raster; see :mod:`.heights`. In tiles it is done
+once for each block of a grid of blocks, from the lowest points of cells, and tiles join the blocks.
 """
 
 from __future__ import annotations
@@ -26,10 +25,9 @@ from .openings import FILL_RINGS, objects_of, opening_radius
 from .surface import GroundRaster, from_parents, planes_of_blocks
 from .surface import reach as planes_reach
 
-#: Side in meters of the coarsest blocks of the surface from which points are told to be ground or
-#: not.
+#: Side in meters of the coarsest blocks of the provisional surface, which tells ground points.
 NEAR = 16.0
-#: The same of the surface that heights are measured from: it spans the holes under large buildings.
+#: Side of those of the surface that heights are measured from: it spans holes under large roofs.
 FAR = 32.0
 #: Largest radius of a window in cells: beyond it memory and halo of a tile become too large.
 _MOST_CELLS = 300
@@ -41,7 +39,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """Of :func:`.heights.filtered_ground`; lengths in meters. Wrong ones raise an
+    """Options of :func:`.heights.filtered_ground`; lengths in meters. Wrong ones raise an
     :class:`OptionError`."""
 
     cell: float = 1.0
@@ -50,6 +48,7 @@ class FilterOptions:
     threshold: float = 0.5
     scalar: float = 1.25
     openings: Sequence[float] = ()
+    slope_too: bool = False
 
     def __post_init__(self) -> None:
         for name, value in (
@@ -69,21 +68,26 @@ class FilterOptions:
 
     @property
     def radius(self) -> int:
-        """Of the largest window, in cells."""
+        """Radius of the largest window, in cells."""
         return max(1, round(self.window / self.cell))
 
     @property
     def opening_radii(self) -> list[int]:
-        """Of the openings that are wanted, in cells."""
+        """Radii of the requested openings, in cells."""
         return [opening_radius(size, self.cell) for size in self.openings]
 
     @property
-    def largest_radius(self) -> int:
-        """Of windows and openings, in cells."""
-        return max([self.radius, *self.opening_radii])
+    def near_levels(self) -> int:
+        """Levels of the provisional surface."""
+        return self._levels(NEAR)
 
-    def levels(self, block: float) -> int:
-        """How often cells are put together until they are blocks of so many meters."""
+    @property
+    def far_levels(self) -> int:
+        """Levels of the surface that heights are measured from."""
+        return self._levels(FAR)
+
+    def _levels(self, block: float) -> int:
+        """Return how often cells are joined, 2 x 2, until they are blocks of about that side."""
         return max(1, round(math.log2(block / self.cell)))
 
     def is_ground(
@@ -92,8 +96,8 @@ class FilterOptions:
         height: NDArray[np.float64],
         gradient: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Which of the points to `use` are ground, by their heights above the surface and its slope
-        there; NaN is not."""
+        """Return which of the points to `use` are ground, by their heights above the surface and
+        its slope there; NaN is not."""
         return use & (np.abs(height) <= self.threshold + self.scalar * gradient)
 
     @property
@@ -104,41 +108,55 @@ class FilterOptions:
         An opening looks twice its radius away; low outliers are judged before, and surfaces fitted
         through ground after.
         """
-        surfaces = ROUNDS * planes_reach(self.levels(NEAR))
-        openings = 2 * self.largest_radius + 2 * FILL_RINGS
+        surfaces = ROUNDS * planes_reach(self.near_levels)
+        openings = 2 * max([self.radius, *self.opening_radii]) + 2 * FILL_RINGS
         return outlier_reach(self.cell) + openings + surfaces + 2
 
     @property
     def reach_of_points(self) -> int:
-        """How far away, in cells, points can change a point's results.
+        """Distance in cells within which points can change a point's results.
 
-        Beyond what decides which cells are ground come the surfaces through it: that for telling
-        ground, and the last.
+        Beyond what decides which cells are ground come the surfaces through it: the provisional
+        one, and that of heights.
         """
-        return self.reach + sum(planes_reach(self.levels(block)) for block in (NEAR, FAR))
+        return self.reach + self._reach_of_surfaces
+
+    @property
+    def reach_of_given(self) -> int:
+        """Distance in cells within which points can change a point's height above given ground, or
+        an opening's."""
+        if not self.openings:
+            return self._reach_of_surfaces + 4
+        openings = 2 * max(self.opening_radii) + 2 * FILL_RINGS + outlier_reach(self.cell)
+        return max(self._reach_of_surfaces, openings) + 4
+
+    @property
+    def _reach_of_surfaces(self) -> int:
+        return planes_reach(self.near_levels) + planes_reach(self.far_levels)
 
     @property
     def reach_of_cells(self) -> int:
-        """How far away from points, in cells, cells of the ground matter that was found before."""
-        return planes_reach(self.levels(FAR)) + 4
+        """Distance in cells within which cells of known ground matter to points."""
+        return planes_reach(self.far_levels) + 4
 
     @property
     def link(self) -> int:
-        """How far one step looks, in cells: no step of the filter sees from a point to another
-        across more empty land."""
-        openings = self.largest_radius + 2 * FILL_RINGS
-        return max(outlier_reach(self.cell), openings, planes_reach(self.levels(FAR))) + 2
+        """Distance in cells across which one step looks: no step of the filter sees from a point to
+        another across more empty land."""
+        openings = max([self.radius, *self.opening_radii]) + 2 * FILL_RINGS
+        return max(outlier_reach(self.cell), openings, planes_reach(self.far_levels)) + 2
 
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
 _PARTS = 2.0**20
-#: Which cells (h, w) hold ground points, and where these are on average (h, w, 3), as
+#: Which cells (h, w) hold ground points, and their mean places (h, w, 3), as
 #: :attr:`.surface.GroundRaster.place`.
 CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
 class GroundPoints(NamedTuple):
-    """Points with finite coordinates in meters (n,) each, and the cells they fall in."""
+    """Points with finite coordinates in meters (n,) each, and the cells they fall in; a NamedTuple,
+    as kernels read it."""
 
     x: NDArray[np.float64]
     y: NDArray[np.float64]
@@ -148,13 +166,13 @@ class GroundPoints(NamedTuple):
     row: NDArray[np.int64]
 
     @classmethod
-    def of(cls, x, y, z, use, cell: float) -> GroundPoints:
-        """Of a grid of such cells."""
+    def in_cells(cls, x, y, z, use, cell: float) -> GroundPoints:
+        """Return points with the cells of a grid that they fall in."""
         return cls(x, y, z, use, cell_numbers(x, cell), cell_numbers(y, cell))
 
-    def some(self, which: NDArray | slice) -> GroundPoints:
-        """Part of them."""
-        return GroundPoints._make(values[which] for values in self)
+    def take(self, rows: NDArray | slice) -> GroundPoints:
+        """Return some of the points."""
+        return GroundPoints._make(values[rows] for values in self)
 
 
 def ground_raster(
@@ -163,56 +181,60 @@ def ground_raster(
     margin: int = FILL_RINGS + 1,
     wanted: GridWindow | None = None,
 ) -> tuple[GroundRaster, NDArray[np.int64]]:
-    """Classify the cells of the minimum grid round points into ground and objects.
+    """Classify the cells of the minimum grid around points into ground and objects.
 
-    The steps are those of SMRF [P13]: minimum grid, low outliers, openings with growing windows;
-    ground that the openings took from ridges is then regained where it lies near the surface
-    through the rest.
+    The steps are those of SMRF [P13]: minimum grid, low outliers, opening with growing windows;
+    ground that the openings took from ridges is then regained.
 
     Parameters
     ----------
     points : GroundPoints
     margin : int
-        Empty cells on every side, one at least: points blend the four cells round them.
+        Empty cells on every side, one at least: points blend the four cells around them.
     wanted : GridWindow, optional
-        The cells that are looked at; the raster holds these and as many around as later steps need.
+        The requested cells; the raster holds these and as many around as later steps need.
 
     Returns
     -------
     raster : GroundRaster
     low_outliers : (m,) int64
-        Numbers of the points that are low outliers.
+        Indices of the points that are low outliers.
     """
-    x, y, z, _, column, row = points
-    window = GridWindow.enclosing(column, row).padded(margin)
-    lowest, raster, low_outliers = minimum_grid(points, window, options.cell)
+    window, cell = GridWindow.enclosing(points.column, points.row).padded(margin), options.cell
+    lowest, heights, low_outliers = minimum_grid(points, window, cell)
     objects, floor, opened = objects_of(
-        raster, options.cell, options.slope, options.radius, options.opening_radii
+        heights, cell, options.slope, options.radius, options.opening_radii
     )
-    step = planes_reach(options.levels(NEAR))
     wanted = wanted or window
-    kept = wanted.padded(ROUNDS * step).intersect(window)
+    kept = wanted.padded(ROUNDS * planes_reach(options.near_levels)).intersect(window)
     part = kept.slices_in(window)
-    lowest, raster = np.ascontiguousarray(lowest[part]), np.ascontiguousarray(raster[part])
+    lowest, heights = np.ascontiguousarray(lowest[part]), np.ascontiguousarray(heights[part])
     objects, floor = np.ascontiguousarray(objects[part]), np.ascontiguousarray(floor[part])
     opened = {radius: np.ascontiguousarray(values[part]) for radius, values in opened.items()}
     held = lowest >= 0
-    low, place = lowest[held], np.zeros((*raster.shape, 3))
-    for axis, (at, cells_of) in enumerate(((x, column), (y, row))):
-        place[held, axis] = at[low] / options.cell - cells_of[low] - 0.5
-    place[held, 2] = z[low]
-    ground = np.isfinite(raster) & ~objects
-    made = GroundRaster(kept, raster, place, ground, floor, opened)
+    low, place = lowest[held], np.zeros((*heights.shape, 3))
+    place[held, 0] = points.x[low] / cell - points.column[low] - 0.5
+    place[held, 1] = points.y[low] / cell - points.row[low] - 0.5
+    place[held, 2] = points.z[low]
+    ground = np.isfinite(heights) & ~objects
+    raster = GroundRaster(kept, heights, place, ground, floor, opened)
+    _regain_ground(raster, wanted, options)
+    return raster, low_outliers
+
+
+def _regain_ground(raster: GroundRaster, wanted: GridWindow, options: FilterOptions) -> None:
+    """Turn cells near the provisional surface, through the ground so far, into ground again: in
+    several rounds, each of which sees less around the `wanted` cells."""
+    step, kept = planes_reach(options.near_levels), raster.window
+    measured = np.isfinite(raster.lowest)
     for number in range(1, ROUNDS + 1):
         seen = np.zeros(raster.shape, bool)
         seen[wanted.padded((ROUNDS - number) * step).intersect(kept).slices_in(kept)] = True
-        seen &= np.isfinite(raster) & ~ground
-        blocks, cells = planes_of_blocks(made, options.levels(NEAR), seen), np.flatnonzero(seen)
-        near = _near(
-            cells, place, *blocks, *kept[:2], options.cell, options.threshold, options.scalar
-        )
-        ground.ravel()[cells[near]] = True
-    return made, low_outliers
+        seen &= measured & ~raster.ground
+        blocks, cells = planes_of_blocks(raster, options.near_levels, seen), np.flatnonzero(seen)
+        tolerance = options.cell, options.threshold, options.scalar
+        near = _near(cells, raster.place, blocks, kept[:2], *tolerance)
+        raster.ground.ravel()[cells[near]] = True
 
 
 def minimum_grid(
@@ -223,11 +245,11 @@ def minimum_grid(
     Returns
     -------
     lowest : (h, w) int64
-        Number of the lowest point of each cell, -1 where there is none.
+        Index of the lowest point of each cell, -1 where there is none.
     raster : (h, w) float32
         Its height in meters; HOLE where there is none, or a low outlier.
     low_outliers : (m,) int64
-        Numbers of the points that are low outliers.
+        Indices of the points that are low outliers.
     """
     shape, cells = (window.height, window.width), window.height * window.width
     usable = np.flatnonzero(points.use)
@@ -242,15 +264,17 @@ def minimum_grid(
 
 
 @njit
-def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, threshold, scalar):
-    """Find the cells (n,), numbered row by row, that lie near the surface through the ground (see
-    :mod:`.surface`)."""
+def _near(cells, place, blocks, corner, cell, threshold, scalar):
+    """Find the cells (n,), numbered row by row, that lie near the surface through the ground.
+
+    `blocks` are the :class:`.surface.Planes`; `corner` is the first column and row of the raster.
+    """
     w = place.shape[1]
     out = np.zeros(len(cells), np.bool_)
     for k in range(len(cells)):
         j, i = cells[k] // w, cells[k] % w
         height, across, along = from_parents(
-            blocks, blocks_left, blocks_bottom, i + left, j + bottom, 1.0
+            blocks.values, blocks.left, blocks.bottom, i + corner[0], j + corner[1], 1.0
         )
         x, y, z = place[j, i, 0], place[j, i, 1], place[j, i, 2]
         gradient = np.sqrt(across * across + along * along) / cell
@@ -259,21 +283,26 @@ def _near(cells, place, blocks, blocks_left, blocks_bottom, left, bottom, cell, 
 
 
 @njit
-def add_ground(x, y, z, is_ground, column, row, cell, left, bottom, count, place):
-    """Add points that are ground to their cells: number (h, w) and places (h, w, 3); in whole
-    numbers, so order is free."""
-    for p in range(len(x)):
+def add_ground(points, is_ground, cell, corner, count, place):
+    """Add points that are ground to their cells: number (h, w) and places (h, w, 3), as whole
+    numbers, so that order does not matter.
+
+    `points` are :class:`GroundPoints`; `corner` is the first column and row of the raster.
+    """
+    left, bottom = corner
+    for p in range(len(points.x)):
         if is_ground[p]:
-            j, i = row[p] - bottom, column[p] - left
+            column, row = points.column[p], points.row[p]
+            j, i = row - bottom, column - left
             count[j, i] += 1
-            place[j, i, 0] += np.rint((x[p] / cell - column[p] - 0.5) * _PARTS)
-            place[j, i, 1] += np.rint((y[p] / cell - row[p] - 0.5) * _PARTS)
-            place[j, i, 2] += np.rint(z[p] * _PARTS)
+            place[j, i, 0] += np.rint((points.x[p] / cell - column - 0.5) * _PARTS)
+            place[j, i, 1] += np.rint((points.y[p] / cell - row - 0.5) * _PARTS)
+            place[j, i, 2] += np.rint(points.z[p] * _PARTS)
 
 
 def means_of(count: NDArray[np.int64], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Make such sums means: from the cell's center, in cells, and its height; which cells (h, w)
-    hold ground."""
+    """Make sums of :func:`add_ground` means: from the cell's center, in cells, and its height;
+    return which cells (h, w) hold ground."""
     held = count > 0
     place[held] /= (_PARTS * count[held])[:, None]
     return held

@@ -11,6 +11,7 @@ fixed tree, so the same ground gives the same bits whatever lies further away.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +29,9 @@ _STIFFNESS = 0.02
 _HOLD = 0.1
 
 
-class GroundRaster(NamedTuple):
-    """A minimum grid and what was found on it."""
+@dataclass(frozen=True)
+class GroundRaster:
+    """A minimum grid, and which of its cells are ground."""
 
     window: GridWindow  #: which cells
     #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
@@ -46,30 +48,26 @@ class GroundRaster(NamedTuple):
         return self.ground.shape
 
     def cut(self, window: GridWindow) -> GroundRaster:
-        """A copy of some of the cells."""
+        """Return a copy of the cells of a window."""
         part = window.slices_in(self.window)
-        return self._replace(
-            window=window,
-            opened={radius: values[part].copy() for radius, values in self.opened.items()},
-            **{
-                name: getattr(self, name)[part].copy()
-                for name in ("lowest", "place", "ground", "floor")
-            },
-        )
+        rasters = {
+            field.name: getattr(self, field.name)[part].copy() for field in fields(self)[1:-1]
+        }
+        opened = {radius: values[part].copy() for radius, values in self.opened.items()}
+        return replace(self, window=window, opened=opened, **rasters)
 
 
 class Planes(NamedTuple):
-    """Of blocks of 2 x 2 cells."""
+    """Planes of blocks of 2 x 2 cells; a NamedTuple, as kernels read it."""
 
-    values: (
-        np.ndarray
-    )  #: (h, w, 3) at their centers: height, gradient per cell; NaN where nothing is known
+    #: (h, w, 3) at the centers: height, gradient per cell; NaN where nothing is known
+    values: np.ndarray
     left: int  #: number of the first column
     bottom: int  #: of the first row
 
 
 def reach(levels: int) -> int:
-    """How far ground changes the surface, in cells."""
+    """Return how far away ground changes the surface, in cells."""
     # A block's parents lie up to 1.5 blocks away, level by level; the coarsest sees 3 x 3 of its
     # blocks.
     return 3 * 2**levels
@@ -77,8 +75,8 @@ def reach(levels: int) -> int:
 
 @device
 def blend(planes, i, j, s, t, size):
-    """Height and gradient of the four planes round a place, weighted by nearness; NaN where none is
-    known.
+    """Return height and gradient of the four planes around a place, weighted by nearness; NaN
+    where none is known.
 
     The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the center of block (j, i):
     given apart, so that rounding does not depend on where the array begins.
@@ -107,7 +105,7 @@ def blend(planes, i, j, s, t, size):
 
 @device
 def from_parents(parents, parents_left, parents_bottom, column, row, size):
-    """What the planes of blocks of twice the `size` say at the center of a block of `size`."""
+    """Evaluate the planes of blocks of twice the `size` at the center of a block of `size`."""
     # A left child lies 3/4 of the way from the block before its parent's, a right one 1/4 beyond
     # its parent.
     s, t = 0.25 + 0.5 * (1 - (column & 1)), 0.25 + 0.5 * (1 - (row & 1))
@@ -132,8 +130,7 @@ def _add(total, m, dx, dy, weight):
 
 @device
 def _sum_around(moments, j, i, size, sums):
-    """Sums of the moments of the 3 x 3 blocks round one, about its center: nearer ones weigh
-    more."""
+    """Sum the moments of the 3 x 3 blocks around one, about its center: nearer ones weigh more."""
     sums[:] = 0.0
     for b in range(max(j - 1, 0), min(j + 2, moments.shape[0])):
         for a in range(max(i - 1, 0), min(i + 2, moments.shape[1])):
@@ -143,10 +140,14 @@ def _sum_around(moments, j, i, size, sums):
 
 
 @njit
-def _moments_of_cells(held, place, height, level, left, bottom, out, out_left, out_bottom):
-    """Add up moments of the held cells (n,), numbered row by row, of each block of a level, about
-    its center."""
+def _moments_of_cells(held, place, height, level, corner, out, out_corner):
+    """Add up the moments of the held cells (n,), numbered row by row, of each block of a level,
+    about its center.
+
+    Corners are the first column and row of the cells and of the blocks `out` (h, w, 9).
+    """
     size, width = 1 << level, height.shape[1]
+    (left, bottom), (out_left, out_bottom) = corner, out_corner
     for cell in held:
         j, i = cell // width, cell % width
         x = place[j, i, 0] + ((i + left) & (size - 1)) - (0.5 * size - 0.5)
@@ -160,7 +161,7 @@ def _moments_of_cells(held, place, height, level, left, bottom, out, out_left, o
 
 @njit
 def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
-    """The same of blocks of twice the `size`, from their four parts."""
+    """Add up the moments of blocks of twice the `size` from those of their four parts."""
     for j in range(fine.shape[0]):
         for i in range(fine.shape[1]):
             if fine[j, i, 0] > 0:
@@ -199,7 +200,7 @@ def _coarsest(moments, size, needed, planes):
 
 @njit
 def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, planes):
-    """What the planes of blocks of twice the `size` say at the centers of the needed blocks of
+    """Evaluate the planes of blocks of twice the `size` at the centers of the needed blocks of
     `size`."""
     for j in range(needed.shape[0]):
         for i in range(needed.shape[1]):
@@ -253,28 +254,28 @@ def planes_of_blocks(raster: GroundRaster, levels: int, needed: NDArray[np.bool_
         (a, b), (h, w) = spans[-1], wanted[-1].shape
         low_a, low_b = (a >> 1) - 1, (b >> 1) - 1
         h, w = ((b + h - 1) >> 1) + 2 - low_b, ((a + w - 1) >> 1) + 2 - low_a
-        made = np.zeros((h, w, 9))
+        sums = np.zeros((h, w, 9))
         if level == 1:
             held, heights = np.flatnonzero(raster.ground), raster.place[..., 2]
-            _moments_of_cells(held, raster.place, heights, 1, a, b, made, low_a, low_b)
+            _moments_of_cells(held, raster.place, heights, 1, (a, b), sums, (low_a, low_b))
         else:
-            _moments_of_blocks(moments[-1], 2.0 ** (level - 1), a, b, made, low_a, low_b)
+            _moments_of_blocks(moments[-1], 2.0 ** (level - 1), a, b, sums, low_a, low_b)
         wanted.append(np.zeros((h, w), bool))
         _mark_parents(wanted[-2], a, b, wanted[-1], low_a, low_b)
-        moments.append(made)
+        moments.append(sums)
         spans.append((low_a, low_b))
     planes = np.empty((h, w, 3))
-    made = np.zeros((h, w, 9))
+    sums = np.zeros((h, w, 9))
     middle = np.broadcast_to(0.0, (*raster.shape, 2))
     measured = np.flatnonzero(raster.lowest != HOLE)
-    _moments_of_cells(measured, middle, raster.floor, levels, *spans[0], made, *spans[levels])
-    _coarsest(made, 2.0**levels, wanted[levels], planes)
+    _moments_of_cells(measured, middle, raster.floor, levels, spans[0], sums, spans[levels])
+    _coarsest(sums, 2.0**levels, wanted[levels], planes)
     for level in range(levels, 0, -1):
-        made = moments.pop()
+        sums = moments.pop()
         if level < levels:
-            coarser, planes = planes, np.empty((*made.shape[:2], 3))
+            coarser, planes = planes, np.empty((*sums.shape[:2], 3))
             _finer(coarser, *spans[level + 1], 2.0**level, *spans[level], wanted[level], planes)
-        _fit(made, 2.0**level, wanted[level], planes)
+        _fit(sums, 2.0**level, wanted[level], planes)
     return Planes(planes, *spans[1])
 
 
@@ -284,12 +285,11 @@ def surface(
     needed: NDArray[np.bool_],
     planes: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Planes at the centers of all cells (h, w, 3): height, gradient per cell; NaN beyond the reach
-    of all measured cells.
+    """Fit planes at the centers of the `needed` cells (h, w): return height and gradient per cell
+    (h, w, 3), NaN beyond the reach of all measured cells.
 
-    There are `levels` coarser levels, at least 1. `needed` (h, w) says at which cells planes are
-    wanted; elsewhere stands none. They are put into `planes` where that is given: those at the same
-    cells, made before.
+    There are `levels` coarser levels, at least 1. Planes of an earlier call for the same cells are
+    overwritten where they are given.
     """
     ground, place = raster.ground, raster.place
     blocks = planes_of_blocks(raster, levels, needed)
@@ -304,8 +304,12 @@ def surface(
 
 
 @njit
-def heights_above(x, y, z, cell, left, bottom, planes, height, gradient):
-    """Height above the surface, and its slope, at points."""
+def heights_above(x, y, z, cell, corner, planes, height, gradient):
+    """Compute the height of points (n,) above the surface, and its slope there.
+
+    `corner` is the first column and row of the planes (h, w, 3).
+    """
+    left, bottom = corner
     for p in range(len(x)):
         u, v = x[p] / cell - 0.5, y[p] / cell - 0.5
         i, j = np.floor(u), np.floor(v)
@@ -314,9 +318,8 @@ def heights_above(x, y, z, cell, left, bottom, planes, height, gradient):
         gradient[p] = np.sqrt(across * across + along * along) / cell
 
 
-def around(window: GridWindow, column: NDArray, row: NDArray) -> NDArray[np.bool_]:
-    """Cells (h, w) at which a surface is asked for: those of points, and all round them, whose
-    planes points blend."""
+def cells_around(window: GridWindow, column: NDArray, row: NDArray) -> NDArray[np.bool_]:
+    """Mark the cells (h, w) of points and all around them, whose planes points blend."""
     held = np.zeros((window.height, window.width), bool)
     held.ravel()[window.flat_index(column, row)] = True
     return highest_around(held, 1, 0)
