@@ -41,7 +41,7 @@ def edited(tmp_path):
 
 def far_from(xyz, given):
     """Which points (n,) have a height above given ground beyond the tolerance."""
-    found = filtered_ground(xyz, given=given, slope_too=True)
+    found = filtered_ground(xyz, ground=given, slope_too=True)
     slope = np.tan(np.radians(found["Slope"]))
     return np.abs(found["HeightAboveGround"]) > OPTIONS.threshold + OPTIONS.scalar * slope + 0.05
 
@@ -50,7 +50,7 @@ def far_from(xyz, given):
 def test_the_surface_is_that_of_the_ground_that_is_given(name):
     xyz, codes = clip(name)
     ground, figures = codes == 2, {}
-    given = filtered_ground(xyz, given=ground, openings=(5, 17), figures=figures)
+    given = filtered_ground(xyz, ground=ground, openings=(5, 17), figures=figures)
     found = filtered_ground(xyz, openings=(5, 17))
     height = np.abs(given["HeightAboveGround"][ground])
     assert np.percentile(height, 99) < 0.25 and given["Ground"][ground].all()
@@ -67,12 +67,12 @@ def test_the_surface_is_that_of_the_ground_that_is_given(name):
 def test_points_as_far_as_its_reach_decide():
     """A part of a cloud gives the same bits with the reach around it, in any order."""
     xyz, codes = clip("woods")
-    whole = filtered_ground(xyz, given=codes == 2, openings=(5, 17))
+    whole = filtered_ground(xyz, ground=codes == 2, openings=(5, 17))
     middle = np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20
     near = np.flatnonzero(np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20 + OPTIONS.reach_of_given)
     assert len(near) < 0.9 * len(xyz)
     near = np.random.default_rng(0).permutation(near)
-    part = filtered_ground(xyz[near], given=codes[near] == 2, openings=(5, 17))
+    part = filtered_ground(xyz[near], ground=codes[near] == 2, openings=(5, 17))
     for name, values in part.items():
         assert np.array_equal(values[middle[near]], whole[name][near][middle[near]]), name
 
@@ -105,7 +105,7 @@ def test_classify_keeps_the_ground_that_is_given(edited, tmp_path, capsys):
     assert not (codes[far_from(xyz, given) & ~given] == 2).any()
     assert (codes[~given] == 2).sum() > 500  # the strip that was not marked
     assert {5, 6} <= set(codes.tolist())
-    heights = filtered_ground(xyz, given=given)["HeightAboveGround"]
+    heights = filtered_ground(xyz, ground=given)["HeightAboveGround"]
     assert np.allclose(las["HeightAboveGround"], heights, atol=1 / 32)
     found = tmp_path / "found.laz"
     assert main(["classify", str(edited), str(found)]) == 0

@@ -16,10 +16,10 @@ EMPTY_NAMES = {
     "catches", "on", "of", "within", "around", "perform", "typed", "adapted",
 }  # fmt: skip
 
-#: Rooms that are read so; terrain is still to be mended.
+#: The rooms of the package.
 ROOMS = (
     "accuracy", "alsnet", "base", "classifier", "cli", "features", "objects", "pipeline", "plugin",
-    "reports", "review", "stages", "structures", "synthetic", "tiling",
+    "reports", "review", "stages", "structures", "synthetic", "terrain", "tiling",
 )  # fmt: skip
 
 MODULES = [

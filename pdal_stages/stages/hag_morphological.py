@@ -165,7 +165,7 @@ class HagMorphological(FarReaching):
             threads=self.threads,
             cells=context.blocks,
             figures=points.report.figures,
-            given=ground if ground is None or all_wanted else ground[wanted],
+            ground=ground if ground is None or all_wanted else ground[wanted],
         )
         out = {}
         for name in self.creates():

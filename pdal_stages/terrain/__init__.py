@@ -1,5 +1,7 @@
-"""Heights of points above the ground: the published minima grid [W18], and filtered ground [P13];
-noise around it."""
+"""Heights of points above the ground, and noise around it.
+
+The published minima grid [W18] and filtered ground [P13].
+"""
 
 from .heights import filtered_ground
 from .minima import MinimaTerrain, hag_minima

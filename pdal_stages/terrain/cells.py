@@ -1,5 +1,4 @@
-"""Points in cells of grids that are anchored to absolute coordinates: the lowest ones, vertical
-layers, sums around cells."""
+"""Points in cells of anchored grids: the lowest ones, vertical layers, sums around cells."""
 
 from __future__ import annotations
 
@@ -18,8 +17,10 @@ GAP = 1.0
 
 
 def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
-    """Sum whole numbers (h, w, ...) over the square that goes `reach` cells to every side of each
-    cell."""
+    """Sum whole numbers over the square that goes `reach` cells to every side of each cell.
+
+    Values have the shape (h, w, ...).
+    """
     sums = np.asarray(values)
     for axis in (0, 1):
         total = np.moveaxis(np.cumsum(sums, axis, np.int64), axis, 0)
@@ -31,8 +32,10 @@ def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
 
 
 def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDArray[np.float64]]:
-    """Return three arrays of one length, from three or from one of shape (n, 3); StageError where
-    shapes differ."""
+    """Return three arrays of one length, from three or from one of shape (n, 3).
+
+    StageError where shapes differ.
+    """
     if y is None and z is None:
         xyz = np.asarray(x, np.float64)
         if xyz.ndim != 2 or xyz.shape[1] != 3:
@@ -50,8 +53,10 @@ def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDAr
 
 
 def usable(*axes: NDArray[np.float64], mask: ArrayLike | None = None) -> NDArray[np.bool_]:
-    """Return which points (n,) have finite coordinates, and are in the mask where there is one;
-    StageError where its shape differs."""
+    """Return which points (n,) have finite coordinates, and are in the mask where there is one.
+
+    StageError where its shape differs.
+    """
     use = np.logical_and.reduce([np.isfinite(axis) for axis in axes])
     if mask is None:
         return use
@@ -70,8 +75,9 @@ def lowest_points(
     cell: NDArray[np.int64],
     count: int,
 ) -> NDArray[np.int64]:
-    """Return the indices of the lowest points of each of `count` cells, by the numbers of these; -1
-    where a cell has none.
+    """Return the indices of the lowest points of `count` cells; -1 where a cell has none.
+
+    `cell` (n,) has the numbers of the points' cells.
 
     Of points of one height the first by x, then y, is taken, so that order does not matter.
     """
@@ -106,8 +112,9 @@ def lowest_of_cells(
 def levels(
     z: NDArray[np.float64], cell: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Order points (n,) by the numbers of their cells (small ones) and by height; return the order,
-    and which begin a vertical layer of a cell.
+    """Order points (n,) by cell and height: return the order, and which begin a vertical layer.
+
+    The numbers of cells are small ones.
 
     A cell's points are parted where a gap is wide: the ground and the deck over it, a roof and what
     it stands on. The lowest points of levels are levels again, each by itself, so they stand for

@@ -21,15 +21,16 @@ def root_of(parent, member):
 
 
 @njit
-def number_sets(one, other, number):
-    """Number alike the members (n,) of each set that pairs join, in the order of first members;
-    return the number of sets.
+def number_sets(first, second, number):
+    """Give the members (n,) of each set that pairs join its number; return the number of sets.
+
+    Sets are numbered in the order of their first members.
 
     By hand: scipy.sparse.csgraph takes 0.4 s to be imported.
     """
     parent = np.arange(len(number))
-    for k in range(len(one)):
-        a, b = root_of(parent, one[k]), root_of(parent, other[k])
+    for k in range(len(first)):
+        a, b = root_of(parent, first[k]), root_of(parent, second[k])
         parent[max(a, b)] = min(a, b)
     count = 0
     for i in range(len(number)):
@@ -41,7 +42,7 @@ def number_sets(one, other, number):
 
 @njit
 def _linked(padded, offsets, steps, reach, number):
-    """Number alike the measured cells of each linked set; return the number of sets."""
+    """Give the measured cells of each linked set its number; return the number of sets."""
     h, w = number.shape
     parent = np.arange(h * w)
     for j in range(h):
@@ -75,8 +76,9 @@ def linked_cells(
     reach: float,
     step: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the number of each cell's set (h, w), -1 in holes; the sizes of the sets (n,), and
-    their :func:`longest_sides`.
+    """Link cells to sets: return each cell's set (h, w), sizes, and :func:`longest_sides` (n,).
+
+    The set is -1 in holes.
 
     Cells at most `reach` away from each other are linked across a `step` of meters, by the distance
     in cells.
@@ -98,8 +100,10 @@ def linked_cells(
 def longest_sides(
     label: NDArray[np.int64], places: Sequence[NDArray[np.int64]], count: int
 ) -> NDArray[np.int64]:
-    """Return the longest side of each of `count` sets of places: the largest difference along an
-    axis."""
+    """Return the longest side of each of `count` sets of places.
+
+    It is the largest difference along an axis.
+    """
     sides = np.zeros((len(places), count), np.int64)
     for side, at in zip(sides, places, strict=True):
         first, last = np.full((2, count), at[0] if len(at) else 0)

@@ -1,5 +1,7 @@
-"""Blocks of the ground's raster, computed once from the lowest points far around and all points
-inside; tiles join them."""
+"""Blocks of the ground's raster, which tiles join.
+
+They are computed once, from the lowest points far around and all points inside.
+"""
 
 from __future__ import annotations
 
@@ -34,21 +36,24 @@ def reach_of_block(options: FilterOptions) -> int:
 
 
 def _reach_of_ground(options: FilterOptions) -> int:
-    """Return how far around a block, in cells, it must be known which cells are ground: the
-    provisional surface of its points is fitted through these."""
+    """Return how far around a block, in cells, it must be known which cells are ground.
+
+    The provisional surface of its points is fitted through these.
+    """
     return planes_reach(options.near_levels) + 4
 
 
 @dataclass(frozen=True)
 class GroundCells:
-    """The cells of a :class:`.surface.GroundRaster` that have a height, an opening, or ground
-    points, as records."""
+    """The cells of a :class:`.surface.GroundRaster` that are not empty, as records.
+
+    They have a height, an opening, or ground points.
+    """
 
     cells: NDArray[np.void]  #: (n,) records, see `_record`
 
     def in_parts(self, side: int) -> dict[str, NDArray]:
-        """Return the cells of each square of `side` columns and rows by the square's name, for
-        files."""
+        """Return the cells of each square of `side` columns and rows by its name, for files."""
         column, row = (self.cells[name].astype(np.int64) // side for name in ("column", "row"))
         parts = group_by_key(cell_keys(column, row))
         return {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
@@ -91,8 +96,11 @@ class GroundCells:
 
 
 def _record(openings: int) -> np.dtype:
-    """Return the type of a cell's record: as in a :class:`.surface.GroundRaster`; whether it holds
-    ground points, and their mean place."""
+    """Return the type of a cell's record.
+
+    The fields of a :class:`.surface.GroundRaster`, whether the cell holds ground points, and their
+    mean place.
+    """
     return np.dtype(
         [
             *((name, np.int32) for name in ("column", "row")),
@@ -111,8 +119,10 @@ def by_block(
     use: NDArray[np.bool_],
     cell: float,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Return the points that may be ground (m, 3) by the block of `BLOCK_SIDE` cells that holds
-    them; meters."""
+    """Return the points that may be ground (m, 3) by the block that holds them, in meters.
+
+    Blocks have `BLOCK_SIDE` cells along a side.
+    """
     rows = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     column, row = (cell_numbers(axis[rows], cell) // BLOCK_SIDE for axis in (x, y))
     parts = group_by_key(cell_keys(column, row))
@@ -175,8 +185,10 @@ def _ground_means(
     window: GridWindow,
     options: FilterOptions,
 ) -> CellMeans:
-    """Find the ground among the points of parts (n, 3) by the planes (h, w, 3) of a window, and
-    return its means by cell."""
+    """Find the ground among points by the planes of a window; return its means by cell.
+
+    Parts of points are (n, 3), planes (h, w, 3).
+    """
     cell, corner = options.cell, window[:2]
     count, place = np.zeros(window.shape, np.int64), np.zeros((*window.shape, 3))
     for xyz in parts:

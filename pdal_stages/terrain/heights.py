@@ -68,7 +68,7 @@ def filtered_ground(
     z: ArrayLike | None = None,
     *,
     mask: ArrayLike | None = None,
-    given: ArrayLike | None = None,
+    ground: ArrayLike | None = None,
     cells: GroundCells | None = None,
     threads: int | None = None,
     figures: dict[str, Any] | None = None,
@@ -82,7 +82,7 @@ def filtered_ground(
         Coordinates in meters; or `x` alone, of shape (n, 3).
     mask : array_like of bool, shape (n,), optional
         Points that may be ground, e.g. all but noise; the others only receive heights.
-    given : array_like of bool, shape (n,), optional
+    ground : array_like of bool, shape (n,), optional
         Points that are the ground: nothing is filtered, they alone form the surface. They are
         ``Ground``, and so are others within the tolerance of the surface.
     cells : GroundCells, optional
@@ -117,10 +117,10 @@ def filtered_ground(
     finite, use = usable(x, y, z), usable(x, y, z, mask=mask)
     use &= np.abs(z) < HIGHEST
     rows = slice(None) if finite.all() else np.flatnonzero(finite)
-    ground = None if given is None else (usable(x, y, z, mask=given) & use)[rows]
+    known = None if ground is None else (usable(x, y, z, mask=ground) & use)[rows]
     points = GroundPoints.in_cells(x[rows], y[rows], z[rows], use[rows], settings.cell)
     counts = {} if figures is None else figures
-    out = _heights(points, settings, ground, cells, threads, counts)
+    out = _heights(points, settings, known, cells, threads, counts)
     counts["unused_points"] = int(len(x) - np.count_nonzero(use))
     return out if finite.all() else {k: _spread(v, rows, len(x)) for k, v in out.items()}
 
@@ -189,8 +189,10 @@ def _known_pieces(
 def _given_pieces(
     points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_]
 ) -> Iterator[_Piece]:
-    """Yield pieces of the cloud with the raster of the points (n,) that are `ground`: surveyed,
-    edited, or found by another program."""
+    """Yield pieces of the cloud with the raster of the points (n,) that are `ground`.
+
+    These are surveyed, edited, or found by another program.
+    """
     margin = 2 + FILL_RINGS + max([0, *options.opening_radii])
     for rows, core in patches(points.column, points.row, options.reach_of_given, options.link):
         part = points.take(rows)

@@ -19,8 +19,10 @@ from .openings import highest_around
 
 
 class LowRules(NamedTuple):
-    """Thresholds of low outliers; a NamedTuple, as kernels read it. Columns are those of the
-    raster: of 1 m for the ground filter, 1.5 m for noise."""
+    """Thresholds of low outliers; a NamedTuple, as kernels read it.
+
+    Columns are those of the raster: of 1 m for the ground filter, 1.5 m for noise.
+    """
 
     near: int = 9  #: columns to each side through which the plane is fitted
     min_columns: int = 12  #: that a plane needs
@@ -48,8 +50,7 @@ def reach(side: float) -> int:
 
 @device(_nrt=True, fastmath=set(FAST))
 def _plane_under(low, j, i, rules):
-    """Fit a plane under the columns around one: return its height there, and its rise per column
-    along both axes.
+    """Fit a plane under the columns around one: return its height there, and its rise per column.
 
     Iteratively reweighted least squares; the height is -inf where there are too few columns.
     """
@@ -116,8 +117,10 @@ def _supported(base, rules):
 
 @device
 def _has_company(base, supported, side, j, i, z, plane, rules):
-    """Tell whether enough other columns are about as deep as z, and at least half as far below the
-    plane."""
+    """Tell whether enough other columns are about as deep as z.
+
+    They lie at least half as far below the plane.
+    """
     h, w = base.shape
     far, half, company = int(np.ceil(rules.far_m / side)), 0.5 * (plane[0] - z), 0
     for b in range(max(j - far, 0), min(j + far + 1, h)):
@@ -133,8 +136,10 @@ def _has_company(base, supported, side, j, i, z, plane, rules):
 
 @njit
 def _limits(low, base, supported, side, depth, limit, rules):
-    """Fill `limit` with the height below which each low place is an outlier, -inf where it may be
-    ground."""
+    """Fill `limit` with the height below which each low place is an outlier.
+
+    It is -inf where the place may be ground.
+    """
     for j in range(low.shape[0]):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:

@@ -56,8 +56,9 @@ class MinimaTerrain:
         }
 
     def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Return the terrain height of points: bilinear, at the center of their fine cell; NaN for
-        those not finite.
+        """Return the terrain height of points: bilinear, at the center of their fine cell.
+
+        NaN for points that are not finite.
 
         NoTerrainError if no point formed a terrain.
         """
@@ -81,8 +82,7 @@ class MinimaTerrain:
         return out
 
     def _filled(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the values of the cells `keys`; empty ones from the filled ones about as near as
-        the nearest.
+        """Return the values of cells; empty ones from the filled ones about as near as the nearest.
 
         Weights are one over the fourth power of the distance between cell centers. [W18] does not
         say what becomes of empty cells.
@@ -111,8 +111,10 @@ _FILL = 1.5
 
 
 def _corners(x, y, cell: float, resolution: float):
-    """Return the keys of the four coarse cells around the middle of each point's fine cell (4, n),
-    and where between them it lies."""
+    """Return the keys of the four coarse cells around each point's fine cell (4, n).
+
+    And where between them its middle lies, from 0 to 1.
+    """
     u, v = ((np.floor(axis / resolution) + 0.5) * (resolution / cell) - 0.5 for axis in (x, y))
     i, j = cell_numbers(u, 1.0), cell_numbers(v, 1.0)
     return np.array([cell_keys(i + a, j + b) for b in (0, 1) for a in (0, 1)]), u - i, v - j

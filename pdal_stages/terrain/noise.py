@@ -175,8 +175,10 @@ class Voxels:
     def from_places(
         cls, row, column, layer, width: int, counts=None
     ) -> tuple[Voxels, NDArray[np.int64]]:
-        """Return the voxels of points, or of voxels with `counts` points; and the index of the
-        voxel of each."""
+        """Return the voxels of points, and the index of each one's voxel.
+
+        Instead of points they may be voxels with `counts` points.
+        """
         keys, voxel = np.unique(
             ((row * width + column) << BITS) + layer + LAYERS, return_inverse=True
         )
@@ -190,8 +192,10 @@ class Voxels:
 
 
 def density(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean number of points in a column around each voxel (n,), and their spacing (n,)
-    in meters, over 3 x 3 blocks."""
+    """Return the mean number of points in a column around each voxel (n,), and their spacing.
+
+    In meters, over 3 x 3 blocks.
+    """
     row, column, _ = voxels.places
     wide = voxels.width // BLOCK
     block = (row // BLOCK) * wide + column // BLOCK
@@ -249,8 +253,7 @@ def _touching(keys, spans, pairs):
 def small_clusters(
     voxels: Voxels, per_column: NDArray[np.float64], spacing: NDArray[np.float64], most: int
 ) -> NDArray[np.bool_]:
-    """Return which voxels (n,) are of clusters of at most `most` points that nothing joins to the
-    rest.
+    """Return which voxels (n,) are of clusters of at most `most` points that nothing joins.
 
     `per_column` and `spacing` (n,) are those of :func:`density`.
     """
@@ -271,8 +274,10 @@ def small_clusters(
 
 @njit
 def _mark_high(place, lowest, suspect, gaps, top, hanging, rules, verdict):
-    """Mark the suspects that lie above everything near by their `gaps` (n,), and are not part of a
-    line."""
+    """Mark the suspects that lie above everything near, and are not part of a line.
+
+    `gaps` (n,) are the least distances, in meters.
+    """
     h, w = top.shape
     near = np.empty((3, (2 * rules.far + 1) ** 2))
     for k in range(len(place)):
@@ -297,8 +302,9 @@ def _mark_high(place, lowest, suspect, gaps, top, hanging, rules, verdict):
 
 @device
 def _in_line(hanging, j, i, z, near, rules):
-    """Tell whether hanging voxels are strung along a line through a place, as wires are, or single
-    points of them.
+    """Tell whether hanging voxels are strung along a line through a place, as wires are.
+
+    Or single points of them.
 
     `hanging` are the heights (h, w) of hanging voxels, and which are suspects; `near` (3, m) is
     working memory.

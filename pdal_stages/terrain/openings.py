@@ -1,5 +1,4 @@
-"""Morphological openings of a minimum grid by octagons, and the objects that growing openings show
-[P13].
+"""Morphological openings of a minimum grid, and the objects that growing ones show [P13].
 
 Holes near measured cells are filled first, as SMRF inpaints them: between scattered points of a
 slope, an opening would lower each to its lowest neighbor in the window. Other holes are ``+inf``:
@@ -32,8 +31,10 @@ def opening_radius(window: float, cell: float) -> int:
 
 
 def opening_radii(largest: int) -> list[int]:
-    """Return radii in cells, each larger than the one before by a fifth, but by 1 or 2 cells:
-    with larger steps slopes would drop as objects do."""
+    """Return radii in cells, each larger than the one before by a fifth, but by 1 or 2 cells.
+
+    With larger steps slopes would drop as objects do.
+    """
     radii = [1]
     while (radius := radii[-1] + min(max(1, radii[-1] // 5), 2)) < largest:
         radii.append(radius)
@@ -41,8 +42,10 @@ def opening_radii(largest: int) -> list[int]:
 
 
 def _steps(radius: int) -> tuple[int, int]:
-    """Return the numbers of squares and diamonds of radius 1 that add up to an octagon:
-    tan(22.5 degrees) of them are squares."""
+    """Return the numbers of squares and diamonds of radius 1 that add up to an octagon.
+
+    tan(22.5 degrees) of them are squares.
+    """
     squares = int(0.41421356 * radius)
     return squares, radius - squares
 
@@ -86,8 +89,9 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
 
 @njit
 def _fill_ring(heights, known):
-    """Fill the holes that touch `known` cells (n,) with the mean of their known neighbors; return
-    the filled cells (m,).
+    """Fill the holes that touch `known` cells (n,) with the mean of their known neighbors.
+
+    Returns the filled cells (m,).
 
     Cells are numbered row by row. Neighbors at an edge count twice those at a corner.
     """
@@ -118,8 +122,10 @@ def _fill_ring(heights, known):
 
 
 def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the raster (h, w) with the holes up to `FILL_RINGS` cells from measured ones filled,
-    ring by ring; meters."""
+    """Return the raster (h, w) with the holes near measured cells filled, in meters.
+
+    Up to `FILL_RINGS` cells away, ring by ring.
+    """
     filled = raster.copy()
     known = np.flatnonzero(raster != HOLE)
     for _ in range(FILL_RINGS):
@@ -130,8 +136,10 @@ def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
 def openings_of(
     raster: NDArray[np.float32], radii: Iterable[int]
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield radii in cells, ascending, and the openings (h, w) of a minimum grid by octagons of
-    them; meters."""
+    """Yield radii in cells, ascending, and the openings (h, w) of a minimum grid by octagons.
+
+    Heights are in meters.
+    """
     # Erosion is the maximum of what is upended. The ceiling keeps windows from holes.
     ceiling = np.where(raster != HOLE, HOLE, -HOLE)
     lowest_upended = np.where(raster != HOLE, -raster, -HOLE)

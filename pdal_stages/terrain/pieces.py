@@ -1,5 +1,7 @@
-"""Cut points into pieces whose rasters are small wherever points lie: groups far apart, and squares
-with surroundings."""
+"""Cut points into pieces whose rasters are small wherever points lie.
+
+Pieces are groups far apart, and squares with surroundings.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,9 @@ BLOCKS_PER_LINK = 4
 def patches(
     column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int
 ) -> Iterator[tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]]:
-    """Yield the indices of the points of a piece and of those around it that matter, and which of
-    them belong to the piece.
+    """Yield the points of a piece with those around that matter, and which belong to the piece.
+
+    Both as indices or masks, or a slice where they are all.
 
     Every point belongs to one piece. Points more than `reach` cells away, along either axis, do not
     matter; nor do points that no chain of others connects with steps of at most `link` cells. One
@@ -59,8 +62,9 @@ def patches(
 
 
 def refuse_scattered(counts: Collection[int]) -> None:
-    """Refuse points that are alone in most of their places: each would take milliseconds, and none
-    tells anything.
+    """Refuse points that are alone in most of their places.
+
+    Each would take milliseconds, and none tells anything.
 
     `counts` are the points of each place.
     """
@@ -77,8 +81,7 @@ def refuse_scattered(counts: Collection[int]) -> None:
 def _groups(
     column: NDArray[np.int64], row: NDArray[np.int64], link: int
 ) -> list[NDArray[np.int64]]:
-    """Group points: all within `link` cells of each other, and few that are a little farther
-    apart."""
+    """Group points: all within `link` cells of each other, and few a little farther apart."""
     side = -(-link // BLOCKS_PER_LINK)
     rings = -(-link // side)
     blocks, block = np.unique(cell_keys(column // side, row // side), return_inverse=True)

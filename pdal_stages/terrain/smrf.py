@@ -1,5 +1,4 @@
-"""The progressive morphological filter [P13]: it classifies the cells of a minimum grid into ground
-and objects.
+"""The progressive morphological filter [P13]: ground and objects of a minimum grid.
 
 Every step that looks far away is done here, on a raster; see :mod:`.heights`. In tiles it is done
 once for each block of a grid of blocks, from the lowest points of cells, and tiles join the blocks.
@@ -39,8 +38,10 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """Options of :func:`.heights.filtered_ground`; lengths in meters. Wrong ones raise an
-    :class:`OptionError`."""
+    """Options of :func:`.heights.filtered_ground`; lengths in meters.
+
+    Wrong ones raise an :class:`OptionError`.
+    """
 
     cell: float = 1.0
     slope: float = 0.1
@@ -51,6 +52,7 @@ class FilterOptions:
     slope_too: bool = False
 
     def __post_init__(self) -> None:
+        """Refuse wrong sizes."""
         for name, value in (
             ("cell", self.cell),
             ("window", self.window),
@@ -96,14 +98,17 @@ class FilterOptions:
         height: NDArray[np.float64],
         gradient: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Return which of the points to `use` are ground, by their heights above the surface and
-        its slope there; NaN is not."""
+        """Return which of the points to `use` are ground.
+
+        They are so by their heights above the surface and its slope there; NaN is not.
+        """
         return use & (np.abs(height) <= self.threshold + self.scalar * gradient)
 
     @property
     def reach(self) -> int:
-        """Distance in cells within which lowest points can change which cells are ground, and how
-        high.
+        """Distance in cells within which lowest points can change which cells are ground.
+
+        And how high these are.
 
         An opening looks twice its radius away; low outliers are judged before, and surfaces fitted
         through ground after.
@@ -123,8 +128,10 @@ class FilterOptions:
 
     @property
     def reach_of_given(self) -> int:
-        """Distance in cells within which points can change a point's height above given ground, or
-        an opening's."""
+        """Distance in cells within which points can change a height above given ground.
+
+        Or above an opening.
+        """
         if not self.openings:
             return self._reach_of_surfaces + 4
         openings = 2 * max(self.opening_radii) + 2 * FILL_RINGS + outlier_reach(self.cell)
@@ -141,8 +148,10 @@ class FilterOptions:
 
     @property
     def link(self) -> int:
-        """Distance in cells across which one step looks: no step of the filter sees from a point to
-        another across more empty land."""
+        """Distance in cells across which one step looks.
+
+        No step of the filter sees from a point to another across more empty land.
+        """
         openings = max([self.radius, *self.opening_radii]) + 2 * FILL_RINGS
         return max(outlier_reach(self.cell), openings, planes_reach(self.far_levels)) + 2
 
@@ -155,8 +164,10 @@ CellMeans = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
 class GroundPoints(NamedTuple):
-    """Points with finite coordinates in meters (n,) each, and the cells they fall in; a NamedTuple,
-    as kernels read it."""
+    """Points with finite coordinates in meters (n,) each, and the cells they fall in.
+
+    A NamedTuple, as kernels read it.
+    """
 
     x: NDArray[np.float64]
     y: NDArray[np.float64]
@@ -223,8 +234,10 @@ def ground_raster(
 
 
 def _regain_ground(raster: GroundRaster, wanted: GridWindow, options: FilterOptions) -> None:
-    """Turn cells near the provisional surface, through the ground so far, into ground again: in
-    several rounds, each of which sees less around the `wanted` cells."""
+    """Turn cells near the provisional surface, through the ground so far, into ground again.
+
+    There are several rounds, each of which sees less around the `wanted` cells.
+    """
     step, kept = planes_reach(options.near_levels), raster.window
     measured = np.isfinite(raster.lowest)
     for number in range(1, ROUNDS + 1):
@@ -284,8 +297,9 @@ def _near(cells, place, blocks, corner, cell, threshold, scalar):
 
 @njit
 def add_ground(points, is_ground, cell, corner, count, place):
-    """Add points that are ground to their cells: number (h, w) and places (h, w, 3), as whole
-    numbers, so that order does not matter.
+    """Add points that are ground to their cells: number (h, w) and places (h, w, 3).
+
+    Places are whole numbers, so that order does not matter.
 
     `points` are :class:`GroundPoints`; `corner` is the first column and row of the raster.
     """
@@ -301,8 +315,10 @@ def add_ground(points, is_ground, cell, corner, count, place):
 
 
 def means_of(count: NDArray[np.int64], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Make sums of :func:`add_ground` means: from the cell's center, in cells, and its height;
-    return which cells (h, w) hold ground."""
+    """Make sums of :func:`add_ground` means; return which cells (h, w) hold ground.
+
+    Means are from the cell's center, in cells, and the height in meters.
+    """
     held = count > 0
     place[held] /= (_PARTS * count[held])[:, None]
     return held

@@ -75,8 +75,9 @@ def reach(levels: int) -> int:
 
 @device
 def blend(planes, i, j, s, t, size):
-    """Return height and gradient of the four planes around a place, weighted by nearness; NaN
-    where none is known.
+    """Return height and gradient of the four planes around a place, weighted by nearness.
+
+    NaN where none is known.
 
     The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the center of block (j, i):
     given apart, so that rounding does not depend on where the array begins.
@@ -141,8 +142,9 @@ def _sum_around(moments, j, i, size, sums):
 
 @njit
 def _moments_of_cells(held, place, height, level, corner, out, out_corner):
-    """Add up the moments of the held cells (n,), numbered row by row, of each block of a level,
-    about its center.
+    """Add up the moments of the held cells of each block of a level, about its center.
+
+    The cells (n,) are numbered row by row.
 
     Corners are the first column and row of the cells and of the blocks `out` (h, w, 9).
     """
@@ -172,8 +174,10 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
 
 @njit
 def _mark_parents(needed, left, bottom, parents, parents_left, parents_bottom):
-    """Mark the blocks (h, w) of the next coarser level whose planes `from_parents` blends for
-    needed ones."""
+    """Mark the blocks of the next coarser level that `from_parents` blends for needed ones.
+
+    Both (h, w).
+    """
     for j in range(needed.shape[0]):
         for i in range(needed.shape[1]):
             if needed[j, i]:
@@ -200,8 +204,10 @@ def _coarsest(moments, size, needed, planes):
 
 @njit
 def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, planes):
-    """Evaluate the planes of blocks of twice the `size` at the centers of the needed blocks of
-    `size`."""
+    """Evaluate the planes of blocks of twice the `size` at the centers of the needed blocks.
+
+    These have the side `size`, in cells.
+    """
     for j in range(needed.shape[0]):
         for i in range(needed.shape[1]):
             if needed[j, i]:
@@ -212,8 +218,10 @@ def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, pl
 
 @njit
 def _fit(moments, size, needed, planes):
-    """Correct the needed planes (given: what the coarser level says) by the ground of 3 x 3
-    blocks."""
+    """Correct the needed planes by the ground of 3 x 3 blocks.
+
+    They are given as the coarser level has them.
+    """
     h, w = moments.shape[:2]
     sums = np.empty(9)
     for j in range(h):
@@ -285,8 +293,9 @@ def surface(
     needed: NDArray[np.bool_],
     planes: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Fit planes at the centers of the `needed` cells (h, w): return height and gradient per cell
-    (h, w, 3), NaN beyond the reach of all measured cells.
+    """Fit planes at the centers of the `needed` cells (h, w): height and gradient per cell.
+
+    The result is (h, w, 3), NaN beyond the reach of all measured cells.
 
     There are `levels` coarser levels, at least 1. Planes of an earlier call for the same cells are
     overwritten where they are given.
