@@ -93,17 +93,3 @@ def test_neighbors_beyond_the_halo_are_counted(tmp_path):
         progress=False,
     )
     assert model.info["training"][SHORT] > 0
-
-
-def test_tiles_hold_each_point_once_and_what_lies_around(tmp_path):
-    cloud = scene()
-    tiles = list(cut(cloud, 8.1, tmp_path / "raw").clouds(10.0))
-    assert sum(tile.points for tile in tiles) == len(cloud)
-    for tile in tiles:
-        own = tile.xyz[tile.inside]
-        low, high = np.floor(own[0, :2] / 8.1) * 8.1, np.floor(own[0, :2] / 8.1) * 8.1 + 8.1
-        near = ((cloud.xyz[:, :2] >= low - 10) & (cloud.xyz[:, :2] <= high + 10)).all(axis=1)
-        assert np.count_nonzero(near) == len(tile)
-        assert len(tile) == len(np.unique(tile.xyz, axis=0)) and len(
-            tile.dimensions["Flight"]
-        ) == len(tile)

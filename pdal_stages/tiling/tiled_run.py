@@ -25,14 +25,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .checkpoint import Store, fingerprint
 from .inputs import CloudIndex, Survey
-from .jobs import (
-    InterruptedRun,
-    Job,
-    TiledRun,
-    messages_of,
-    messages_on_folders,
-    summarize,
-)
+from .jobs import InterruptedRun, Job, TiledRun, messages_of, messages_on_folders, summarize
 from .options import TilingOptions, worker_bytes
 from .plan import RunContext, TilePlan, make_plan, outputs_for
 from .rounds import block_name, blocks_near, make_block, square_name
