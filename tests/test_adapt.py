@@ -10,8 +10,8 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.cli import main
-from pdal_stages.tiling import self_training as adapting
-from pdal_stages.tiling.self_training import spread, sure_points
+from pdal_stages.tiling import train_survey as adapting
+from pdal_stages.tiling.train_survey import spread, sure_points
 
 pytestmark = pytest.mark.pdal
 

@@ -25,7 +25,7 @@ from surveys import SURVEYS
 
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.self_training import SURE, adapt
+from pdal_stages.tiling.train_survey import SURE, adapt
 
 CODES = (2, 5, 6)
 

@@ -101,7 +101,7 @@ def _train(options: argparse.Namespace) -> None:
 
 def _adapt(options: argparse.Namespace) -> None:
     from ..classifier.model import load_model
-    from ..tiling.self_training import adapt
+    from ..tiling.train_survey import adapt
 
     how = tiling_options(options)
     with signals.sigterm_like_ctrl_c():

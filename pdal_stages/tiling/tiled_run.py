@@ -28,8 +28,7 @@ from .inputs import CloudIndex, Survey
 from .jobs import InterruptedRun, Job, TiledRun, messages_of, messages_on_folders, summarize
 from .options import TilingOptions, worker_bytes
 from .plan import RunContext, TilePlan, make_plan, outputs_for
-from .rounds import block_name, blocks_near, make_block, square_name
-from .run_tile import run_tile
+from .run_tile import block_name, blocks_near, make_block, run_tile, square_name
 from .sorted_points import TEMPORARY, is_intact, sort_points
 from .tile_grid import Box, TileGrid
 from .write_outputs import write_file
