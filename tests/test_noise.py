@@ -337,16 +337,6 @@ def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
         assert np.array_equal(part[inside[near]], found[inside])
 
 
-def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
-    xyz, _ = scene(6, 200, 2.0)
-    found = detached_noise(xyz)
-    from pdal_stages.terrain import pieces
-
-    monkeypatch.setattr(pieces, "LARGEST_RASTER", 1000)
-    monkeypatch.setattr(pieces, "SQUARE_SIDE", 64)
-    assert np.array_equal(detached_noise(xyz), found)
-
-
 def test_degenerate_clouds_hold_no_noise():
     for xyz in (np.empty((0, 3)), np.zeros((1, 3)), np.zeros((500, 3)), np.full((3, 3), np.nan)):
         assert not detached_noise(xyz).any()
