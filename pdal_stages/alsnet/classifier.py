@@ -59,15 +59,11 @@ class AlsNet:
             parameters["inputs"],
         )
         if [each["name"] for each in inputs] != names or names != entry["dimensions"]:
-            raise ModelError(
-                "the network's inputs are not the model's dimensions", found=repr(names)[:80]
-            )
+            raise ModelError("inputs and dimensions of the network differ", found=repr(names)[:80])
         mean, scale = (tuple(float(each[key]) for each in inputs) for key in ("mean", "scale"))
         needed = configuration.memory_mb(n_features)
         if needed > MOST_MB:
-            raise ModelError(
-                "a batch of the network would need too much memory", found=f"{needed:,.0f} MB"
-            )
+            raise ModelError("a batch would need too much memory", found=f"{needed:,.0f} MB")
         check_weights(arrays, configuration, n_features, n_classes)
         spacing = float(parameters["spacing"])
         return cls(dict(arrays), configuration, tuple(names), mean, scale, spacing, n_classes)

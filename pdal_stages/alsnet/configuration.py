@@ -145,9 +145,7 @@ def parse_configuration(
     elif isinstance(source, Mapping):
         configuration = _from_mapping(source)
     else:
-        raise OptionError(
-            "a network configuration must be a name or a mapping", found=repr(source)[:60]
-        )
+        raise OptionError("a configuration must be a name or a mapping", found=repr(source)[:60])
     return configuration if points is None else replace(configuration, points=points)
 
 

@@ -47,19 +47,13 @@ def check_weights(
     """
     shapes = configuration.shapes(inputs, classes)
     if odd := sorted(set(weights) ^ set(shapes)):
-        raise ModelError(
-            "the network's arrays are not those of its configuration", found=repr(odd[0])[:60]
-        )
+        raise ModelError("the arrays are not those of its configuration", found=repr(odd[0])[:60])
     for name, shape in shapes.items():
         array = weights[name]
         if array.shape != shape:
-            raise ModelError(
-                f"the network's array '{name}' must be {shape}", found=f"shape {array.shape}"
-            )
+            raise ModelError(f"the array '{name}' must be {shape}", found=f"shape {array.shape}")
         if not np.isfinite(array).all() or (name != "scores" and array[:, -1].min() < 0.0):
-            raise ModelError(
-                f"the network's array '{name}' must be finite, with variances of 0 or more"
-            )
+            raise ModelError(f"the array '{name}' must be finite, with variances of 0 or more")
 
 
 def forward(

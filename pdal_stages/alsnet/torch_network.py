@@ -149,9 +149,7 @@ def resume_checkpoint(path: str, identity: str, apply: Callable[[dict[str, Any]]
     """
     data = Path(path).read_bytes()
     if hashlib.sha256(data[:-_DIGEST]).digest() != data[-_DIGEST:]:
-        raise ModelError(
-            "this is not a checkpoint of this release, or it is damaged", where=path, cure=_CURE
-        )
+        raise ModelError("the checkpoint is damaged or of another release", where=path, cure=_CURE)
     try:
         state = torch.load(BytesIO(data[:-_DIGEST]), map_location="cpu", weights_only=True)
         fits = state["identity"] == identity

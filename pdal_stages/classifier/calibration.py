@@ -178,9 +178,7 @@ def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
         try:
             return Calibration.from_dict(strict_json(beside.read_bytes()))
         except (OSError, ValueError, RecursionError) as error:
-            raise ModelError(
-                "the file beside the model is damaged", where=str(beside), found=error
-            ) from None
+            raise ModelError("the calibration is damaged", where=str(beside), found=error) from None
     cure = "Train it with folds (the default), on labels that lie in more than one place"
     if info.get("teacher"):
         cure = (

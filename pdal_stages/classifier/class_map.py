@@ -91,9 +91,7 @@ class ClassMap:
             sorted(label for k, part in enumerate(self.labels) if k != i for label in part)
         )
         if not rest:
-            raise OptionError(
-                "nothing is left for the background: 'classes' names the target only", cure=_CURE
-            )
+            raise OptionError("nothing is left: 'classes' names the target only", cure=_CURE)
         both = sorted([(target, self.names[i], self.labels[i]), (background, "Background", rest)])
         return ClassMap(*zip(*both, strict=True))
 
@@ -116,13 +114,11 @@ def _labels(text: Any) -> tuple[int, ...]:
         span = re.fullmatch(r"\s*(\d{1,5})(?:\s*-\s*(\d{1,5}))?\s*", part)
         if span is None:
             raise OptionError(
-                "'classes' has a key that is not a list of labels", found=repr(text), cure=_CURE
+                "a key of 'classes' is not a list of labels", found=repr(text), cure=_CURE
             )
         first, last = int(span[1]), int(span[2] or span[1])
         if last < first or last > MAX_LABEL:
-            raise OptionError(
-                "'classes' has an invalid label range", found=part.strip(), cure=_CURE
-            )
+            raise OptionError("'classes' has a bad label range", found=part.strip(), cure=_CURE)
         labels.extend(range(first, last + 1))
     return tuple(dict.fromkeys(labels))
 

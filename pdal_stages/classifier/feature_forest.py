@@ -36,9 +36,7 @@ class Features:
         for part in self.plan.layout:
             token = part.neighborhood.token
             if part.shapes and token not in stored:
-                raise ModelError(
-                    "the model lacks the thresholds of shape distributions", found=token
-                )
+                raise ModelError("the model lacks thresholds of shape distributions", found=token)
             if part.neighborhood.kind == "copt" and self.copt_threshold is None:
                 raise ModelError("the model lacks the curvature threshold of copt")
 

@@ -157,7 +157,7 @@ class Model:
         values = self.info["passes"][number]["importances"]
         if by not in GROUPINGS:
             raise OptionError(
-                "importances are grouped by something unknown", found=by, cure=f"One of {GROUPINGS}"
+                "importances are not grouped by that", found=by, cure=f"One of {GROUPINGS}"
             )
         if values is None:
             raise ModelError("the model file holds no importances")
@@ -388,7 +388,7 @@ def load_model(path: str | os.PathLike) -> Model:
         raise error.at(file) from error.__cause__
     except OptionError as error:  # a feature of another release, say
         raise ModelError(
-            "the model needs what this release does not have", where=file, found=error
+            "this release lacks what the model needs", where=file, found=error
         ) from error
 
 

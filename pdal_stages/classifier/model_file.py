@@ -151,9 +151,7 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
         raise error.at(str(path)) from error.__cause__
     except _BAD as error:  # RecursionError is a RuntimeError
         text = f"{type(error).__name__}: {error}"[:200]
-        raise ModelError(
-            "the model file cannot be read", where=str(path), found=text, cure=CURE
-        ) from error
+        raise ModelError("the file is damaged", where=str(path), found=text, cure=CURE) from error
 
 
 def _read(
@@ -171,32 +169,24 @@ def _read(
     if MANIFEST not in members:
         raise ModelError("this is not a model file", found=f"a zip without {MANIFEST}")
     if members[MANIFEST].file_size > MANIFEST_LIMIT:
-        raise ModelError(
-            "the manifest is too large", found=f"{members[MANIFEST].file_size:,} bytes"
-        )
+        raise ModelError("the manifest is too large", found=f"{members[MANIFEST].file_size:,} B")
     manifest = parse(_unpack(archive, members[MANIFEST]), is_shipped)
     rules = [rules_of(entry["algorithm"]) for entry in manifest["passes"]]
     table = manifest["arrays"]
     expected = {MANIFEST, *(entry["file"] for entry in table.values())}
     if len(expected) != 1 + len(table) or expected != set(members):
         odd = sorted(expected ^ set(members))
-        raise ModelError(
-            "the members and the manifest's list of arrays differ", found=odd[:3] or None
-        )
+        raise ModelError("members and the manifest's list of arrays differ", found=odd[:3] or None)
     arrays: Arrays = [{} for _ in rules]
     for label, entry in table.items():
         number, name = int(label[0]) - 1, label[2:]
         known = rules[number].items() if number < len(rules) else ()
         rule = next((rule for pattern, rule in known if fnmatchcase(name, pattern)), None)
         if rule is None:
-            raise ModelError(
-                "the model file has an array its passes do not know", found=repr(label)
-            )
+            raise ModelError("the file has an array its passes do not know", found=repr(label))
         data = _unpack(archive, members[entry["file"]])
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise ModelError(
-                f"the array '{name}' is not the one that was stored", found="another SHA-256"
-            )
+            raise ModelError(f"the array '{name}' is not the stored one", found="another SHA-256")
         arrays[number][name] = from_bytes(data, rule, name)
     for stored, needed in zip(arrays, rules, strict=True):
         missing = [name for name in needed if not name.endswith("*") and name not in stored]
@@ -248,9 +238,7 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
         if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != rest:
             raise ValueError(f"{rest:,} bytes of values for shape {shape}")
     except (ValueError, RecursionError, MemoryError) as error:
-        raise ModelError(
-            f"the array '{name}' is not what a model has", found=str(error)[:120]
-        ) from None
+        raise ModelError(f"the array '{name}' is not a model's", found=str(error)[:120]) from None
     values = np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
     return values.astype(dtype.newbyteorder("="), copy=False)
 
@@ -286,9 +274,7 @@ def validate(manifest: Mapping[str, Any]) -> None:
         raise ModelError("the manifest is nested too deeply", cure=CURE) from None
     if error is not None:
         place = "/".join(str(part)[:60] for part in error.absolute_path) or "(the whole)"
-        raise ModelError(
-            f"the manifest is not valid at {place}", found=error.message[:200], cure=CURE
-        )
+        raise ModelError(f"the manifest is not valid at {place}", found=error.message[:200])
 
 
 @lru_cache

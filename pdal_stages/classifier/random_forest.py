@@ -152,7 +152,7 @@ class Forest:
         values = np.ascontiguousarray(values, dtype=np.float32)
         if values.ndim != 2 or values.shape[1] != self.n_features:
             raise ModelError(
-                f"the model takes {self.n_features} features per point",
+                f"it takes {self.n_features} features per point",
                 found=f"shape {values.shape}",
             )
         out = np.zeros((len(values), self.n_classes))

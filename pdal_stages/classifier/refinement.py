@@ -38,9 +38,7 @@ class Blend:
         blend = cls(tuple(entry["before"]), tuple(entry["labeled"]), float(entry["trusted"]))
         ascending = all(sorted(set(each)) == list(each) for each in (blend.before, blend.labeled))
         if not ascending or blend.codes != list(codes):
-            raise ModelError(
-                "a refined forest's classes do not fit each other", found=str(entry)[:100]
-            )
+            raise ModelError("classes of a refined forest do not fit", found=str(entry)[:100])
         return blend
 
     def to_dict(self) -> dict[str, Any]:

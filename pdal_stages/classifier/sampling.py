@@ -116,9 +116,7 @@ def draw_samples(
             progress.update(len(position))
     available = there.sum(axis=0)
     if not available.all():
-        raise OptionError(
-            "a class has no samples", found=f"class position {int(np.argmin(available))}"
-        )
+        raise OptionError("a class has no samples", found=f"position {int(np.argmin(available))}")
     if not random_order:
         count = min(count, int(available.max()))
     is_alone = np.count_nonzero(there.any(axis=1)) == 1

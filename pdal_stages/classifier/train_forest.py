@@ -42,6 +42,12 @@ PASS_FOLDS = 5
 #: features.
 SHORT = "short_of_neighbors"
 
+#: Options of growing that the model file stores.
+_STORED = (
+    *("max_samples", "max_features", "min_samples_leaf", "max_depth"),
+    *("vote", "sampling", "scaling"),
+)
+
 optional_inputs = {**{name: (name,) for name in OPTIONAL_DIMENSIONS}, "returns": SOURCES}
 
 
@@ -166,7 +172,7 @@ class ForestTraining:
         bad = ~np.isfinite(values).all(axis=0)
         if bad.any():
             raise DimensionError(
-                f"the feature {names[int(bad.argmax())]} is not finite for some samples"
+                f"the feature {names[int(bad.argmax())]} is not finite for a sample"
             )
         return values
 
@@ -184,13 +190,7 @@ class ForestTraining:
             "count": o.count,
             "seed": o.seed,
             "samples": len(self.samples),
-            "max_samples": self.growth.max_samples,
-            "max_features": o.max_features,
-            "min_samples_leaf": o.min_samples_leaf,
-            "max_depth": o.max_depth,
-            "vote": o.vote,
-            "sampling": o.sampling,
-            "scaling": o.scaling,
+            **{name: getattr(self.growth, name) for name in _STORED},
             **notes,
             **self._held_by_base(),
             **({SHORT: self.short} if self.short else {}),

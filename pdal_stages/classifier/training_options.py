@@ -283,9 +283,7 @@ class TrainingOptions(Settings):
         checks.one_of("'algorithm'", self.algorithm, kinds())
         for name in kinds():  # an algorithm's own options stand under its name
             if name != self.algorithm and getattr(self, name, None):
-                raise OptionError(
-                    f"'{name}' applies only to algorithm '{name}'", found=self.algorithm
-                )
+                raise OptionError(f"'{name}' is for algorithm '{name}'", found=self.algorithm)
         options = trainer_of(self.algorithm).own_options(getattr(self, self.algorithm, None))
         if options is not None:
             self._set(**{self.algorithm: options})
@@ -315,9 +313,7 @@ class TrainingOptions(Settings):
                 cure="Leave these options out",
             )
         if self.context is not None and OWN not in Context.parse(self.context).tokens:
-            raise OptionError(
-                f"with a 'base', 'context' must have '{OWN}'", found=str(self.context)[:60]
-            )
+            raise OptionError(f"on a base, 'context' needs '{OWN}'", found=str(self.context)[:60])
         self._set(voxel=self.base.voxel)
 
     @classmethod
