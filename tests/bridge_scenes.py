@@ -239,8 +239,6 @@ def overpass(seed=0, half=4.0, reach=24.0, turn=0.2):
 SCENES = {
     "viaduct": viaduct,
     "viaduct of two decks": lambda seed=0: viaduct(seed, gap=4.0),
-    "high viaduct": lambda seed=0: viaduct(seed, height=16.0, half=7.0, turn=1.3),
     "river": river,
-    "river without returns": lambda seed=0: river(seed, returns=0.0),
     "overpass": overpass,
 }

@@ -21,7 +21,7 @@ class Line:
     stations: tuple[float, ...]
     wires: tuple[tuple[float, float], ...]
     sag: float  # per squared meter of span: 8 sag / span^2 is the curvature
-    kind: str  # lattice, wide, pole, frame
+    kind: str  # lattice, wide, pole
     tall: float
 
 
@@ -36,7 +36,6 @@ HIGH = (
 )
 MEDIUM = ((-1.2, 10.2), (0.0, 10.6), (1.2, 10.2))
 HIGHEST = ((-15.0, 38.0), (0.0, 38.0), (15.0, 38.0))
-LOW = ((-0.4, 7.6), (0.0, 8.0), (0.4, 7.6))
 DOUBLE = ((-4.0, 15.0), (4.0, 15.0), (-4.5, 18.5), (4.5, 18.5), (-3.5, 22.0), (3.5, 22.0))
 
 
@@ -104,20 +103,6 @@ def _pole(rng, foot, turn, tall, wires, density):
     return _placed(np.vstack([stem, arm]), foot, turn)
 
 
-def _frame(rng, foot, turn, tall, wires, density):
-    """Two poles and a beam."""
-    reach = max(abs(t) for t, _ in wires) * 0.7
-    stems = [
-        _pole(rng, (0, 0, 0), 0, tall, ((0.0, 0.0),), density * 1.3) + np.array([0.0, t, 0.0])
-        for t in (-reach, reach)
-    ]
-    m = int(3 * reach * density * 0.5)
-    beam = np.column_stack(
-        [rng.normal(0, 0.1, m), rng.uniform(-reach / 0.7, reach / 0.7, m), np.full(m, tall - 0.3)]
-    )
-    return _placed(np.vstack([*stems, beam]), foot, turn)
-
-
 def _placed(q, foot, turn):
     c, s = np.cos(turn), np.sin(turn)
     return np.column_stack(
@@ -125,7 +110,7 @@ def _placed(q, foot, turn):
     ) + np.asarray(foot)
 
 
-_SUPPORTS = {"lattice": _lattice, "wide": _wide, "pole": _pole, "frame": _frame}
+_SUPPORTS = {"lattice": _lattice, "wide": _wide, "pole": _pole}
 
 
 def _crown(rng, foot, radius, tall, density):
@@ -231,9 +216,6 @@ def _every(step, length=700.0, start=0.0):
 
 
 CORRIDORS = {
-    "high voltage": lambda d=8.0, seed=0: corridor(
-        [Line(0.0, _every(280.0, 840.0), HIGH, 1.1e-4, "lattice", 42.0)], d, seed
-    ),
     "highest voltage": lambda d=8.0, seed=6: corridor(
         [Line(0.0, _every(300.0, 900.0), HIGHEST, 1.0e-4, "wide", 48.0)],
         d,
@@ -256,26 +238,6 @@ CORRIDORS = {
         tall=(8, 22),
         clear=4.0,
         turn=0.8,
-    ),
-    "low voltage along a street": lambda d=8.0, seed=3: corridor(
-        [Line(-20.0, _every(40.0), LOW, 4.0e-4, "pole", 8.2)],
-        d,
-        seed,
-        trees=120,
-        tall=(4, 10),
-        clear=1.5,
-        houses=25,
-        turn=2.0,
-    ),
-    "frames": lambda d=8.0, seed=4: corridor(
-        [
-            Line(
-                10.0, _every(150.0), ((-4.0, 13.0), (0.0, 13.0), (4.0, 13.0)), 1.5e-4, "frame", 13.8
-            )
-        ],
-        d,
-        seed,
-        turn=0.0,
     ),
     "two lines beside each other": lambda d=8.0, seed=5: corridor(
         [

@@ -138,7 +138,7 @@ def test_the_stage_gives_wires_their_class():
     assert stage.halo_m() == wires.RULES.reach_m < 75 and max(stage.written_classes()) == 14
 
 
-@pytest.mark.parametrize("name", ["highest voltage", "medium voltage in woods", "frames"])
+@pytest.mark.parametrize("name", ["highest voltage", "medium voltage in woods"])
 def test_generated_corridors(name):
     xyz, codes = CORRIDORS[name](4.0)
     wire = find_wires(xyz, filtered_ground(xyz)["HeightAboveGround"], np.ones(len(xyz), bool))

@@ -178,18 +178,11 @@ class FeaturePlan:
         reach = max(reach, return_features.reach(self.dimensions))
         if any(n.reach is None for n in self.neighborhoods):
             reach = max(reach, POINTS_HALO)
-        for k in self._surfaced:
-            reach = max(reach, POINTS_HALO * (math.sqrt(k) + math.sqrt(AROUND)) / math.sqrt(100))
+        for columns in self.layout:
+            if any(name in columns.at for name in SURFACE_FEATURES):
+                steps = math.sqrt(columns.neighborhood.parameters[0]) + math.sqrt(AROUND)
+                reach = max(reach, POINTS_HALO * steps / math.sqrt(100))
         return reach + self.cell
-
-    @property
-    def _surfaced(self) -> list[int]:
-        """The numbers of neighbors whose surfaces are wanted."""
-        return [
-            int(c.neighborhood.parameters[0])
-            for c in self.layout
-            if any(name in c.at for name in SURFACE_FEATURES)
-        ]
 
     @property
     def copt(self) -> bool:

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -138,11 +138,6 @@ class ShapeBins:
             ]
         return cls(result)
 
-    @property
-    def tokens(self) -> tuple[str, ...]:
-        """The neighborhoods there are thresholds for."""
-        return tuple(self._thresholds)
-
     def thresholds(self, token: str) -> np.ndarray:
         """Return thresholds (metrics, 9) float64 of one neighborhood, in radians and meters."""
         try:
@@ -154,14 +149,10 @@ class ShapeBins:
                 cure="Fit them for the same neighborhoods that are computed",
             ) from None
 
-    def comparable(self, tokens: Iterable[str]) -> np.ndarray:
-        """Return thresholds as the kernels compare them: (neighborhoods, metrics, 9) float32."""
-        rows = [
-            COMPARABLE[name][0](row)
-            for token in tokens
-            for name, row in zip(METRIC_NAMES, self.thresholds(token), strict=True)
-        ]
-        return np.array(rows, np.float32).reshape(-1, len(METRIC_NAMES), INNER)
+    def comparable(self, token: str) -> np.ndarray:
+        """Return thresholds as the kernels compare them: (metrics, 9) float32."""
+        rows = zip(METRIC_NAMES, self.thresholds(token), strict=True)
+        return np.array([COMPARABLE[name][0](row) for name, row in rows], np.float32)
 
     def to_dict(self) -> dict[str, Any]:
         """Return ``{"c1": {"A3": [9 numbers], "D1": ...}, ...}``, JSON-able and exact."""
@@ -280,7 +271,7 @@ class NeighborhoodGroup:
                 token = columns.neighborhood.token
                 seeds[number] = point_seeds(*points, fitted.seed, token)
                 if bins is not None:
-                    thresholds[number] = bins.comparable([token])[0]
+                    thresholds[number] = bins.comparable(token)
         values = np.empty((k, m if bins is None else 0, METRICS, PULLS), np.float32)
         shaped = np.array([columns.shapes for columns in self.chosen])
         features = columns_of(self.chosen, SHAPE_FEATURES)
