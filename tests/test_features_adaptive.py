@@ -128,11 +128,6 @@ def test_tree_boxes_hold_their_points(cloud):
     visit(0, 0, len(tree.x), tree.depth)
 
 
-def test_no_tree_over_nothing():
-    with pytest.raises(ValueError, match="not 0"):
-        build_tree(*np.zeros((3, 0)))
-
-
 # ---- the nearest -------------------------------------------------------------------------------------------
 
 
@@ -331,14 +326,6 @@ def test_curvature(cloud):
         ).curvatures()[at]
         wanted = [oracle.curvature(xyz, q, least=least) for q in xyz[at]]
         assert got == pytest.approx(wanted, rel=1e-9, abs=1e-12)
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(0, 1 / 3), min_size=1, max_size=200))
-def test_a_curvature_threshold_lies_among_the_values(values):
-    got = curvature_threshold(np.array(values))
-    assert min(values) - 1e-15 <= got <= max(values) + 1e-15
-    assert curvature_threshold(np.array(values[::-1])) == got
 
 
 def test_curvature_threshold_is_the_oracle_s():

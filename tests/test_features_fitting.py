@@ -33,11 +33,6 @@ def test_clouds_far_apart_are_fitted_as_one(order):
     assert all(bins != engine.bins for engine in alone)
 
 
-def test_one_cloud_is_fitted_as_by_its_engine():
-    engine = FeatureEngine(CLOUDS[1], PLAN).fit()
-    assert fit_clouds(CLOUDS[1:2], PLAN) == (engine.bins, engine.copt_threshold)
-
-
 def test_nothing_is_fitted_that_no_feature_needs():
     assert fit_clouds(CLOUDS, FeaturePlan.parse("c1,kopt", "covariance")) == (None, None)
     bins, threshold = fit_clouds(CLOUDS, FeaturePlan.parse("copt", "covariance"))

@@ -54,19 +54,6 @@ def test_variations_with_many_ties(points, k, scale):
             )
 
 
-def test_a_plane_agrees_and_a_crown_does_not():
-    rng = np.random.default_rng(0)
-    xy = rng.uniform(0, 10, (800, 2))
-    roof = np.column_stack([xy, 0.7 * xy[:, 0]])
-    table = compute_features(roof, None, "k20", "surfaces")
-    assert (
-        table["NormalAgreement_k20"].min() > 1 - 1e-6
-        and table["SurfaceVariationMean_k20"].max() < 1e-12
-    )
-    crown = compute_features(rng.normal(0, 2, (800, 3)), None, "k20", "surfaces")
-    assert crown["NormalAgreement_k20"].max() < 0.95 and crown["SurfaceVariationMin_k20"].min() > 0
-
-
 @settings(max_examples=15, deadline=None)
 @given(
     st.integers(0, 10_000),

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features.neighborhoods import (
     PRESETS,
-    Neighborhood,
     parse_neighborhoods,
     preset_dimensions,
 )
@@ -105,14 +104,6 @@ def test_presets_bring_dimensions():
     )
     assert preset_dimensions("c1") == ()
     assert all(parse_neighborhoods(list(words)) for words, _ in PRESETS.values())
-
-
-def test_neighborhoods_are_values():
-    (one,) = parse_neighborhoods("c2")
-    assert one == Neighborhood("cylinder", (2.0,)) and hash(one) == hash(
-        parse_neighborhoods("c2.0")[0]
-    )
-    assert str(one) == "c2"
 
 
 @given(st.floats(0.001, 99999.0), st.sampled_from("cs"))
