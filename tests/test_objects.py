@@ -178,6 +178,18 @@ def test_spans_end_at_poles_and_decks_have_room_below():
     )
 
 
+@pytest.mark.parametrize("cell", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("degrees", [0, 20, 45, 60])
+def test_wires_in_any_direction_are_one_span_between_two_towers(cell, degrees):
+    along, direction = np.arange(0, 240, 1.0), np.radians(degrees)
+    sag = 2 - 2 * (along % 80 / 40 - 1) ** 2
+    wire = np.column_stack([along * np.cos(direction), along * np.sin(direction), 20 - sag])
+    codes = np.where(along % 80 == 0, 15, 14).astype(np.uint8)
+    spans = found_in(*scene((wire, codes), size=250.0), cell=cell).tables[Kind.SPAN]
+    assert len(spans) == 3
+    assert spans.columns["length"].min() > 55  # of 80 m, less the cells around both towers
+
+
 def test_a_building_larger_than_any_block_and_its_margin():
     long, _ = house(0, 10, 500, 16, 6.0, 0.4)
     ground, codes = house(-10, 0, 510, 30, 0.0, 0.9, 2)

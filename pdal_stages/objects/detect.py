@@ -134,18 +134,20 @@ def _detect_surfaces(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_
 def _detect_spans(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
     """Yield spans: wires, joined over gaps, between towers."""
     settings = view.settings
-
-    def dilate(mask: NDArray[np.bool_], meters: float) -> NDArray[np.bool_]:
-        cells = round(meters / settings.cell)
-        return scipy.ndimage.binary_dilation(mask, NEIGHBORS, iterations=cells) if cells else mask
+    half_gap = round(settings.span_gap / 2 / settings.cell)
+    # A tower has at least the cells around it, or wires would be joined past it at their corners.
+    radius = max(1, round(TOWER_RADIUS / settings.cell))
 
     def mask_of(view: CellView) -> NDArray[np.bool_]:
         tower, wire = (view.indices(each) >= 0 for each in (Kind.TOWER, kind))
-        return dilate(wire, settings.span_gap / 2) & ~dilate(tower, TOWER_RADIUS)
+        if half_gap:
+            wire = scipy.ndimage.binary_dilation(wire, NEIGHBORS, iterations=half_gap)
+        return wire & ~scipy.ndimage.binary_dilation(tower, NEIGHBORS, iterations=radius)
 
-    view, mask = view.widened_to_whole(core, mask_of, with_neighbors=False)
+    view, mask = view.widened_to_whole(core, mask_of)
     high = view.highest(kind)
-    joined, _ = scipy.ndimage.label(mask)
+    # In cells too wide for a gap, those of a diagonal wire touch at their corners alone.
+    joined, _ = scipy.ndimage.label(mask, None if half_gap else NEIGHBORS)
     label = _without_small(np.where(np.isnan(high), -1, joined - 1), MIN_SPAN_CELLS)
     return _measured(view, label, label, high, core, kind, attributes.measure_span)
 

@@ -139,9 +139,10 @@ class CellView:
         self,
         core: GridWindow,
         mask_of: Callable[[CellView], NDArray[np.bool_]],
-        with_neighbors: bool = True,
     ) -> tuple[CellView, NDArray[np.bool_]]:
         """Return a view in which all objects that reach into a block are whole, and its mask.
+
+        Objects a cell apart, also at a corner, count as one.
 
         Parameters
         ----------
@@ -149,15 +150,11 @@ class CellView:
             The block.
         mask_of : function of a view
             Returns the cells of objects.
-        with_neighbors : bool
-            Whether cells beside an object matter, too, so that objects a cell apart count as one.
         """
         margin, view = round(MARGIN / self.settings.cell), self
         while True:
             mask = mask_of(view)
-            part, count = scipy.ndimage.label(
-                scipy.ndimage.binary_dilation(mask, NEIGHBORS) if with_neighbors else mask
-            )
+            part, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(mask, NEIGHBORS))
             reaches_core = np.zeros(count + 1, bool)
             reaches_core[part[view._slices(core)]] = True
             reaches_core[0] = False

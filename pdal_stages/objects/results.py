@@ -60,7 +60,11 @@ class ObjectSettings(Settings):
         "forests of each region)",
     )
     dbh_power: float = _number(0.809, 0, 2, "", "See dbh_factor")
-    span_gap: float = _number(2.0, 0.5, 20, "m", "Gap between wires that separates two spans")
+    span_gap: float = _number(
+        *(2.0, 0.5, 20, "m"),
+        "Gap between wires that separates two spans, rounded to an even number of cells; where "
+        "that is 0, wires in cells that touch, also at a corner, are one span",
+    )
 
 
 @dataclass
