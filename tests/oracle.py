@@ -149,17 +149,17 @@ def surface(xyz, q):
 
 
 def surfaces(xyz, q, k):
-    """What the surfaces of q and its k nearest make of it, and how well the worst of their normals is defined."""
-    own, _, gap = surface(xyz, q)
-    found = [surface(xyz, p) for p in nearest(xyz, q, k)[0]]
-    variation = np.array([v for _, v, _ in found])
+    """Return what the surfaces of q and its k nearest make of it, and how well the worst of their normals is defined."""
+    own_surface, _, gap = surface(xyz, q)
+    surfaces_near = [surface(xyz, p) for p in nearest(xyz, q, k)[0]]
+    variation = np.array([v for _, v, _ in surfaces_near])
     values = (
-        float(np.mean([abs(own @ normal) for normal, _, _ in found])),
+        float(np.mean([abs(own_surface @ normal) for normal, _, _ in surfaces_near])),
         float(variation.min()),
         float(variation.mean()),
         float(variation.std()),
     )
-    return dict(zip(SURFACES, values, strict=True)), min(gap, *(g for _, _, g in found))
+    return dict(zip(SURFACES, values, strict=True)), min(gap, *(g for _, _, g in surfaces_near))
 
 
 def of_sphere(xyz, q, radius):

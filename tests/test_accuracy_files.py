@@ -21,11 +21,11 @@ def place(name, x, n=50):
 
 def test_files_near_one_another_share_a_map():
     files = [place("a", 0), place("b", 600_000), place("c", 900), place("d", 1800)]
-    found = places(files)
-    assert [one.name for one in found] == ["a, c, d", "b"]
-    assert [len(one.xyz) for one in found] == [150, 50]
+    matches = places(files)
+    assert [match.name for match in matches] == ["a, c, d", "b"]
+    assert [len(match.xyz) for match in matches] == [150, 50]
     # Of another reference system, they lie elsewhere.
-    assert [one.name for one in places(files, ["x", "x", "y", "y"])] == ["a", "b", "c, d"]
+    assert [match.name for match in places(files, ["x", "x", "y", "y"])] == ["a", "b", "c, d"]
 
 
 @pytest.mark.pdal
@@ -46,12 +46,12 @@ def test_each_file_has_its_line_and_each_place_its_map(tmp_path, write_las, capf
     assert main(["accuracy", *words]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[2:5]] == ["b.laz", "a.laz", "far.laz"]
-    said = json.loads(figures.read_text())
-    by_name = {one["name"]: one for one in said["files"]}
+    report = json.loads(figures.read_text())
+    by_name = {entry["name"]: entry for entry in report["files"]}
     assert by_name["far.laz"]["overall_accuracy"] == 1.0 > by_name["a.laz"]["overall_accuracy"]
-    assert said["points"] == sum(one["points"] for one in said["files"])
-    right = sum(one["points"] * one["overall_accuracy"] for one in said["files"])
-    assert np.isclose(said["overall_accuracy"], right / said["points"])
+    assert report["points"] == sum(entry["points"] for entry in report["files"])
+    right = sum(entry["points"] * entry["overall_accuracy"] for entry in report["files"])
+    assert np.isclose(report["overall_accuracy"], right / report["points"])
     text = page.read_text()
     assert text.count("<h2>Maps") == 2 and "Maps: far.laz" in text
 
@@ -66,17 +66,19 @@ def test_a_model_is_scored_by_one_option(tmp_path, write_las, capsys):
     capsys.readouterr()
     words = ["accuracy", str(tmp_path / "t1.laz"), "--model", model]
     assert main([*words, "--json", str(tmp_path / "a.json")]) == 0
-    said = json.loads((tmp_path / "a.json").read_text())
-    assert said["points"] > 800 and said["overall_accuracy"] > 0.9
-    assert [one["code"] for one in said["classes"]] == [2, 6]
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert report["points"] > 800 and report["overall_accuracy"] > 0.9
+    assert [entry["code"] for entry in report["classes"]] == [2, 6]
     assert main([*words, "--reference", str(tmp_path / "t0.laz")]) == 1
     assert "exclude each other" in capsys.readouterr().err
 
 
 def test_files_of_one_name_are_compared_by_their_folders():
-    made = ["out/2023/c_t1.laz", "out/2024/c_t1.laz", "out/2024/t2.laz"]
+    names = ["out/2023/c_t1.laz", "out/2024/c_t1.laz", "out/2024/t2.laz"]
     true = ["truth/2024/t1.laz", "truth/2023/t1.laz", "truth/2024/t2.laz"]
-    assert sorted(paired(made, true)) == sorted(zip(made, [true[1], true[0], true[2]], strict=True))
+    assert sorted(paired(names, true)) == sorted(
+        zip(names, [true[1], true[0], true[2]], strict=True)
+    )
     with pytest.raises(StageError, match="no reference with its name") as caught:
-        paired(made, [*true[:2], "truth/2023/t2.laz"])
+        paired(names, [*true[:2], "truth/2023/t2.laz"])
     assert "2023/t2" in str(caught.value)

@@ -58,7 +58,7 @@ def models(tmp_path_factory):
 
 
 def judged(source, model, tmp_path, **options):
-    """What a pipeline that classifies and compares finds, and its page."""
+    """Return what a pipeline that classifies and compares finds, and its page."""
     ps.run_pipeline(
         [
             str(source),

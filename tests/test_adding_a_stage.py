@@ -16,7 +16,9 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "adding-a-stage.md"
 #: Vegetation, ground and the height of each; what the stage makes of them.
-CODES, HEIGHTS, BANDS = [5, 5, 5, 2, 3], [0.1, 1.0, 9.0, 9.0, 2.5], [3, 4, 5, 2, 5]
+CODES = [5, 5, 5, 2, 3]
+HEIGHTS = [0.1, 1.0, 9.0, 9.0, 2.5]
+BANDS = [3, 4, 5, 2, 5]
 
 pytestmark = pytest.mark.pdal
 

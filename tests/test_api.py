@@ -20,8 +20,8 @@ ROOT = Path(__file__).resolve().parent.parent
 @pytest.fixture(scope="module")
 def scene():
     """Ground (2) and a block (6), meters."""
-    made = ground_and_block(1500, size=30.0)
-    return np.column_stack([made[axis] for axis in "XYZ"]), made["Classification"]
+    points = ground_and_block(1500, size=30.0)
+    return np.column_stack([points[axis] for axis in "XYZ"]), points["Classification"]
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,8 @@ def test_features_with_defaults(scene):
 def test_heights_of_one_array(scene):
     xyz = scene[0]
     assert np.array_equal(ps.hag_minima(xyz), ps.hag_minima(*xyz.T))
-    one, three = ps.filtered_ground(xyz), ps.filtered_ground(*xyz.T)
-    assert all(np.array_equal(one[name], three[name]) for name in three)
+    heights, three = ps.filtered_ground(xyz), ps.filtered_ground(*xyz.T)
+    assert all(np.array_equal(heights[name], three[name]) for name in three)
     with pytest.raises(StageError, match=r"\(n, 3\)"):
         ps.hag_minima(xyz[:, :2])
 
@@ -52,8 +52,8 @@ def test_train_and_predict_on_coordinates_alone(scene, small, tmp_path):
     model.save(tmp_path / "m.model")
     loaded = ps.load_model(tmp_path / "m.model")
     assert loaded.info["preparation"][0]["type"] == "filters.hag_morphological"
-    found = loaded.predict(xyz)
-    assert (found.classification == y).mean() > 0.98
+    prediction = loaded.predict(xyz)
+    assert (prediction.classification == y).mean() > 0.98
 
 
 @pytest.mark.pdal
@@ -73,9 +73,9 @@ def test_a_model_of_arrays_classifies_files_alike(scene, small, tmp_path, write_
     )
     import laspy
 
-    made = laspy.read(tmp_path / "o.las")
-    xyz = np.column_stack([made.x, made.y, made.z])
-    assert np.array_equal(np.asarray(made.classification), model.predict(xyz).classification)
+    classified = laspy.read(tmp_path / "o.las")
+    xyz = np.column_stack([classified.x, classified.y, classified.z])
+    assert np.array_equal(np.asarray(classified.classification), model.predict(xyz).classification)
 
 
 def test_every_public_name_is_on_the_api_page():

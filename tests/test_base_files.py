@@ -24,8 +24,8 @@ def names(folder):
 def test_several_files_appear_together_or_not_at_all(tmp_path):
     a, b = tmp_path / "a.txt", tmp_path / "b.txt"
     b.write_text("older")
-    with pytest.raises(ZeroDivisionError), whole_files(a, b) as (one, two):
-        one.write_text("1")
+    with pytest.raises(ZeroDivisionError), whole_files(a, b) as (first, two):
+        first.write_text("1")
         two.write_text("2")
         raise ZeroDivisionError
     assert names(tmp_path) == ["b.txt"] and b.read_text() == "older"
@@ -54,7 +54,7 @@ def test_several_files_appear_together_or_not_at_all(tmp_path):
 
 
 def test_a_work_folder_is_one_that_is_swept(tmp_path):
-    """As `train` and `adapt` use it: what these leave when they are killed goes with the next file."""
+    """`train` and `adapt` use such a folder: what these leave when they are killed goes with the next file."""
     with work_folder(tmp_path / "new.model") as folder:
         (folder / "points.npz").touch()
         sweep(tmp_path)
@@ -100,13 +100,13 @@ def test_two_writers_of_one_name_at_once_while_others_sweep(tmp_path):
 @pytest.mark.skipif(os.name == "nt" or os.geteuid(), reason="only root can give files to others")
 @pytest.mark.parametrize("kind", ["link", "chain", "dangling", "pipe"])
 def test_links_and_pipes_of_other_users_are_refused(tmp_path, kind):
-    """As Linux does in sticky folders: they count only if they are one's own or the folder's owner's."""
-    shared, mine, at = tmp_path / "shared", tmp_path / "mine", tmp_path / "shared" / "o"
+    """Linux does so in sticky folders: they count only if they are one's own or the folder's owner's."""
+    shared, own_file, at = tmp_path / "shared", tmp_path / "mine", tmp_path / "shared" / "o"
     shared.mkdir()
     shared.chmod(0o1777)
     if kind != "dangling":
-        mine.write_text("mine")
-    os.mkfifo(at) if kind == "pipe" else at.symlink_to(mine)
+        own_file.write_text("mine")
+    os.mkfifo(at) if kind == "pipe" else at.symlink_to(own_file)
     os.chown(at, 65534, -1, follow_symlinks=False)
     named = at
     if kind == "chain":
@@ -114,13 +114,13 @@ def test_links_and_pipes_of_other_users_are_refused(tmp_path, kind):
         named.symlink_to("shared/o")
     with pytest.raises(StageError, match="link or pipe of another user"):
         write_whole(named, b"new")
-    assert mine.exists() == (kind != "dangling") and (
-        not mine.exists() or mine.read_text() == "mine"
+    assert own_file.exists() == (kind != "dangling") and (
+        not own_file.exists() or own_file.read_text() == "mine"
     )
     if kind != "pipe":
         os.chown(shared, 65534, -1)
         write_whole(named, b"new")
-        assert mine.read_bytes() == b"new"
+        assert own_file.read_bytes() == b"new"
 
 
 @unix
@@ -145,8 +145,8 @@ def test_what_is_refused_stays_what_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # a socket's name may not be long
     (tmp_path / "protected").write_text("older")
     (tmp_path / "protected").chmod(0o444)
-    with socket.socket(socket.AF_UNIX) as one:
-        one.bind("socket")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind("socket")
         before = names(tmp_path)
         for name, says in {
             "socket": "cannot be written to",

@@ -21,20 +21,22 @@ def test_a_first_job_says_that_it_compiles_and_the_next_one_nothing(tmp_path):
     code = TWO_KERNELS
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PDAL_STAGES_PROGRESS": "1"}
 
-    def said(code: str = code) -> str:
+    def output_of(code: str = code) -> str:
         return subprocess.run(
             [sys.executable, "-c", code], env=env, text=True, capture_output=True
         ).stderr
 
-    assert "compiling for this processor, once" in said()
-    assert not said()
+    assert "compiling for this processor, once" in output_of()
+    assert not output_of()
     for caller in (tmp_path / "kernels").rglob("*.heights-*"):
         caller.unlink()  # and is compiled again, with what it calls from the cache
-    assert "compiling for this processor, once" in said()
+    assert "compiling for this processor, once" in output_of()
     for index in (tmp_path / "kernels").rglob("*.nbi"):
         index.write_bytes(b"damaged")
-    assert "Traceback" not in said("import os; os.environ['PDAL_STAGES_PROGRESS'] = '0'; " + code)
-    assert not said()
+    assert "Traceback" not in output_of(
+        "import os; os.environ['PDAL_STAGES_PROGRESS'] = '0'; " + code
+    )
+    assert not output_of()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="users and modes of Unix")
@@ -60,11 +62,11 @@ def test_code_is_kept_only_where_no_other_user_can_put_any(tmp_path):
     (tmp_path / "link").symlink_to(kernels)
     for mode in (0o700, 0o775, 0o1777):  # one's own, a group's, sticky like /tmp
         assert run(mode) == (2, "")
-    for count, said in (run(0o777), run(0o777, folder=kernels)):
-        assert not count and said.count("compiled code is not kept") == 1
+    for count, errors in (run(0o777), run(0o777, folder=kernels)):
+        assert not count and errors.count("compiled code is not kept") == 1
     if os.geteuid() == 0:
-        count, said = run(owner=65534)
-        assert not count and f"other users can write to {home}" in said
+        count, errors = run(owner=65534)
+        assert not count and f"other users can write to {home}" in errors
 
 
 @pytest.mark.pdal

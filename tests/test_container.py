@@ -57,7 +57,7 @@ def test_what_the_build_needs_is_sent_to_it():
 
 @pytest.fixture
 def image(tmp_path):
-    """What the build leaves, with programs that tell how they were started."""
+    """Return what the build leaves, with programs that tell how they were started."""
     root = tmp_path / "image"
     (root / "scripts").mkdir(parents=True)
     for name in ("container", "lib.sh"):

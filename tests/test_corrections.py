@@ -48,12 +48,12 @@ def test_partners_are_the_points_themselves(seed, n, places):
     xyz = random.integers(0, places, (n, 3)) * 0.01 + 500_000.0
     time = random.permutation(n).astype(float)
     order = random.permutation(n)
-    found = match_points(xyz, xyz[order], 0.01, [(time, time[order])])
-    assert np.array_equal(order[found], np.arange(n))
+    matches = match_points(xyz, xyz[order], 0.01, [(time, time[order])])
+    assert np.array_equal(order[matches], np.arange(n))
     # Without anything that tells them apart: points of the same place, each taken once.
-    found = match_points(xyz, xyz[order], 0.01)
-    assert sorted(found) == list(range(n))
-    assert np.abs(xyz[order][found] - xyz).max() < 1e-6
+    matches = match_points(xyz, xyz[order], 0.01)
+    assert sorted(matches) == list(range(n))
+    assert np.abs(xyz[order][matches] - xyz).max() < 1e-6
 
 
 def test_points_left_over_take_the_nearest():
@@ -76,8 +76,10 @@ def test_near_any_is_what_distances_say():
 def test_changes_are_found_in_any_order(town, tmp_path, how, run):
     corner, _ = changed_copy(town, tmp_path / "after.laz", **how)
     out = tmp_path / "checked.laz"
-    code, said, _ = run("corrections", town, tmp_path / "after.laz", "--out", out, "--around", "0")
-    assert code == 0 and ("missing" in said) == bool(how.get("drop"))
+    code, output, _ = run(
+        "corrections", town, tmp_path / "after.laz", "--out", out, "--around", "0"
+    )
+    assert code == 0 and ("missing" in output) == bool(how.get("drop"))
     las, before = laspy.read(out), laspy.read(town)
     assert np.array_equal(las.xyz, before.xyz)
     same = las.classification != before.classification
@@ -107,7 +109,7 @@ def test_all_around_a_change_was_seen(town, tmp_path):
 
 
 def test_a_copc_file_becomes_a_plain_one(tmp_path):
-    """As `classify` writes it from COPC, where PDAL can."""
+    """`classify` does so, too, where PDAL can read COPC."""
     before = Path(__file__).parent / "data/town.copc.laz"
     las = laspy.read(before)
     plain = laspy.LasHeader(version="1.4", point_format=6)
@@ -118,19 +120,19 @@ def test_a_copc_file_becomes_a_plain_one(tmp_path):
     after.write(tmp_path / "after.laz")
     out = tmp_path / "checked.laz"
     write_corrections(str(before), str(out), str(tmp_path / "after.laz"))
-    made = laspy.read(out)
-    assert np.array_equal(made.xyz, las.xyz) and np.array_equal(
-        made.classification, after.classification
+    kept = laspy.read(out)
+    assert np.array_equal(kept.xyz, las.xyz) and np.array_equal(
+        kept.classification, after.classification
     )
-    assert made.header.parse_crs() == las.header.parse_crs()
-    assert "copc" not in {one.user_id for one in [*made.header.vlrs, *(made.evlrs or [])]}
+    assert kept.header.parse_crs() == las.header.parse_crs()
+    assert "copc" not in {record.user_id for record in [*kept.header.vlrs, *(kept.evlrs or [])]}
     assert len(ps.run_pipeline([str(out)]).arrays[0]) == len(las)
 
 
 def test_geotiff_keys_that_are_padded_stay_as_they_are(town, tmp_path):
-    """As they are in old files in feet: laspy counts the padding."""
+    """Old files in feet have them: laspy counts the padding."""
     las = laspy.read(town)
-    las.vlrs[:] = [one for one in las.vlrs if one.user_id != "LASF_Projection"]
+    las.vlrs[:] = [record for record in las.vlrs if record.user_id != "LASF_Projection"]
     keys = struct.pack("<12H", 1, 1, 0, 1, 3072, 0, 1, 25832, 0, 0, 0, 0)
     las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "keys", keys))
     las.write(tmp_path / "b.las")
@@ -176,7 +178,7 @@ def test_other_points_are_refused(town, tmp_path, run):
 
 @pytest.mark.pdal
 def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path, run):
-    """Where the points have a Reliability, as many of those that nobody looked at as of the most frequent checked class."""
+    """If the points have a Reliability, as many of those that nobody looked at as of the most frequent checked class."""
     las = laspy.read(town)
     codes = np.asarray(las.classification).copy()
     known = np.isin(codes, (2, 5, 6))
@@ -191,18 +193,18 @@ def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path,
     model = tmp_path / "m.model"
     words = ["--model", model, "--base", "standard", "--classes", "2,5,6"]
     code, out, err = run("train", tmp_path / "checked.laz", *words)
-    mine = {code: np.count_nonzero(checked & (codes == code)) for code in (2, 5, 6)}
+    corrected = {code: np.count_nonzero(checked & (codes == code)) for code in (2, 5, 6)}
     anchors = {
-        code: min(np.count_nonzero(sure & (codes == code)), max(mine.values()))
-        for code in mine
-        if mine[code]
+        code: min(np.count_nonzero(sure & (codes == code)), max(corrected.values()))
+        for code in corrected
+        if corrected[code]
     }
-    said = f"from about {sum(anchors.values()):,} others of which the base is sure"
-    assert code == 0 and said in err + out
+    sentence = f"from about {sum(anchors.values()):,} others of which the base is sure"
+    assert code == 0 and sentence in err + out
     info = ps.load_model(str(model)).info
-    for one in info["classes"]:
-        most = mine[one["code"]] + anchors[one["code"]]
-        assert 0.5 * most < one["available"] <= 1.1 * most, (
-            one
+    for entry in info["classes"]:
+        most = corrected[entry["code"]] + anchors[entry["code"]]
+        assert 0.5 * most < entry["available"] <= 1.1 * most, (
+            entry
         )  # less what stands for it: a voxel's, or contradicted
     assert info["sureness"]["about"].startswith("its base (")

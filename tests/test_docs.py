@@ -130,14 +130,14 @@ def blocks_of(text: str, language: str) -> list[str]:
 
 
 def test_links_between_pages_lead_somewhere():
-    made = {f"stages/{name}.md" for name in stage_types()} | {"stages/index.md"}
+    generated = {f"stages/{name}.md" for name in stage_types()} | {"stages/index.md"}
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+?)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             path = (page.parent / target).resolve()
             inside = (
                 str(path.relative_to(ROOT / "docs")) if path.is_relative_to(ROOT / "docs") else ""
             )
-            assert path.exists() or inside in made, f"{page.name}: {target}"
+            assert path.exists() or inside in generated, f"{page.name}: {target}"
 
 
 def test_the_card_of_the_shipped_model_is_of_what_was_measured_of_it(monkeypatch):

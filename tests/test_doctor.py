@@ -16,11 +16,11 @@ pytestmark = pytest.mark.pdal
 
 def test_all_that_is_needed_is_here(capsys, monkeypatch):
     assert cli.main(["doctor"]) == 0
-    said = capsys.readouterr().out
-    told = "pdal_stages", "shipped model", "PDAL", "filters.python in this process", "cores"
-    assert all(f"{what}: " in said for what in (*told, "compiled kernels"))
-    assert "MISSING" not in said
-    assert said.count("filters.python in ") >= 2
+    output = capsys.readouterr().out
+    headings = "pdal_stages", "shipped model", "PDAL", "filters.python in this process", "cores"
+    assert all(f"{what}: " in output for what in (*headings, "compiled kernels"))
+    assert "MISSING" not in output
+    assert output.count("filters.python in ") >= 2
 
 
 def test_what_is_missing_has_its_cure(tmp_path):
@@ -42,8 +42,10 @@ def test_another_python_is_told(tmp_path, monkeypatch):
             "/other\nModuleNotFoundError: No module named 'pdal_stages'"
         )
 
-    found = doctor._python_of("filters.python", run)
-    assert found.cure == "/other/bin/python -m pip install pdal-stages" and "MISSING" in str(found)
+    interpreter = doctor._python_of("filters.python", run)
+    assert interpreter.cure == "/other/bin/python -m pip install pdal-stages" and "MISSING" in str(
+        interpreter
+    )
 
     def another(stages):
         Path(stages[1]["pdalargs"]["answer"]).write_text(

@@ -47,10 +47,10 @@ def cloud():
 
 def test_a_frozen_file_gives_the_classes_it_gave(cloud):
     xyz, truth = cloud
-    found = load_model(FROZEN).predict(xyz).classification
-    counts = np.bincount(found, minlength=6)[[2, 5]]
+    predicted = load_model(FROZEN).predict(xyz).classification
+    counts = np.bincount(predicted, minlength=6)[[2, 5]]
     assert np.abs(counts - (1241, 1259)).max() <= 3  # another processor may round otherwise
-    assert np.mean(found == truth) > 0.94
+    assert np.mean(predicted == truth) > 0.94
 
 
 @pytest.mark.slow
@@ -73,19 +73,19 @@ def test_a_new_feature_is_one_entry_and_one_line_and_changes_no_model(cloud, tmp
             encoding="utf-8",
         )
     np.save(tmp_path / "cloud.npy", cloud[0])
-    own = {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    said = subprocess.run(
+    environment = {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run(
         [sys.executable, "-c", CLASSIFY, tmp_path / "cloud.npy", FROZEN],
         cwd=tmp_path,
-        env=os.environ | own,
+        env=os.environ | environment,
         capture_output=True,
         text=True,
     )
-    assert said.returncode == 0, said.stderr
-    found = json.loads(said.stdout)
-    assert found["names"] == ["Dummy_c1", "Linearity_c1", "Planarity_c1"]
-    assert found["dummy"] == [0.75]
-    assert found["classes"] == load_model(FROZEN).predict(cloud[0]).classification.tolist()
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["names"] == ["Dummy_c1", "Linearity_c1", "Planarity_c1"]
+    assert result["dummy"] == [0.75]
+    assert result["classes"] == load_model(FROZEN).predict(cloud[0]).classification.tolist()
 
 
 def test_columns_in_another_order_are_read_by_their_names(cloud, tmp_path):
@@ -93,16 +93,17 @@ def test_columns_in_another_order_are_read_by_their_names(cloud, tmp_path):
     model = load_model(FROZEN)
     manifest = json.loads(json.dumps(model.manifest()))
     arrays = [
-        {name: values.copy() for name, values in one.arrays().items()} for one in model.passes
+        {name: values.copy() for name, values in classifier.arrays().items()}
+        for classifier in model.passes
     ]
-    for entry, of_pass, one in zip(manifest["passes"], arrays, model.passes, strict=True):
-        count = len(one.plan.names)
+    for entry, of_pass, classifier in zip(manifest["passes"], arrays, model.passes, strict=True):
+        count = len(classifier.plan.names)
         entry["feature_names"][:count] = entry["feature_names"][:count][::-1]
         splits = (of_pass["feature"] >= 0) & (of_pass["feature"] < count)
         of_pass["feature"][splits] = count - 1 - of_pass["feature"][splits]
     model_file.write(tmp_path / "reverse.model", manifest, arrays)
-    found = load_model(tmp_path / "reverse.model").predict(cloud[0]).classification
-    assert np.array_equal(found, model.predict(cloud[0]).classification)
+    predicted = load_model(tmp_path / "reverse.model").predict(cloud[0]).classification
+    assert np.array_equal(predicted, model.predict(cloud[0]).classification)
 
 
 def test_the_table_of_features_is_the_registry():
@@ -116,8 +117,10 @@ def test_models_of_other_algorithms_warn_and_say_what_to_do(cloud):
     model = load_model(FROZEN)
     assert not model.outdated and not model.predict(xyz).report.warnings
     model.info["algorithms"]["filters.multiscalefeatures"] += 1
-    (told,) = model.predict(xyz).report.warnings
-    assert "version 2 of filters.multiscalefeatures" in told and "Train the model again" in told
+    (warning,) = model.predict(xyz).report.warnings
+    assert (
+        "version 2 of filters.multiscalefeatures" in warning and "Train the model again" in warning
+    )
 
 
 def test_shipped_models_are_of_the_algorithms_of_this_release():
@@ -127,10 +130,12 @@ def test_shipped_models_are_of_the_algorithms_of_this_release():
 
 def test_the_shipped_model_is_described_in_words(capsys):
     main(["model", "standard"])
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     model = load_model("standard")
-    for token in {one.token for each in model.passes for one in each.plan.neighborhoods}:
-        assert token in said
+    for token in {
+        neighborhood.token for each in model.passes for neighborhood in each.plan.neighborhoods
+    }:
+        assert token in output
     for words in (
         "of points right, on ground it had not seen",
         "filters.hag_morphological (ground True, openings",
@@ -139,4 +144,4 @@ def test_the_shipped_model_is_described_in_words(capsys):
         "Montpellier, Delft, Seville",
         *(f"{code} {name}" for code, name in model.classes),
     ):
-        assert words in said, words
+        assert words in output, words

@@ -48,23 +48,23 @@ def figures(clip: str) -> Figures:
     scores = [0 if (clip, code) == GRASS else SCORED.get(code, 0) for code in range(256)]
     truth = np.array(scores)[np.asarray(las.classification)]
     scored = truth > 0
-    found = load_model("standard").predict(np.asarray(las.xyz), returns).classification[scored]
+    predicted = load_model("standard").predict(np.asarray(las.xyz), returns).classification[scored]
     truth = truth[scored]
     by_class = []
     for code in (2, 5, 6):
-        right = np.count_nonzero((truth == code) & (found == code))
-        both = np.count_nonzero(truth == code) + np.count_nonzero(found == code)
+        right = np.count_nonzero((truth == code) & (predicted == code))
+        both = np.count_nonzero(truth == code) + np.count_nonzero(predicted == code)
         by_class.append(round(float(200 * right / both), 2) if (truth == code).any() else None)
-    return Figures(round(100 * float(np.mean(found == truth)), 2), *by_class)
+    return Figures(round(100 * float(np.mean(predicted == truth)), 2), *by_class)
 
 
 @pytest.mark.parametrize("clip", SHIPPED)
 def test_the_shipped_model_keeps_its_figures(clip):
-    found = figures(clip)
-    for name, now, then in zip(Figures._fields, found, SHIPPED[clip], strict=True):
+    measured = figures(clip)
+    for name, now, then in zip(Figures._fields, measured, SHIPPED[clip], strict=True):
         assert (now is None) == (then is None)
         if then is not None and now is not None:
-            assert now >= then - MARGIN, f"{clip}: {name} fell from {then} to {now}: {found}"
+            assert now >= then - MARGIN, f"{clip}: {name} fell from {then} to {now}: {measured}"
 
 
 def test_no_model_is_trained_on_the_clips():
@@ -72,7 +72,7 @@ def test_no_model_is_trained_on_the_clips():
     sources = [line.split("`")[3] for line in read.splitlines() if line.startswith(CLIPS)]
     used = Path(__file__).parent.parent / "benchmarks" / "surveys" / "sources.csv"
     assert len(sources) == len(SHIPPED)
-    assert not [one for one in sources if one in used.read_text(encoding="utf-8")]
+    assert not [source for source in sources if source in used.read_text(encoding="utf-8")]
 
 
 if __name__ == "__main__":

@@ -27,21 +27,21 @@ FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.spl
     "path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT))
 )
 def test_house(path):
-    own, *rest = path.relative_to(ROOT).with_suffix("").parts
-    for node in ast.walk(ast.parse(path.read_text())) if own != "__init__" else ():
+    parts, *rest = path.relative_to(ROOT).with_suffix("").parts
+    for node in ast.walk(ast.parse(path.read_text())) if parts != "__init__" else ():
         if not isinstance(node, ast.ImportFrom) or not node.level:
             continue
-        module = (*[own, *rest][: -node.level], *(node.module or "").split("."))
+        module = (*[parts, *rest][: -node.level], *(node.module or "").split("."))
         for room in [module[0]] if module[0] else [alias.name for alias in node.names]:
-            assert room == own or FLOOR[room] < FLOOR[own], (
-                f"line {node.lineno}: {own} imports {room}"
+            assert room == parts or FLOOR[room] < FLOOR[parts], (
+                f"line {node.lineno}: {parts} imports {room}"
             )
             private = [
-                one.name
-                for one in node.names
-                if one.name.startswith("_") and one.name != "__version__"
+                imported.name
+                for imported in node.names
+                if imported.name.startswith("_") and imported.name != "__version__"
             ]
-            assert room == own or not private, f"line {node.lineno}: {private} of {room}"
+            assert room == parts or not private, f"line {node.lineno}: {private} of {room}"
 
 
 def test_the_core_imports_extras_in_their_doors_alone():
@@ -80,11 +80,11 @@ def test_no_import_upward_by_name(path):
 
 def test_one_class_one_name():
     """No two public classes of the package have one name, so that a name means one thing in any room."""
-    found: dict[str, str] = {}
+    doors: dict[str, str] = {}
     for path in sorted(ROOT.rglob("*.py")):
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                own = str(path.relative_to(ROOT))
-                assert found.setdefault(node.name, own) == own, (
-                    f"{node.name} in {found[node.name]} and {own}"
+                module = str(path.relative_to(ROOT))
+                assert doors.setdefault(node.name, module) == module, (
+                    f"{node.name} in {doors[node.name]} and {module}"
                 )

@@ -80,8 +80,8 @@ def test_failed_step_says_why(tmp_path, output, message):
 
 @pytest.mark.pdal
 def test_check_pdal_proves_bindings_and_program(pdal_program):
-    said = printed(sys.executable, ROOT / "scripts/check_pdal.py", "--program", pdal_program)
-    assert re.match(r"PDAL \d+\.\d+\.\d+, python-pdal \d", said)
+    output = printed(sys.executable, ROOT / "scripts/check_pdal.py", "--program", pdal_program)
+    assert re.match(r"PDAL \d+\.\d+\.\d+, python-pdal \d", output)
 
 
 def test_check_pdal_names_what_is_missing():

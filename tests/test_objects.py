@@ -45,15 +45,15 @@ def found_in(xyz, codes, **options):
 
 def same(a, b):
     assert a.tables.keys() == b.tables.keys()
-    for kind, one in a.tables.items():
+    for kind, table in a.tables.items():
         other = b.tables[kind]
-        np.testing.assert_array_equal(one.ids, other.ids)
-        assert list(one.columns) == list(other.columns)
-        for name in one.columns:
-            np.testing.assert_array_equal(one.columns[name], other.columns[name])
-        for mine, theirs in ((one.cells, other.cells), (one.paths, other.paths)):
-            for own, twin in zip(mine, theirs, strict=True):
-                np.testing.assert_array_equal(own, twin)
+        np.testing.assert_array_equal(table.ids, other.ids)
+        assert list(table.columns) == list(other.columns)
+        for name in table.columns:
+            np.testing.assert_array_equal(table.columns[name], other.columns[name])
+        for first, theirs in ((table.cells, other.cells), (table.paths, other.paths)):
+            for part, twin in zip(first, theirs, strict=True):
+                np.testing.assert_array_equal(part, twin)
     np.testing.assert_array_equal(a.key, b.key)
     np.testing.assert_array_equal(a.owner, b.owner)
 
@@ -93,13 +93,13 @@ def test_a_house_is_measured():
     got = found_in(*scene(house(10, 10, 22, 18, 6.0)))
     table = got.tables[Kind.BUILDING]
     assert len(table) == 1
-    one = {name: values[0] for name, values in table.columns.items()}
-    assert one["area"] == pytest.approx(96, abs=6) and one["h_ridge"] == one["h_eave"] == 6.0
+    row = {name: values[0] for name, values in table.columns.items()}
+    assert row["area"] == pytest.approx(96, abs=6) and row["h_ridge"] == row["h_eave"] == 6.0
     assert (
-        one["planes"] == 1
-        and one["slope"] < 0.1
-        and one["ground"] == 0
-        and one["verdict"] == "sure"
+        row["planes"] == 1
+        and row["slope"] < 0.1
+        and row["ground"] == 0
+        and row["verdict"] == "sure"
     )
     assert int(table.ids[0]) == int(object_id(Kind.BUILDING, np.array(20), np.array(20)))
 
@@ -217,10 +217,10 @@ def test_a_roof_that_is_partly_called_leaves_is_whole(slope):
         (crown, np.full(400, 5, np.uint8)),
         (chimney, np.full(len(chimney), 5, np.uint8)),
     ]
-    found = found_in(*scene(*parts))
-    columns = found.tables[Kind.BUILDING].columns
+    objects = found_in(*scene(*parts))
+    columns = objects.tables[Kind.BUILDING].columns
     assert columns["area"].tolist() == pytest.approx([30.0], abs=3.0)
-    trees = found.tables[Kind.TREE].columns
+    trees = objects.tables[Kind.TREE].columns
     assert len(trees["x"]) == 1 and abs(trees["x"][0] - 18) < 1.5
 
 
@@ -240,7 +240,7 @@ def test_a_hedge_as_high_as_a_roof_is_not_of_it(height):
 
 @pytest.mark.parametrize("turned", [0.0, 0.6])
 def test_a_roof_from_whose_inside_nothing_came_back(turned):
-    """Of a wet roof only the rim is there; of a courtyard the ground is, and of a third square cars."""
+    """A wet roof has points at its rim only; of a courtyard the ground is, and of a third square cars."""
     c, s = np.cos(turned), np.sin(turned)
     ground, codes = house(-5, -5, 65, 45, 0.0, 0.4, 2)
 
@@ -259,9 +259,10 @@ def test_a_roof_from_whose_inside_nothing_came_back(turned):
     keep = inside(cars, 50, 1.0)
     parts.append((cars[keep], ones[keep]))
     xyz = np.concatenate([ground, *(p for p, _ in parts)])
-    found = found_in(xyz, np.concatenate([codes, *(c for _, c in parts)])).tables[Kind.BUILDING]
+    buildings = found_in(xyz, np.concatenate([codes, *(c for _, c in parts)])).tables[Kind.BUILDING]
     area = {
-        round(float(found.cells[n][1].mean()) / 40): a for n, a in enumerate(found.columns["area"])
+        round(float(buildings.cells[n][1].mean()) / 40): a
+        for n, a in enumerate(buildings.columns["area"])
     }
     assert area[0] == pytest.approx(64, abs=8)
     assert all(area.get(n, 0) < 35 for n in (1, 2))
@@ -280,18 +281,18 @@ def test_blocks_change_nothing(town):
 
 
 def test_a_shift_by_whole_cells_shifts_the_objects(town):
-    one = found_in(town.xyz, town.classification)
+    original = found_in(town.xyz, town.classification)
     two = found_in(town.xyz + np.array([1024.0, -512.0, 0.0]), town.classification)
     for kind in (Kind.BUILDING, Kind.TREE, Kind.DECK):
-        a, b = one.tables[kind], two.tables[kind]
+        a, b = original.tables[kind], two.tables[kind]
         assert len(a) == len(b) > 0
-        for own, twin in zip(a.cells, b.cells, strict=True):
-            np.testing.assert_array_equal(own[0] - 1024, twin[0])
+        for part, twin in zip(a.cells, b.cells, strict=True):
+            np.testing.assert_array_equal(part[0] - 1024, twin[0])
         np.testing.assert_array_equal(a.columns["area"], b.columns["area"])
 
 
 def test_the_town(town):
-    """What stands in a generated town is found: most buildings at IoU 0.5, most trees within 4 m and 30 % of height."""
+    """Objects of a generated town are detected: most buildings at IoU 0.5, most trees within 4 m and 30 % of height."""
     shapely = pytest.importorskip("shapely")
     true = true_objects(150.0, 4)
     got = found_in(town.xyz, town.classification, step=0)
@@ -310,10 +311,10 @@ def test_the_town(town):
         hit += any(shape.intersection(g).area / shape.union(g).area >= 0.5 for g in blocks)
     assert hit >= 0.93 * max(len(blocks), len(table))
     trees = [t for t in true.trees if t.height >= 3]
-    found = got.tables[Kind.TREE].columns
+    detected = got.tables[Kind.TREE].columns
     near = [
-        (np.hypot(found["x"] - t.x, found["y"] - t.y) < 4)
-        & (np.abs(found["height"] - t.height) < 0.3 * t.height)
+        (np.hypot(detected["x"] - t.x, detected["y"] - t.y) < 4)
+        & (np.abs(detected["height"] - t.height) < 0.3 * t.height)
         for t in trees
     ]
     assert np.mean([n.any() for n in near]) > 0.8
@@ -369,14 +370,14 @@ def test_tops_of_trees_are_h_maxima_and_a_part_has_those_of_the_whole(seed, dept
 def test_objects_of_some_reasons_left_out():
     wire, shed = house(5, 5, 35, 6.4, 7.0), house(10, 20, 14, 24, 3.0)
     tree = np.random.default_rng(1).normal([20, 14, 6], [1, 1, 1], (300, 3))
-    found = found_in(*scene(wire, shed, (tree, np.full(300, 5, np.uint8))))
-    same(found.without(())[0], found)
-    rest, left_out = found.without(["narrow"])
-    buildings, kept = found.tables[Kind.BUILDING], rest.tables[Kind.BUILDING]
+    objects = found_in(*scene(wire, shed, (tree, np.full(300, 5, np.uint8))))
+    same(objects.without(())[0], objects)
+    rest, left_out = objects.without(["narrow"])
+    buildings, kept = objects.tables[Kind.BUILDING], rest.tables[Kind.BUILDING]
     assert (left_out, len(buildings), len(kept)) == (1, 2, 1)
     number = buildings.ids.tolist().index(kept.ids[0])
-    for one, other in zip(kept.cells[0], buildings.cells[number], strict=True):
-        np.testing.assert_array_equal(one, other)
+    for first, other in zip(kept.cells[0], buildings.cells[number], strict=True):
+        np.testing.assert_array_equal(first, other)
     assert set(rest.owner) == {i for table in rest.tables.values() for i in table.ids}
-    assert len(rest.key) == len(rest.owner) < len(found.key)
-    assert len(rest.tables[Kind.TREE]) == len(found.tables[Kind.TREE]) > 0
+    assert len(rest.key) == len(rest.owner) < len(objects.key)
+    assert len(rest.tables[Kind.TREE]) == len(objects.tables[Kind.TREE]) > 0

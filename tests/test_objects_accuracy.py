@@ -40,26 +40,30 @@ def test_overlaps_are_matched_as_by_hand():
             shapely.box(*p, *(p + s)) for p, s in zip(low, rng.uniform(2, 12, (n, 2)), strict=True)
         ]
 
-    found, true = boxes(60), boxes(60)
+    detected, true = boxes(60), boxes(60)
     all_pairs = sorted(
         (-f.intersection(t).area / f.union(t).area, a, b)
-        for a, f in enumerate(found)
+        for a, f in enumerate(detected)
         for b, t in enumerate(true)
         if f.intersection(t).area / f.union(t).area >= 0.3
     )
-    kept, one, other = [], set(), set()
+    kept, ours, other = [], set(), set()
     for _, a, b in all_pairs:
-        if a not in one and b not in other:
-            one.add(a)
+        if a not in ours and b not in other:
+            ours.add(a)
             other.add(b)
             kept.append((a, b))
-    assert len(kept) > 5 and sorted(match_by_overlap(found, true, 0.3)) == sorted(kept)
+    assert len(kept) > 5 and sorted(match_by_overlap(detected, true, 0.3)) == sorted(kept)
 
 
 def test_figures_of_buildings():
     true = [shapely.box(0, 0, 10, 10), shapely.box(20, 0, 30, 10), shapely.box(60, 0, 62, 2)]
-    found = [shapely.box(0, 0, 10, 10.5), shapely.box(20, 0, 24, 10), shapely.box(100, 0, 110, 10)]
-    got = compare_buildings(found, true)
+    detected = [
+        shapely.box(0, 0, 10, 10.5),
+        shapely.box(20, 0, 24, 10),
+        shapely.box(100, 0, 110, 10),
+    ]
+    got = compare_buildings(detected, true)
     assert got["objects"]["matched"] == 1 and got["objects"]["completeness"] == pytest.approx(1 / 3)
     assert got["area"]["iou"] == pytest.approx(140 / (204 + 245 - 140))
     assert got["covered"] == pytest.approx(1 / 3)
@@ -84,12 +88,12 @@ def test_figures_of_trees():
 
 def test_the_command(tmp_path, run):
     houses = [shapely.box(0, 0, 10, 10), shapely.box(20, 0, 30, 10)]
-    found, true = tmp_path / "found.gpkg", tmp_path / "true.gpkg"
-    write(found, houses[:1], verdict=["sure"])
-    write(found, [shapely.Point(5, 30)], "Point", "trees", height=[8.0])
+    detected, true = tmp_path / "found.gpkg", tmp_path / "true.gpkg"
+    write(detected, houses[:1], verdict=["sure"])
+    write(detected, [shapely.Point(5, 30)], "Point", "trees", height=[8.0])
     write(true, houses)
     write(true, [shapely.Point(6, 30), shapely.Point(50, 30)], "Point", "trees", height=[8.5, 9.0])
-    command = ["accuracy", found, "--objects", true, "--json", tmp_path / "a.json"]
+    command = ["accuracy", detected, "--objects", true, "--json", tmp_path / "a.json"]
     code, out, _ = run(*command)
     assert code == 0 and "buildings: 1 found, 2 in the reference" in out
     figures = json.loads((tmp_path / "a.json").read_text())
@@ -105,19 +109,22 @@ def test_the_command(tmp_path, run):
 
 def test_errors(tmp_path, run):
     house = [shapely.box(0, 0, 10, 10)]
-    found = write(tmp_path / "found.gpkg", house)
+    detected = write(tmp_path / "found.gpkg", house)
     other = write(tmp_path / "other.gpkg", house, crs="EPSG:2154")
     (tmp_path / "cloud.laz").write_bytes(b"LASF" + b"\0" * 400)
     for command, text in (
-        (["accuracy", found, "--objects", other], "another reference system"),
+        (["accuracy", detected, "--objects", other], "another reference system"),
         (
-            ["accuracy", tmp_path / "cloud.laz", "--objects", found],
+            ["accuracy", tmp_path / "cloud.laz", "--objects", detected],
             "pdal-stages objects classified.laz",
         ),
-        (["accuracy", found, "--objects", tmp_path / "none.gpkg"], "no such file"),
-        (["accuracy", found, found, "--objects", other], "one vector file"),
-        (["accuracy", found, "--objects", found, "--html", "a.html"], "--area and --json alone"),
-        (["accuracy", found, "--area", other], "--area needs --objects"),
+        (["accuracy", detected, "--objects", tmp_path / "none.gpkg"], "no such file"),
+        (["accuracy", detected, detected, "--objects", other], "one vector file"),
+        (
+            ["accuracy", detected, "--objects", detected, "--html", "a.html"],
+            "--area and --json alone",
+        ),
+        (["accuracy", detected, "--area", other], "--area needs --objects"),
     ):
         code, _, err = run(*command)
         assert code == 1 and text in err
@@ -131,16 +138,20 @@ def test_files_that_lie_apart_and_trees_without_heights_are_told(tmp_path, run):
     write(tmp_path / "bare.gpkg", [shapely.Point(1, 1)], "Point", "trees")
     write(tmp_path / "high.gpkg", [shapely.Point(1, 1)], "Point", "trees", height=[7.0])
 
-    def said(found, reference):
+    def message_of(found, reference):
         code, _, err = run(
             "accuracy", tmp_path / f"{found}.gpkg", "--objects", tmp_path / f"{reference}.gpkg"
         )
         assert code == 0
         return " ".join(err.split())
 
-    assert "lie apart" not in said("one", "near") + said("one", "one")
-    assert "5000 to 5010, 0 to 10" in said("one", "far") and "lie apart" in said("far", "one")
-    assert "no heights" in said("high", "bare") and "no heights" not in said("high", "high")
+    assert "lie apart" not in message_of("one", "near") + message_of("one", "one")
+    assert "5000 to 5010, 0 to 10" in message_of("one", "far") and "lie apart" in message_of(
+        "far", "one"
+    )
+    assert "no heights" in message_of("high", "bare") and "no heights" not in message_of(
+        "high", "high"
+    )
 
 
 def test_delft_against_official_outlines(tmp_path, run, data_dir):
@@ -172,14 +183,14 @@ def test_heights_of_trees_may_be_texts_of_numbers_or_missing(tmp_path):
 
 def test_heights_that_are_none(tmp_path, run, bad="12,5 m"):
     spots = [shapely.Point(0, 0), shapely.Point(9, 9)]
-    one = write(tmp_path / "one.gpkg", spots, "Point", "trees", height=[4.0, 5.0])
+    first = write(tmp_path / "one.gpkg", spots, "Point", "trees", height=[4.0, 5.0])
     two = write(tmp_path / "two.gpkg", spots, "Point", "trees", height=np.array(["5", bad], object))
-    code, _, said = run("accuracy", one, "--objects", two)
+    code, _, errors = run("accuracy", first, "--objects", two)
     assert (
         code == 1
-        and "the column 'height' must hold heights" in said
-        and bad in said
-        and "two.gpkg" in said
+        and "the column 'height' must hold heights" in errors
+        and bad in errors
+        and "two.gpkg" in errors
     )
 
 
@@ -191,8 +202,13 @@ def test_a_damaged_file_of_objects_is_told(tmp_path, run):
     assert at > 0
     data[at + 1 : at + 5] = b"\xff\xff\xff\x7f"  # no kind of geometry
     bad.write_bytes(data)
-    code, _, said = run("accuracy", good, "--objects", bad)
-    assert code in (0, 1) and "Traceback" not in said and "report it" not in said
+    code, _, errors = run("accuracy", good, "--objects", bad)
+    assert code in (0, 1) and "Traceback" not in errors and "report it" not in errors
     bad.write_bytes(data[: len(data) // 2])
-    code, _, said = run("accuracy", good, "--objects", bad)
-    assert code == 1 and "bad.gpkg" in said and "Traceback" not in said and "report it" not in said
+    code, _, errors = run("accuracy", good, "--objects", bad)
+    assert (
+        code == 1
+        and "bad.gpkg" in errors
+        and "Traceback" not in errors
+        and "report it" not in errors
+    )

@@ -36,9 +36,9 @@ def folder(tmp_path_factory):
     las = laspy.read(folder / "town.laz")
     (folder / "parts").mkdir()
     for number in range(4):
-        mine = (las.x >= 500_050) == number % 2
-        mine &= (las.y >= 5_400_050) == number // 2
-        las[mine].write(folder / "parts" / f"{number}.laz")
+        inside = (las.x >= 500_050) == number % 2
+        inside &= (las.y >= 5_400_050) == number // 2
+        las[inside].write(folder / "parts" / f"{number}.laz")
     return folder
 
 
@@ -59,18 +59,18 @@ def turned_rectangles(*boxes, angle=0.3):
 @pytest.mark.parametrize("angle", [0.0, 0.7])
 def test_walls_are_straight(angle):
     true, cells = turned_rectangles((5, 5, 45, 25), angle=angle)
-    (made,) = straight_outlines(cells)
-    assert made.is_valid and len(made.exterior.coords) == 5
-    assert made.symmetric_difference(true[0]).area < 0.05 * true[0].area
+    (outline,) = straight_outlines(cells)
+    assert outline.is_valid and len(outline.exterior.coords) == 5
+    assert outline.symmetric_difference(true[0]).area < 0.05 * true[0].area
 
 
 def test_neighbors_share_their_wall():
     true, cells = turned_rectangles((5, 5, 30, 25), (30, 5, 50, 20), angle=0.4)
-    made = straight_outlines(cells)
-    assert all(m.is_valid for m in made)
-    assert made[0].intersection(made[1]).area < 1e-6
-    assert made[0].boundary.intersection(made[1].boundary).length > 12
-    for m, t in zip(made, true, strict=True):
+    outlines = straight_outlines(cells)
+    assert all(m.is_valid for m in outlines)
+    assert outlines[0].intersection(outlines[1]).area < 1e-6
+    assert outlines[0].boundary.intersection(outlines[1].boundary).length > 12
+    for m, t in zip(outlines, true, strict=True):
         assert m.intersection(t).area / m.union(t).area > 0.9
 
 
@@ -82,13 +82,13 @@ def test_holes_stay_and_small_ones_close():
     court = (np.abs(x - 20) < 5) & (np.abs(y - 20) < 5)
     chimney = (np.abs(x - 8) < 0.8) & (np.abs(y - 8) < 0.8)
     roof = (x > 4) & (x < 36) & (y > 4) & (y < 36) & ~court & ~chimney
-    found = find_objects(
+    objects = find_objects(
         Cells.from_points(
             x, y, np.where(roof, 6.0, 0.0), np.where(roof, 6, 2).astype(np.uint8), 0.5
         ),
         progress=False,
     )
-    raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
+    raw = raw_outlines(objects.tables[Kind.BUILDING], 0.5)
     for (shape,) in (raw, straight_outlines(raw)):
         assert shape.is_valid and len(shape.interiors) == 1
         assert shapely.Polygon(shape.interiors[0]).area * 0.25 == pytest.approx(100, rel=0.15)
@@ -104,13 +104,13 @@ def test_one_file_or_four_give_the_same(folder, capsys):
     assert "buildings, " in capsys.readouterr().out
     assert not list(folder.glob(".*"))
     for name in LAYERS:
-        one, shapes, about = layer(folder / "one.gpkg", name)
+        info, shapes, about = layer(folder / "one.gpkg", name)
         four, others, _ = layer(folder / "four.gpkg", name)
-        assert about["crs"] == "EPSG:25832" and list(one) == list(four)
-        for column in one:
-            np.testing.assert_array_equal(one[column], four[column])
+        assert about["crs"] == "EPSG:25832" and list(info) == list(four)
+        for column in info:
+            np.testing.assert_array_equal(info[column], four[column])
         assert all(shapely.equals_exact(shapes, others)) and shapely.is_valid(shapes).all()
-        assert len(set(one["object_id"].tolist())) == len(shapes)
+        assert len(set(info["object_id"].tolist())) == len(shapes)
     buildings, shapes, _ = layer(folder / "one.gpkg", "buildings")
     assert len(shapes) > 8 and (buildings["h_ridge"] >= buildings["h_eave"]).all()
     overlap = shapely.area(shapes).sum() - shapely.union_all(shapes).area
@@ -130,11 +130,11 @@ def test_other_formats_hold_the_same(folder, tmp_path, ending):
     job = [str(folder / "town.laz"), {"type": "writers.objects", "filename": str(target)}]
     Pipeline(job).execute(arrays=False)
     Pipeline([job[0], {**job[1], "filename": str(tmp_path / "town.gpkg")}]).execute(arrays=False)
-    one, shapes, about = layer(tmp_path / f"town_buildings.{ending}")
+    info, shapes, about = layer(tmp_path / f"town_buildings.{ending}")
     two, others, _ = layer(tmp_path / "town.gpkg", "buildings")
-    order, other = np.argsort(one["object_id"]), np.argsort(two["object_id"])
-    np.testing.assert_array_equal(one["object_id"][order], two["object_id"][other])
-    np.testing.assert_allclose(one["h_ridge"][order], two["h_ridge"][other], atol=1e-3)
+    order, other = np.argsort(info["object_id"]), np.argsort(two["object_id"])
+    np.testing.assert_array_equal(info["object_id"][order], two["object_id"][other])
+    np.testing.assert_allclose(info["h_ridge"][order], two["h_ridge"][other], atol=1e-3)
     np.testing.assert_allclose(shapely.area(shapes[order]), shapely.area(others[other]), atol=1e-3)
     assert about["crs"] and (tmp_path / "town_buildings.qml").read_text().startswith(
         "<!DOCTYPE qgis"
@@ -163,9 +163,9 @@ def test_settings_and_metadata(folder, tmp_path):
     assert reason not in left["objects"]["buildings"]["reasons"]
     shown, _, _ = layer(tmp_path / "t.gpkg", "buildings")
     assert len(shown["object_id"]) == left["objects"]["buildings"]["objects"]
-    one, two = run(), run("--writers.objects.tree_height=9", "--cell", "1", "--outlines", "cells")
+    plain, two = run(), run("--writers.objects.tree_height=9", "--cell", "1", "--outlines", "cells")
     assert two["settings"]["tree_height"] == 9 and two["settings"]["cell"] == 1
-    assert two["objects"]["trees"]["objects"] < one["objects"]["trees"]["objects"]
+    assert two["objects"]["trees"]["objects"] < plain["objects"]["trees"]["objects"]
 
 
 @pytest.mark.pdal
@@ -261,13 +261,13 @@ def test_classify_of_many_files_with_options_report_and_resume(folder, tmp_path,
         == 0
     )
     for name in ("buildings", "trees"):
-        one, shapes, _ = layer(target, name)
+        info, shapes, _ = layer(target, name)
         two, others, _ = layer(tmp_path / "two.gpkg", name)
-        np.testing.assert_array_equal(one["object_id"], two["object_id"])
+        np.testing.assert_array_equal(info["object_id"], two["object_id"])
         assert len(shapes) and all(shapely.equals_exact(shapes, others))
-    assert one["height"].min() >= 6
-    told = json.loads((tmp_path / "run.json").read_text())["objects"]
-    assert told["trees"]["objects"] == len(shapes) and told["files"] == [str(target)]
+    assert info["height"].min() >= 6
+    report = json.loads((tmp_path / "run.json").read_text())["objects"]
+    assert report["trees"]["objects"] == len(shapes) and report["files"] == [str(target)]
     page = html.read_text()
     assert "To be checked" in page and f"<td>{len(shapes)}</td>" in page
     assert not list(tmp_path.glob(".town*"))
@@ -304,10 +304,10 @@ def test_bad_clouds_give_an_error_or_a_whole_file(tmp_path, codes, epsg, text, c
     cloud(tmp_path / "in.laz", xyz, rng.choice(codes, 400).astype(np.uint8), epsg)
     target = tmp_path / "out.gpkg"
     code = cli.main(["objects", str(tmp_path / "in.laz"), str(target)])
-    said = capsys.readouterr().err
+    errors = capsys.readouterr().err
     assert not list(tmp_path.glob(".out*"))
     if text:
-        assert code == 1 and text in said and not target.exists()
+        assert code == 1 and text in errors and not target.exists()
     else:
         assert code == 0
         assert all(not len(layer(target, name)[1]) for name in ("buildings", "trees", "decks"))

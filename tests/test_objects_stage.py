@@ -26,10 +26,10 @@ def town(tmp_path_factory):
 def run_stage(arrays, **options):
     """The stage on arrays, as PDAL's runtime calls it."""
     stage = stage_type("filters.objects")(options)
-    made = {
+    outputs = {
         name: np.zeros(len(arrays["X"]), "u8") for name in stage.creates() if name not in arrays
     }
-    return stage.run(stage.points({**arrays, **made}), WHOLE_CLOUD)
+    return stage.run(stage.points({**arrays, **outputs}), WHOLE_CLOUD)
 
 
 def stages(source, target, **options):

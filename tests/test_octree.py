@@ -14,11 +14,14 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.base.octree_check import check_copc, check_ept
 
 #: Where COPC's record and the points begin; bytes of a chunk; where they end.
-INFO, BEGIN, CHUNK, END = 429, 589, 40, 757
+INFO = 429
+BEGIN = 589
+CHUNK = 40
+END = 757
 
 
 def copc(part=0, field=5, value=END, entry=0) -> bytes:
-    """What is looked at of a COPC file of four nodes, the last in a page of its own; with one number changed.
+    """Return what is looked at of a COPC file of four nodes, the last in a page of its own; with one number changed.
 
     `part`: 0 the record, 1 the first page, 2 the second.
     """
@@ -31,9 +34,9 @@ def copc(part=0, field=5, value=END, entry=0) -> bytes:
     struct.pack_into("<4s20xBB68xHIIBHI", head, 0, b"LASF", 1, 4, 375, BEGIN, 1, 6 | 0x80, 30, 0)
     struct.pack_into("<12d20xQ", head, 131, *[0.01] * 3, *[0.0] * 3, *[100.0, 0.0] * 3, 26)
     struct.pack_into("<2x16sHH32x5dQQ", head, 375, b"copc", 1, 160, *info)
-    made = [bytes(head), struct.pack("<Q", END)]
-    made += [bytes(30) + struct.pack("<I", 5 + n) + bytes(CHUNK - 34) for n in range(4)]
-    return b"".join([*made, *(struct.pack("<4iQ2i", *entry) for page in pages for entry in page)])
+    parts = [bytes(head), struct.pack("<Q", END)]
+    parts += [bytes(30) + struct.pack("<I", 5 + n) + bytes(CHUNK - 34) for n in range(4)]
+    return b"".join([*parts, *(struct.pack("<4iQ2i", *entry) for page in pages for entry in page)])
 
 
 @pytest.mark.parametrize(

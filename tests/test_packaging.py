@@ -51,7 +51,9 @@ def test_recipes_are_rendered(name):
     (rendered,) = built.Stage0Recipe.from_file(str(ROOT / name)).render(variants)
     recipe = rendered.recipe
     assert str(recipe.package.version) == __version__
-    assert any(str(one).startswith("python-pdal >=3.5") for one in recipe.requirements.run)
+    assert any(
+        str(requirement).startswith("python-pdal >=3.5") for requirement in recipe.requirements.run
+    )
     with pytest.raises(Exception, match="unknown top-level field"):
         built.Stage0Recipe.from_yaml((ROOT / name).read_text() + "requirments: {}\n")
 

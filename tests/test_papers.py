@@ -31,16 +31,16 @@ LABELS = {2: 2, 3: 1, 5: 8, 6: 5}
 def town():
     from pdal_stages.synthetic import make_town
 
-    made = make_town(size=60, density=4, seed=3)
-    labels = np.full(len(made), 7)
+    points = make_town(size=60, density=4, seed=3)
+    labels = np.full(len(points), 7)
     for code, label in LABELS.items():
-        labels[made.classification == code] = label
+        labels[points.classification == code] = label
     dimensions = {
-        "Intensity": made.intensity.astype(float),
-        "ReturnNumber": made.return_number.astype(float),
-        "NumberOfReturns": made.number_of_returns.astype(float),
+        "Intensity": points.intensity.astype(float),
+        "ReturnNumber": points.return_number.astype(float),
+        "NumberOfReturns": points.number_of_returns.astype(float),
     }
-    return clouds.Cloud("town", made.xyz, labels, dimensions)
+    return clouds.Cloud("town", points.xyz, labels, dimensions)
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +82,14 @@ def test_pts_through_pdal(folder, tmp_path, monkeypatch):
         square = np.floor(cloud.xyz[:, :2] / 10).sum(axis=1).astype(int)
         labels = cloud.labels.copy()
         for label, into in parts.items():
-            mine = cloud.labels == label
-            labels[mine] = np.array(into)[square[mine] % len(into)]
+            members = cloud.labels == label
+            labels[members] = np.array(into)[square[members] % len(into)]
         nine = clouds.Cloud(name, cloud.xyz, labels, cloud.dimensions)
         pts_input.write_pts(tmp_path / f"{name}.pts", nine)
     run("vaihingen-train", f"--stage.input.filename={tmp_path / 'train.pts'}", *quick)
     run("vaihingen-evaluate", f"--stage.input.filename={tmp_path / 'test.pts'}")
     report = json.loads((tmp_path / "vaihingen-accuracy.json").read_text())
-    codes = [one["code"] for one in report["classes"]]
+    codes = [entry["code"] for entry in report["classes"]]
     assert sorted(codes) == [3, 4, 5, 6, 11, 14, 64, 65, 67]
     test = pts_input.read_pts([tmp_path / "test.pts"], "test")
     matrix = np.array(report["confusion"]["counts"])
@@ -115,9 +115,9 @@ def scene(folder, tmp_path_factory):
 
 def test_b16_names():
     count = {
-        (hood, one): len(b16_experiments.names_of(tokens, one))
+        (hood, kind): len(b16_experiments.names_of(tokens, kind))
         for hood, tokens in b16_experiments.NEIGHBORHOODS.items()
-        for one in b16_experiments.SETS
+        for kind in b16_experiments.SETS
     }
     assert count["c1", "measures"] == 13  # 12 and Z
     assert count["c1", "distributions"] == 50
@@ -147,7 +147,7 @@ def test_w18_run(scene):
 
 
 def test_h17_thresholds_are_a_choice_between_two_tables(town):
-    """What the command takes together from two tables is what the engine computes at that threshold."""
+    """The command takes together from two tables is what the engine computes at that threshold."""
     cloud = clouds.with_height(clouds.Cloud("town", town.xyz, town.labels))
     part = h17_oakland.compute([cloud], kit.Cache(None), 1)
     words = (*h17_oakland.SIX, "Radius")
@@ -159,7 +159,7 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     )
     assert 0.05 < (part.curvature >= 0.05).mean() < 0.95
     shares = h17_oakland.shares(part.labels, part.curvature, 0.0)
-    assert all(one["points"] == one["scattered"] for one in shares.values())
+    assert all(share["points"] == share["scattered"] for share in shares.values())
 
 
 def test_b16_command_on_pts_resumes(folder, tmp_path, monkeypatch, capsys):

@@ -183,7 +183,7 @@ def test_a_ready_pipeline_gives_the_same_bytes(
             *(quick if name == "train" else ()),
         ]
         model = str(ready_models / "classes.model")
-        stages = with_words(name, *(one.replace("MODEL", model) for one in words))
+        stages = with_words(name, *(word.replace("MODEL", model) for word in words))
         if door == "stock":
             pipeline(stages, cwd=tmp_path / door)
         else:
@@ -253,8 +253,10 @@ def test_points_of_several_readers_see_each_other(pipeline, ready_halves, tmp_pa
         stock = accuracy.read_text() if accuracy.exists() else ""
         count = ps.Pipeline(las(stages, tmp_path / "ours.las")).execute()
         assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
-    made = json.loads(stock)  # one file of all points
-    assert stock == accuracy.read_text() and made["points"] + made["left_out"]["points"] == count
+    merged = json.loads(stock)  # one file of all points
+    assert (
+        stock == accuracy.read_text() and merged["points"] + merged["left_out"]["points"] == count
+    )
 
 
 # ---- options, metadata, log --------------------------------------------------------------------------------
@@ -273,20 +275,20 @@ def test_options_of_every_pdal_stage(pipeline, ready_town, tmp_path):
 def test_metadata_is_the_report(pipeline, ready_town, tmp_path):
     stages = [str(ready_town), {"type": "filters.hag_minima", "cell": 10}, {"type": "writers.null"}]
     pipeline(stages, f"--metadata={tmp_path / 'm.json'}")
-    said = json.loads((tmp_path / "m.json").read_text())["stages"]
-    assert "filters.python" not in said
+    stages_metadata = json.loads((tmp_path / "m.json").read_text())["stages"]
+    assert "filters.python" not in stages_metadata
     done = ps.Pipeline(stages)
     done.execute()
-    assert said["filters.hag_minima"] == done.metadata["metadata"]["filters.hag_minima"]
+    assert stages_metadata["filters.hag_minima"] == done.metadata["metadata"]["filters.hag_minima"]
 
 
 def test_an_empty_list_is_none(pipeline, ready_town, tmp_path):
     """PDAL cannot tell an empty list from none given; null is one."""
     files = tmp_path / "stock.txt", tmp_path / "ours.txt"
-    for given, run, file in zip(
+    for pipeline_json, run, file in zip(
         (None, []), (pipeline, lambda s: ps.Pipeline(s).execute()), files, strict=True
     ):
-        stage = {"type": "filters.hag_minima", "ignore": given}
+        stage = {"type": "filters.hag_minima", "ignore": pipeline_json}
         run([str(ready_town), stage, {"type": "writers.text", "filename": str(file)}])
     assert files[0].read_bytes() == files[1].read_bytes()
 
@@ -355,13 +357,15 @@ def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
         "sys.meta_path.insert(0, Hide())\n"
     )
     assert (
-        "has no package pdal_stages" in (said := run(hidden)) and "pip install pdal-stages" in said
+        "has no package pdal_stages" in (errors := run(hidden))
+        and "pip install pdal-stages" in errors
     )
     broken = tmp_path / "broken" / "pdal_stages"
     broken.mkdir(parents=True)
     (broken / "__init__.py").write_text("raise OSError('cannot open shared object')")
     assert (
-        "cannot be imported" in (said := run(broken.parent)) and "cannot open shared object" in said
+        "cannot be imported" in (errors := run(broken.parent))
+        and "cannot open shared object" in errors
     )
     (broken / "__init__.py").write_text(  # a package that lacks what the library asks for
         "import sys\nclass Old:\n    def find_spec(self, name, path=None, target=None):\n"
@@ -373,14 +377,14 @@ def test_a_package_that_is_missing(pipeline, environment, ready_town, tmp_path):
 
 
 def test_a_plugin_of_another_version():
-    asked = {
+    programs = {
         "version": "9.9",
         "digest": "x",
         "stage": "filters.hag_minima",
         "label": "l",
         "step": "prepare",
     }
-    module = {"pdalargs": asked}
+    module = {"pdalargs": programs}
     assert calls.answer(module, {}, {})
     (leaf,) = module["out_metadata"]["children"]
     assert leaf["name"] == "pdal_stages_error" and "9.9" in leaf["value"]
@@ -417,7 +421,7 @@ def test_without_filters_python(plugin, pdal_program, ready_town, tmp_path):
 
 
 def test_objects_of_python_pdal(python, ready_town):
-    said = python(
+    output = python(
         "import sys, pdal, numpy as np, pdal_stages as ps\n"
         f"read = pdal.Reader.las({str(ready_town)!r})\n"
         "job = read | pdal.Filter.hag_minima(cell=10) | pdal.Filter.hag_morphological(openings=[5, 17])\n"
@@ -429,13 +433,13 @@ def test_objects_of_python_pdal(python, ready_town):
         "assert all(np.array_equal(one[name], other[name]) for name in one.dtype.names)\n"
         "print(pdal.Filter.hag_minima.__doc__)\n"
     )
-    assert int(said.split()[0]) == laspy.read(ready_town).header.point_count
-    assert "coarse" in said
+    assert int(output.split()[0]) == laspy.read(ready_town).header.point_count
+    assert "coarse" in output
 
 
 def test_a_notebook_survives_failures(python, ready_town):
     """Failures, each an ordinary exception with our message, then a run that succeeds."""
-    said = python(
+    output = python(
         "import gc, pdal\n"
         f"read = pdal.Reader.las({str(ready_town)!r})\n"
         "for n in range(10):\n"
@@ -450,7 +454,7 @@ def test_a_notebook_survives_failures(python, ready_town):
         "    gc.collect()\n"
         "print((read | pdal.Filter.hag_minima()).execute() > 0)\n"
     )
-    assert "True" in said
+    assert "True" in output
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

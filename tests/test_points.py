@@ -9,39 +9,39 @@ from pdal_stages.stages.points import Points
 
 def arrays(n=1000):
     random = np.random.default_rng(0)
-    made = {name: np.round(random.uniform(0, 50, n), 3) for name in ("X", "Y", "Z", "GpsTime")}
-    return made | {"Classification": np.full(n, 2, np.uint8), "Mine": np.full(n, -1.0)}
+    columns = {name: np.round(random.uniform(0, 50, n), 3) for name in ("X", "Y", "Z", "GpsTime")}
+    return columns | {"Classification": np.full(n, 2, np.uint8), "Mine": np.full(n, -1.0)}
 
 
 def test_coordinates_in_meters():
-    given = arrays()
-    points = Points(given)
+    columns = arrays()
+    points = Points(columns)
     assert all(
-        np.array_equal(axis, given[name]) for axis, name in zip(points.axes, "XYZ", strict=True)
+        np.array_equal(axis, columns[name]) for axis, name in zip(points.axes, "XYZ", strict=True)
     )
-    assert np.array_equal(points.xyz, np.column_stack([given[name] for name in "XYZ"]))
+    assert np.array_equal(points.xyz, np.column_stack([columns[name] for name in "XYZ"]))
 
 
 def test_what_is_not_kept_is_let_go_of_and_coordinates_stay():
-    given = arrays()
-    points = Points(dict(given), meters_outside=given["Mine"])
+    columns = arrays()
+    points = Points(dict(columns), meters_outside=columns["Mine"])
     points.keep_only(["Classification", "HeightAboveGround"])
     assert set(points.arrays) == {"Classification"} and points.count == 1000
     with pytest.raises(DimensionError, match="GpsTime"):
         points.dimension("GpsTime")
-    assert np.array_equal(points.take_xyz(), np.column_stack([given[name] for name in "XYZ"]))
+    assert np.array_equal(points.take_xyz(), np.column_stack([columns[name] for name in "XYZ"]))
     points.tally("all", np.ones(1000, bool))
     assert points.report.figures["all"] == 1000
 
 
 @pytest.mark.parametrize("scale", [0.01, 0.001, 0.00025])
 def test_scale_and_offset_of_a_file_do_not_change_coordinates(scale):
-    """As LAS readers compute them, they differ in the last bit, and fall into other cells."""
+    """LAS readers compute coordinates that differ in the last bit, and fall into other cells."""
     steps = np.arange(683_200_000, 683_210_000)  # of a centimeter
     plain = steps * 0.01 + 0.0
     offset = 6_831_989.0
     other = np.rint((plain - offset) / scale) * scale + offset
     assert (plain != other).any()
-    one, two = (Points(dict.fromkeys("XYZ", values)).axes for values in (plain, other))
-    assert all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))
-    assert np.abs(one[0] - plain).max() < 1e-8
+    first, two = (Points(dict.fromkeys("XYZ", values)).axes for values in (plain, other))
+    assert all(np.array_equal(a, b) for a, b in zip(first, two, strict=True))
+    assert np.abs(first[0] - plain).max() < 1e-8

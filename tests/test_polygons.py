@@ -86,16 +86,16 @@ def test_what_is_written_for_a_file_and_a_class():
 def test_ground_inside_becomes_the_class_and_nothing_else(tmp_path, suffix, epsg):
     arrays = cloud()
     path = write(tmp_path / f"lakes.{suffix}", [LAKE, ISLET], epsg)
-    found, report = run([f"{path}=9"], arrays)
+    classes, report = run([f"{path}=9"], arrays)
     codes = arrays["Classification"]
     want = np.where(inside(arrays, LAKE, ISLET) & (codes == 2), 9, codes)
     edge = shapely.distance(
         shapely.union_all([LAKE.boundary, ISLET.boundary]), shapely.points(arrays["X"], arrays["Y"])
     )
     certain = edge > (0.0 if epsg in (RD, None) else 0.01)
-    assert np.array_equal(found[certain], want[certain]) and (want == 9).sum() > 300
+    assert np.array_equal(classes[certain], want[certain]) and (want == 9).sum() > 300
     assert report.figures["polygons"] == {
-        f"{path}=9": {"polygons": 2, "points": int((found == 9).sum())}
+        f"{path}=9": {"polygons": 2, "points": int((classes == 9).sum())}
     }
     assert bool(report.notes) == (epsg is None)
 
@@ -104,15 +104,17 @@ def test_other_classes_and_several_files_in_their_order(tmp_path):
     arrays = cloud()
     lake, islet = write(tmp_path / "a.gpkg", [LAKE]), write(tmp_path / "b.gpkg", [ISLET])
     codes, at = arrays["Classification"], inside(arrays, LAKE)
-    found, _ = run([f"{lake}=17:5,6"], arrays)
-    assert np.array_equal(found, np.where(at & np.isin(codes, (5, 6)), 17, codes))
-    found, _ = run([f"{lake}=40:all", f"{islet}=41:2,40"], arrays, ignore="", keep="")
+    classes, _ = run([f"{lake}=17:5,6"], arrays)
+    assert np.array_equal(classes, np.where(at & np.isin(codes, (5, 6)), 17, codes))
+    classes, _ = run([f"{lake}=40:all", f"{islet}=41:2,40"], arrays, ignore="", keep="")
     want = np.where(at, 40, codes)
-    assert np.array_equal(found, np.where(inside(arrays, ISLET) & np.isin(want, (2, 40)), 41, want))
-    found, _ = run([f"{lake}=40:all"], arrays)
-    assert np.array_equal(found == 40, at & ~np.isin(codes, (7, 12)))
-    found, _ = run([f"{lake}=9"], arrays, where="X > 85040")
-    assert np.array_equal(found == 9, at & (codes == 2) & (arrays["X"] > 85040))
+    assert np.array_equal(
+        classes, np.where(inside(arrays, ISLET) & np.isin(want, (2, 40)), 41, want)
+    )
+    classes, _ = run([f"{lake}=40:all"], arrays)
+    assert np.array_equal(classes == 40, at & ~np.isin(codes, (7, 12)))
+    classes, _ = run([f"{lake}=9"], arrays, where="X > 85040")
+    assert np.array_equal(classes == 9, at & (codes == 2) & (arrays["X"] > 85040))
 
 
 def test_layers_of_a_file(tmp_path):
@@ -123,8 +125,8 @@ def test_layers_of_a_file(tmp_path):
         run([f"{path}=9"], arrays)
     with pytest.raises(StageError, match=r"no such layer of polygons"):
         run([f"{path}|layername=seas=9"], arrays)
-    found, report = run([f"{path}|layername=islets=9"], arrays)
-    assert np.array_equal(found == 9, inside(arrays, ISLET) & (arrays["Classification"] == 2))
+    classes, report = run([f"{path}|layername=islets=9"], arrays)
+    assert np.array_equal(classes == 9, inside(arrays, ISLET) & (arrays["Classification"] == 2))
     assert list(report.figures["polygons"]) == [f"{path}|layername=islets=9"]
 
 
@@ -140,9 +142,9 @@ def test_shapes_of_all_kinds(tmp_path):
         str(path), np.array([*map(shapely.to_wkb, shapes), None], object), [np.arange(4)], ["id"],
         crs=f"EPSG:{RD}", geometry_type="Unknown",
     )  # fmt: skip
-    found, _ = run([f"{path}=9"], arrays)
+    classes, _ = run([f"{path}=9"], arrays)
     shapes = [shapely.make_valid(bow), shapely.force_2d(solid), mixed.geoms[1]]
-    assert np.array_equal(found == 9, inside(arrays, *shapes) & (arrays["Classification"] == 2))
+    assert np.array_equal(classes == 9, inside(arrays, *shapes) & (arrays["Classification"] == 2))
     _, report = run([f"{write(tmp_path / 'far.gpkg', [shapely.box(0, 0, 1, 1)])}=9"], arrays)
     assert not next(iter(report.figures["polygons"].values()))["points"]
 
@@ -187,13 +189,13 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las, run_job):
     elsewhere = write(tmp_path / "elsewhere.gpkg", [shapely.box(1000, 1000, 1010, 1010)])
     source = write_las(tmp_path / "in.las", cloud(), point_format=1)
     lay = {"type": "filters.polygons", "polygons": [f"{path}=9", f"{elsewhere}=9:all"]}
-    found = []
+    results = []
     for words in ([], ["--tile", "30", "--workers", "0", "--no-progress"]):
         code, _, err = run_job([source, lay, out], *words)
-        found.append(np.asarray(laspy.read(out).classification))
-        said = [line for line in err.splitlines() if "no polygon lies where" in line]
-        assert code == 0 and len(said) == 1 and "elsewhere.gpkg" in said[0]
-    assert np.array_equal(*found) and (found[0] == 9).sum() > 300
+        results.append(np.asarray(laspy.read(out).classification))
+        lines = [line for line in err.splitlines() if "no polygon lies where" in line]
+        assert code == 0 and len(lines) == 1 and "elsewhere.gpkg" in lines[0]
+    assert np.array_equal(*results) and (results[0] == 9).sum() > 300
     with pytest.raises(StageError):
         ps.Pipeline([str(source), lay, {"type": "writers.las", "filename": path}]).execute()
 
@@ -209,9 +211,9 @@ def test_water_of_delft_on_the_command_line(tmp_path, data_dir):
     out = tmp_path / "out.laz"
     words = ["classify", str(tmp_path / "in.laz"), str(out), "--polygons", f"{water}=9"]
     program = [sys.executable, "-m", "pdal_stages.cli"]  # which does without pyproj where it can
-    said = subprocess.check_output([*program, *words], text=True)
+    output = subprocess.check_output([*program, *words], text=True)
     codes = np.asarray(laspy.read(out).classification)
-    assert (codes == 9).any() and "  9 Water" in said
+    assert (codes == 9).any() and "  9 Water" in output
     at = inside({"X": las.x, "Y": las.y}, *shapes)
     assert not (codes[~at] == 9).any() and not (codes[at] == 2).any()
 

@@ -128,8 +128,10 @@ def test_found_by_itself(environment, program, tmp_path, monkeypatch):
 def test_forms_follow_the_command(capsys):
     """Arguments stand in the JSON with the words of --help."""
     assert main(["commands", "--showjson"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    arguments = {one["name"]: one for one in said["commands"]["classify"]["arguments"]}
+    description = json.loads(capsys.readouterr().out)
+    arguments = {
+        argument["name"]: argument for argument in description["commands"]["classify"]["arguments"]
+    }
     assert (
         arguments["inputs"]["many"]
         and arguments["inputs"]["flag"] == ""
@@ -141,7 +143,10 @@ def test_forms_follow_the_command(capsys):
     }  # fmt: skip
     assert arguments["per"]["choices"] == ["auto", "file", "tile"]
     assert "1/32 (3 cm" in arguments["dimensions"]["help"]
-    options = {one["name"]: one for one in said["stages"]["filters.hag_morphological"]["options"]}
+    options = {
+        argument["name"]: argument
+        for argument in description["stages"]["filters.hag_morphological"]["options"]
+    }
     assert options["window"]["default"] == 18.0 and options["window"]["exclusive"]
     assert main(["commands"]) == 0
     assert "classify " in capsys.readouterr().out
@@ -172,7 +177,7 @@ def test_run_fails_with_the_message(running, tmp_path):
 
 
 def runs(stat):
-    """Whether the process is there, and not only its entry in the table."""
+    """Return whether the process is there, and not only its entry in the table."""
     try:
         return stat.read_text().split(")")[-1].split()[0] != "Z"
     except OSError:
@@ -228,7 +233,7 @@ def profile(zipped, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def around(profile, program):
+def environment_of(profile, program):
     """QGIS's environment: a clean machine's, which knows where the program is."""
     runtime = profile / "runtime"
     runtime.mkdir(mode=0o700, exist_ok=True)
@@ -244,9 +249,9 @@ def qgis(around):
 
     def run(*words, code=0, **more):
         done = ended(PROCESS, *words, env={**around, **more})
-        said = done.stdout + done.stderr
-        assert (done.returncode == 0) == (code == 0), said
-        return said
+        output = done.stdout + done.stderr
+        assert (done.returncode == 0) == (code == 0), output
+        return output
 
     run("plugins", "enable", "pdal_stages")
     return run
@@ -266,18 +271,18 @@ def session(around, profile):
 
 @needs_qgis
 def test_algorithms_are_listed(qgis):
-    said = qgis("list")
+    output = qgis("list")
     names = "classify classifysurvey heights terrainmodels train accuracy review corrections objects check"
     for name in names.split():
-        assert f"pdalstages:{name}\t" in said
+        assert f"pdalstages:{name}\t" in output
 
 
 @needs_qgis
 def test_check_tells_what_is_there_and_what_is_missing(qgis):
-    said = qgis("run", "pdalstages:check")
-    assert f"VERSION:\t{__version__}" in said and "ok      shipped model" in said
-    said = qgis("run", "pdalstages:check", code=1, PDAL_STAGES_PROGRAM="/nowhere")
-    assert "no program pdal-stages at /nowhere" in said and "Install pdal-stages" in said
+    output = qgis("run", "pdalstages:check")
+    assert f"VERSION:\t{__version__}" in output and "ok      shipped model" in output
+    output = qgis("run", "pdalstages:check", code=1, PDAL_STAGES_PROGRAM="/nowhere")
+    assert "no program pdal-stages at /nowhere" in output and "Install pdal-stages" in output
 
 
 @needs_qgis
@@ -285,9 +290,9 @@ def test_parameters_are_the_commands_own(session, capsys):
     assert main(["commands", "--showjson"]) == 0
     forms = json.loads(capsys.readouterr().out)
     shown = session("parameters", "classifysurvey")["parameters"]
-    for one in forms["commands"]["classify"]["arguments"]:
-        if one["name"] in ("where", "memory", "workers", "polygons", "per"):
-            assert shown[one["name"].upper()][3] == one["help"]
+    for argument in forms["commands"]["classify"]["arguments"]:
+        if argument["name"] in ("where", "memory", "workers", "polygons", "per"):
+            assert shown[argument["name"].upper()][3] == argument["help"]
     assert shown["PER"][1] and not shown["MEMORY"][1]  # advanced, and not
     for name in ("BRIDGES", "WIRES", "VEGETATION_HEIGHTS"):
         assert name in shown and not shown[name][1]
@@ -302,8 +307,8 @@ def algorithm(qgis):
     """Run one of ours with parameters; what was printed."""
 
     def run(name, code=0, **parameters):
-        given = [f"{key}={value}" for key, value in parameters.items()]
-        return qgis("run", f"pdalstages:{name}", "--", *given, code=code)
+        words = [f"{key}={value}" for key, value in parameters.items()]
+        return qgis("run", f"pdalstages:{name}", "--", *words, code=code)
 
     return run
 
@@ -315,14 +320,14 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     out = tmp_path / "with blanks ü"
     out.mkdir()
     cloud, heights = out / "c.laz", out / "h.laz"
-    said = algorithm("classify", INPUT=ready_town, OUTPUT=cloud, MAP=out / "c.tif", NOISE=0)
-    assert "pdal-stages classify --no-noise" in said and "6 Building" in said
+    output = algorithm("classify", INPUT=ready_town, OUTPUT=cloud, MAP=out / "c.tif", NOISE=0)
+    assert "pdal-stages classify --no-noise" in output and "6 Building" in output
     assert main(["classify", str(ready_town), str(tmp_path / "c.laz"), "--no-noise"]) == 0
     assert cloud.read_bytes() == (tmp_path / "c.laz").read_bytes()
     algorithm("heights", INPUT=ready_town, OUTPUT=heights, MAP=out / "h.tif", WINDOW=40)
     for wrong in ({"WINDOW": "4,5"}, {"WIDNOW": 40}, {"MAP": out / "h.xyz"}):
-        said = algorithm("heights", code=1, INPUT=ready_town, OUTPUT=out / "x.laz", **wrong)
-        assert re.search("found '4,5'|Did you mean WINDOW|ends in .tif", said)
+        output = algorithm("heights", code=1, INPUT=ready_town, OUTPUT=out / "x.laz", **wrong)
+        assert re.search("found '4,5'|Did you mean WINDOW|ends in .tif", output)
     assert not (out / "x.laz").exists()
     job = [
         str(ready_town),
@@ -334,8 +339,8 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     assert np.array_equal(ours, theirs) and ours.max() > 3
     rasters = {"TERRAIN": out / "t.tif", "SURFACE": out / "s.tif", "HEIGHTS": out / "a.tif"}
     algorithm("terrainmodels", INPUT=cloud, GROUND_FROM=1, **rasters)
-    said = algorithm("accuracy", INPUT=cloud, REFERENCE=ready_town, PAGE=out / "a.html")
-    assert "Overall accuracy" in said and (out / "a.html").read_text().startswith("<!")
+    output = algorithm("accuracy", INPUT=cloud, REFERENCE=ready_town, PAGE=out / "a.html")
+    assert "Overall accuracy" in output and (out / "a.html").read_text().startswith("<!")
     pytest.importorskip("pyogrio")
     assert " buildings, " in algorithm("objects", INPUTS=cloud, OUTPUT=out / "o.gpkg")
     shown = session(
@@ -344,16 +349,16 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     layers = {"terrain": "hillshade", "heights": "singlebandpseudocolor", "classes": "paletted"}
     assert shown["building"] == [214, 78, 60] and shown["layers"] | layers == shown["layers"]
     assert shown["layers"]["buildings"] == "RuleRenderer"
-    said = algorithm("review", INPUTS=cloud, OUTPUT=out / "r.gpkg", PAGE=out / "r.html")
-    assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), said
+    output = algorithm("review", INPUTS=cloud, OUTPUT=out / "r.gpkg", PAGE=out / "r.html")
+    assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), output
     marked = {"BEFORE": cloud, "AFTER": ready_town, "OUTPUT": out / "k.laz", "AROUND": 2}
-    said = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
-    assert "no patch is marked as checked" in said and not (out / "k.laz").exists()
-    said = algorithm("corrections", **marked)
+    output = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
+    assert "no patch is marked as checked" in output and not (out / "k.laz").exists()
+    output = algorithm("corrections", **marked)
     words = ["corrections", str(cloud), str(ready_town), "--around", "2"]
     assert main([*words, "--out", str(tmp_path / "k.laz")]) == 0
     assert (out / "k.laz").read_bytes() == (tmp_path / "k.laz").read_bytes()
-    assert np.count_nonzero(laspy.read(out / "k.laz")["Checked"]), said
+    assert np.count_nonzero(laspy.read(out / "k.laz")["Checked"]), output
 
 
 @pytest.mark.pdal

@@ -31,12 +31,12 @@ def cloud(seed, n=3000, wide=60.0):
 @given(st.integers(0, 10**6), st.integers(1, 400), st.integers(1, 5))
 def test_order_and_cuts_change_nothing(seed, n, parts):
     points, random = cloud(seed, n, 20.0), np.random.default_rng(seed)
-    order, of = random.permutation(n), random.integers(0, parts, n)
+    order, part = random.permutation(n), random.integers(0, parts, n)
     whole = ReviewCells.from_points(*points, 2.0)
     several = [
-        ReviewCells.from_points(*(values[order[of[order] == k]] for values in points), 2.0)
+        ReviewCells.from_points(*(values[order[part[order] == k]] for values in points), 2.0)
         for k in range(parts)
-        if (of == k).any()
+        if (part == k).any()
     ]
     joined = ReviewCells.join(several)
     for name in ("place", "points", "parts"):
@@ -45,18 +45,20 @@ def test_order_and_cuts_change_nothing(seed, n, parts):
 
 def test_cells_are_what_they_say():
     xyz, codes, reliability = cloud(3)
-    given = np.where(np.arange(len(codes)) % 50, reliability, np.nan)  # not known: never right
-    reliability = np.nan_to_num(given)
-    made = ReviewCells.from_points(xyz, codes, given, 2.0, file=4)
+    known = np.where(np.arange(len(codes)) % 50, reliability, np.nan)  # not known: never right
+    reliability = np.nan_to_num(known)
+    cells = ReviewCells.from_points(xyz, codes, known, 2.0, file=4)
     place = np.floor(xyz[:, :2] / 2.0)
     groups = [codes == 2, np.isin(codes, (3, 4, 5)), codes == 6]
-    assert made.points.sum() == sum(group.sum() for group in groups)
-    for k in range(0, len(made), 37):
-        file, row, column = made.place[k]
-        mine = (place[:, 1] == row) & (place[:, 0] == column)
-        assert file == 4 and made.points[k].tolist() == [(mine & group).sum() for group in groups]
-        errors = [(1.0 - reliability[mine & group]).sum() for group in groups]
-        assert np.allclose(made.errors[k], errors, atol=1e-3)
+    assert cells.points.sum() == sum(group.sum() for group in groups)
+    for k in range(0, len(cells), 37):
+        file, row, column = cells.place[k]
+        inside = (place[:, 1] == row) & (place[:, 0] == column)
+        assert file == 4 and cells.points[k].tolist() == [
+            (inside & group).sum() for group in groups
+        ]
+        errors = [(1.0 - reliability[inside & group]).sum() for group in groups]
+        assert np.allclose(cells.errors[k], errors, atol=1e-3)
 
 
 def test_places_are_told_in_the_coordinates_of_the_files():
@@ -74,19 +76,19 @@ def test_places_are_told_in_the_coordinates_of_the_files():
 def test_patches_hold_each_cell_once_and_come_best_first():
     assert all("looked at" in styles(np.full(n, 0.2))["patches"] for n in (0, 1, 5))
     cells = ReviewCells.from_points(*cloud(9, 6000, 150.0), 2.0)
-    found = find_patches(cells)
-    assert np.array_equal(np.unique(found.of_cell), np.arange(len(found)))
+    patches = find_patches(cells)
+    assert np.array_equal(np.unique(patches.of_cell), np.arange(len(patches)))
     assert (
-        np.isclose(found.errors.sum(), cells.errors.sum())
-        and found.points.sum() == cells.points.sum()
+        np.isclose(patches.errors.sum(), cells.errors.sum())
+        and patches.points.sum() == cells.points.sum()
     )
-    assert (np.diff(found.errors / found.minutes) <= 1e-6).all()
-    for number in range(len(found)):
-        mine = np.flatnonzero(found.of_cell == number)
-        assert (np.ptp(cells.corners[mine][:, :2], axis=0) < RULES.block).all()
-        errors = cells.errors[mine].sum(axis=1)
-        worst = cells.corners[mine[errors == errors.max()]]
-        assert found.at[number].tolist() in (0.5 * (worst[:, :2] + worst[:, 2:])).tolist()
+    assert (np.diff(patches.errors / patches.minutes) <= 1e-6).all()
+    for number in range(len(patches)):
+        members = np.flatnonzero(patches.of_cell == number)
+        assert (np.ptp(cells.corners[members][:, :2], axis=0) < RULES.block).all()
+        errors = cells.errors[members].sum(axis=1)
+        worst = cells.corners[members[errors == errors.max()]]
+        assert patches.at[number].tolist() in (0.5 * (worst[:, :2] + worst[:, 2:])).tolist()
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +102,8 @@ def folder(ready_town, tmp_path_factory):
     unsure = east & (np.asarray(las.classification) == 6)
     las["Reliability"] = np.where(unsure, 0.5, 0.99).astype(np.float32)
     (folder / "parts").mkdir()
-    for name, mine in (("east", east), ("west", ~east)):
-        las[mine].write(folder / "parts" / f"{name}.laz")
+    for name, side in (("east", east), ("west", ~east)):
+        las[side].write(folder / "parts" / f"{name}.laz")
     las.write(folder / "whole.laz")
     return folder
 
@@ -110,8 +112,8 @@ def folder(ready_town, tmp_path_factory):
 def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
     pytest.importorskip("pyogrio")
     out = tmp_path / "review.gpkg"
-    code, said, _ = run("review", folder / "parts", out, "--json", tmp_path / "r.json")
-    assert code == 0 and "east.laz" in said and "written to" in said
+    code, output, _ = run("review", folder / "parts", out, "--json", tmp_path / "r.json")
+    assert code == 0 and "east.laz" in output and "written to" in output
     figures = json.loads((tmp_path / "r.json").read_text())
     east, west = figures["tiles"]
     assert (east["tile"], west["tile"]) == ("east.laz", "west.laz") and east["expected"] > 3 * west[
@@ -180,10 +182,10 @@ def test_files_without_points(tmp_path, run, write_las):
     nothing = {**dict.fromkeys("XYZ", np.zeros(0)), "Classification": np.zeros(0, np.uint8)}
     source = write_las(tmp_path / "in.las", nothing, point_format=6)
     pages = ("--html", tmp_path / "r.html", "--json", tmp_path / "r.json")
-    code, said, err = run("review", source, tmp_path / "r.gpkg", *pages)
+    code, output, err = run("review", source, tmp_path / "r.gpkg", *pages)
     assert code == 0, err
     assert (
-        "0 points judged" in said and json.loads((tmp_path / "r.json").read_text())["points"] == 0
+        "0 points judged" in output and json.loads((tmp_path / "r.json").read_text())["points"] == 0
     )
     with sqlite3.connect(tmp_path / "r.gpkg") as base:
         for name in ("patches", "tiles"):

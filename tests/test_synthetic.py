@@ -38,8 +38,8 @@ def same(one: Town, two: Town) -> bool:
 
 
 def test_same_seed_same_points_whatever_the_threads():
-    one = make_town(40, 3, seed=5, threads=1, progress=False)
-    assert same(one, make_town(40, 3, seed=5, threads=3, progress=False))
+    whole = make_town(40, 3, seed=5, threads=1, progress=False)
+    assert same(whole, make_town(40, 3, seed=5, threads=3, progress=False))
 
 
 @pytest.mark.parametrize(("size", "density"), [(200, 1.5), (50, 15)])
@@ -76,8 +76,8 @@ def test_any_options_give_whole_pulses(**options):
 
 def test_ground_lies_on_the_ground_and_noise_moves_it(town):
     def error(t, code):
-        of = t.classification == code
-        return t.z[of] - t.ground_height(t.x[of], t.y[of])
+        members = t.classification == code
+        return t.z[members] - t.ground_height(t.x[members], t.y[members])
 
     # Rounding to 1 mm on slopes of one, and kerbs that end at a step.
     assert (
@@ -154,10 +154,14 @@ def test_pdal_reads_the_file_back(tmp_path, pdal_program):
     for name in names.split():
         assert np.array_equal(np.asarray(las[name]), getattr(t, name)), name
     assert np.abs(las["scan_angle"] * 0.006 - t.scan_angle).max() <= 0.004
-    said = json.loads(printed(pdal_program, "info", "--metadata", path))["metadata"]
-    assert said["count"] == len(t) and said["dataformat_id"] == 6 and said["minor_version"] == 4
-    assert 'AUTHORITY["EPSG","25832"]' in said["srs"]["horizontal"]
-    assert said["srs"]["units"]["horizontal"] == "metre" and said["scale_x"] == 0.001
+    metadata = json.loads(printed(pdal_program, "info", "--metadata", path))["metadata"]
+    assert (
+        metadata["count"] == len(t)
+        and metadata["dataformat_id"] == 6
+        and metadata["minor_version"] == 4
+    )
+    assert 'AUTHORITY["EPSG","25832"]' in metadata["srs"]["horizontal"]
+    assert metadata["srs"]["units"]["horizontal"] == "metre" and metadata["scale_x"] == 0.001
     write_town(t, tmp_path / "again.laz")
     assert (tmp_path / "again.laz").read_bytes() == path.read_bytes()
 

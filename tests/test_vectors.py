@@ -25,6 +25,6 @@ def test_points_reach_the_file(tmp_path, name, multicount):
         assert out.stat().st_size == 100 + POINTS * 44  # type PointZ: x, y, z and the measure
         assert {p.suffix for p in tmp_path.iterdir()} >= {".shp", ".shx", ".dbf"}
     else:
-        found = json.loads(out.read_text())["features"]
-        assert len(found) == -(-POINTS // multicount)
-        assert found[0]["geometry"]["type"] == ("Point" if multicount == 1 else "MultiPoint")
+        features = json.loads(out.read_text())["features"]
+        assert len(features) == -(-POINTS // multicount)
+        assert features[0]["geometry"]["type"] == ("Point" if multicount == 1 else "MultiPoint")

@@ -227,7 +227,7 @@ def _warmup(options: argparse.Namespace) -> None:
         neighborhoods="s5,k10",
         feature_set="covariance,geometric,surfaces",
         dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "returns"),
-        context=("own", *TrainingOptions().context),  # shipped models read the point's own as well
+        context=("own", "segments6", *TrainingOptions().context),  # as shipped models read
         trees=1,
         count=50,
         threads=1,

@@ -1,8 +1,8 @@
 """The registry of features: names, groups, units and definitions, in the order of the columns.
 
-A new eigen-feature is one entry here and one line in ``moments.write_eigen_features``. Columns,
-groups, kernel rows and the table of docs/features.md follow. Model files name their features one
-by one, so none of them needs to be trained again.
+A new feature is one entry here and its value in ``features/moments.py``; what goes with it is in
+CONTRIBUTING.md, "Checklists". Columns, groups and kernel rows follow. Model files name their
+features one by one, so none of them needs to be trained again.
 """
 
 from __future__ import annotations

@@ -320,8 +320,9 @@ class ClassStage(Stage):
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors"
     ignore: Selection = ignore_option()
-    #: Dimensions that it reads of a point's neighbors.
-    reads_around: ClassVar[frozenset[str]] = frozenset()
+    #: Dimensions that it reads of a point's neighbors; None: all that it reads. Fewer save tiles
+    #: work: stages that write others are not run in the halo.
+    reads_around: ClassVar[frozenset[str] | None] = None
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
@@ -330,7 +331,8 @@ class ClassStage(Stage):
     def sees_results_of(self, earlier: Stage) -> bool:
         """Neighbors matter by :attr:`reads_around` and by `ignore`, but not by other classes."""
         ignored, written = self.ignore, {name.lower() for name in earlier.creates()}
-        read = (*self.reads_around, *(span.dimension for span in ignored.spans))
+        of_neighbors = self.reads() if self.reads_around is None else self.reads_around
+        read = (*of_neighbors, *(span.dimension for span in ignored.spans))
         ignores = earlier.written_classes() & set(ignored.codes)
         return bool(ignores) or not written.isdisjoint(name.lower() for name in read)
 

@@ -100,7 +100,8 @@ class FilterOptions:
     ) -> NDArray[np.bool_]:
         """Return which of the points to `use` are ground.
 
-        They are so by their heights above the surface and its slope there; NaN is not.
+        They are so by their heights above the surface and its slope there; NaN is not. `_near`
+        applies the same tolerance to cells that are regained.
         """
         return use & (np.abs(height) <= self.threshold + self.scalar * gradient)
 

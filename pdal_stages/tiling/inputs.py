@@ -231,6 +231,10 @@ class Survey:
         others = named_files([*plan.head, *plan.tail])
         #: Sizes and times of inputs, and of other files that stages read, at the start of the run.
         self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
+        #: Digests of the other files; a folder has its size and time.
+        self._contents: dict[str, Any] = {
+            path: digest_of(path) if os.path.isfile(path) else stamp(path) for path in others
+        }
         self._read_headers()
         files_of_las = [source.path for source in self.sources if source.kind == "las"]
         self.messages += replaced(files_of_las, plan.makes)
@@ -350,8 +354,8 @@ class Survey:
         self.bounds: Box = union(boxes)
 
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
-        """Return names, sizes and times of the files that stages read."""
-        return [[path, self.stamps.get(path)] for path in named_files(stages)]
+        """Return names and contents (digests) of the models, maps and other files of stages."""
+        return [[path, self._contents[path]] for path in named_files(stages)]
 
     def seen(self, sources: list[InputSource]) -> list[Any]:
         """Return names, readers and contents of inputs: digests, or sizes and times without."""
