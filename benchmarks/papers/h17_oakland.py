@@ -43,7 +43,7 @@ from tables import choose, spread, table, values
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.features import FeaturePlan
 from pdal_stages.features.adaptive import curvature_threshold
-from pdal_stages.features.neighborhoods import LEAST_MEMBERS
+from pdal_stages.features.neighborhoods import RADIUS_MEMBERS
 
 CLASSES = {2: "Ground", 5: "Vegetation", 6: "Facade", 14: "Wire", 15: "Pole/trunk"}
 SIX = ("Verticality", "HeightRange", "Linearity", "Planarity", "Scattering", "SurfaceVariation")
@@ -144,7 +144,7 @@ def compute(
         members = np.rint(first[:, names.index("Density_s1")] * (4.0 / 3.0 * np.pi))
         curvature = first[:, names.index("SurfaceVariation_s1")]
         parts.setdefault("curvature", []).append(
-            np.where(members < LEAST_MEMBERS, 1.0 / 3.0, curvature)
+            np.where(members < RADIUS_MEMBERS, 1.0 / 3.0, curvature)
         )
         kept = {"kopt": "kopt", "ropt": "ropt", "copt": "regular"}
         kept |= {token: name for name, token in DIMENSIONALITY.items()}

@@ -1,6 +1,6 @@
 """Multi-scale features of point clouds: plan what to compute, compute it block by block.
 
-Importing this package is light; numba and the kernels are loaded when an engine is made.
+Importing this package is light: numba is imported when a kernel is first called.
 """
 
 from .engine import FeatureEngine, FeatureTable, compute_features, warmup

@@ -8,10 +8,10 @@ Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest 
 and takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of
 0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
 
-A candidate needs members that do not all coincide, three of them, among radii
-``neighborhoods.LEAST_MEMBERS``. Where none qualifies (a lone point, copies of one point) the
-largest is taken; its eigen-features then say "no structure". The curvature of a sphere with fewer
-is 1/3.
+A candidate needs members that do not all coincide: three of them where k is chosen
+(``moments.STRUCTURE_MEMBERS``), ten where a radius is (``neighborhoods.RADIUS_MEMBERS``). Where
+none qualifies (a lone point, copies of one point) the largest is taken; its eigen-features then say
+"no structure". The curvature of a sphere with fewer than ten is 1/3.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from ..base.jit import device, njit
 from ..base.threads import map_blocks
-from .moments import COINCIDENT, LEAST_MEMBERS, MOMENTS, M, finish
+from .moments import COINCIDENT, MOMENTS, STRUCTURE_MEMBERS, M, finish
 from .nearest_neighbors import (
     CROWD,
     FIRST2,
@@ -51,9 +51,10 @@ from .scale_selection import (
 )
 from .shape_distributions import Axes, Fitted, NeighborhoodGroup, Shapes, write_shapes
 
-#: Radius of the sphere whose curvature is looked at, meters [H17].
+#: Radius of the sphere whose curvature is looked at, meters [H17]. One of the radii of COPT_RADII:
+#: :func:`_curvature` takes it from among them.
 CURVATURE_RADIUS = 1.0
-#: Curvature where too few neighbors tell [H17].
+#: Curvature of a point with too few neighbors [H17].
 SCATTERED = 1.0 / 3.0
 
 #: ``copt``: first and last radius and step of regular points, meters [H17].
@@ -64,7 +65,7 @@ COPT_K = (10, 50)
 #: For searches that need neither bins nor a threshold.
 NOTHING_FITTED = Fitted()
 
-#: Queries computed at a time for a whole cloud.
+#: Queries computed at a time for a whole cloud; see ``engine.MOST_ROWS``.
 CHUNK = 4096
 
 #: Columns of :attr:`Search.choices`: the first candidate among radii and ks, the one behind the
@@ -119,7 +120,7 @@ class Search(NamedTuple):
     cap2: float  # and of those within this one as many as the last of `ks` says
     choices: np.ndarray  # (n, 4) int64: columns as in CHOICE
     curved: bool = False  # copt: radii where the point is regular, ks where it is scattered
-    least: int = LEAST_MEMBERS  # members that a sphere needs to have a curvature
+    least: int = STRUCTURE_MEMBERS  # members that a sphere needs to have a curvature
     threshold: float = math.nan  # curvature from which on a point is scattered
 
 
@@ -181,8 +182,8 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         """Return the curvature of the cloud's points, in the order of the grid, (n,) [H17]."""
         curvatures = np.empty(len(self.grid))
         none, radius = np.zeros(0, np.int64), np.array([CURVATURE_RADIUS])
-        choices = np.zeros((0, 4), np.int64)
-        search = Search(none, radius, none, 1.0, 1.0, choices, True, least)
+        choices, within2 = np.zeros((0, 4), np.int64), CURVATURE_RADIUS * CURVATURE_RADIUS
+        search = Search(none, radius, none, within2, within2, choices, True, least)
         self._for_all(
             lambda part: self.choose(search, self._part(part), curvature=curvatures[part]), threads
         )
@@ -259,7 +260,7 @@ def _by_number(ranges: dict[int, tuple[int, int]]) -> Search:
     all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
     ks = np.array(sorted(all_ks), np.int64)
     choices = [
-        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, LEAST_MEMBERS, 0]
+        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, STRUCTURE_MEMBERS, 0]
         for first, last in ranges.values()
     ]
     numbers = np.array(list(ranges), np.int64)
@@ -416,7 +417,7 @@ def _choose(search, j, curvature, scratch):
     first, end = search.choices[j, CHOICE.first], search.choices[j, CHOICE.end]
     members = search.choices[j, CHOICE.members]
     if search.curved and curvature >= search.threshold:
-        first, end, members = len(search.radii), len(scratch.ends), LEAST_MEMBERS
+        first, end, members = len(search.radii), len(scratch.ends), STRUCTURE_MEMBERS
     if search.choices[j, CHOICE.by_dimensionality]:
         return lowest_dimensionality(scratch.sums, first, end, members)
     return lowest_entropy(scratch.sums, first, end, members)

@@ -16,7 +16,8 @@ from ..base.jit import njit
 
 #: A share of 1.
 WHOLE = 65535
-#: Side of the cells whose points are counted for the density, meters.
+#: Side of the cells whose points are counted for the density, meters: large enough to hold points
+#: of sparse surveys (4 at 1/m²), small enough that most cells lie inside the cloud. Not tuned.
 CELL = 2.0
 
 
@@ -26,11 +27,11 @@ def cell_means(
     side: float,
     votes: bool = False,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """(cell of each point, means (cells, columns) over each cell and those around it).
+    """Return each point's cell (n,), and means (cells, columns) over each cell and those around it.
 
-    Two coordinates make columns of any height; they and `side`, one of :data:`SIDES`, are in
-    meters. `shares` (n, columns) are in 65535ths; with `votes` the largest column of each point
-    counts alone, as a whole.
+    Two coordinates make columns of any height; they and `side`, a power of two, are in meters.
+    `shares` (n, columns) are in 65535ths; with `votes` the largest column of each point counts
+    alone, as a whole.
     """
     keys, offsets = compact_keys(coordinates, side)
     order = np.argsort(keys)
@@ -60,8 +61,7 @@ def density(xyz: npt.NDArray[np.float64]) -> float:
     return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
 
 
-# ---- kernels
-# --------------------------------------------------------------------------------------------
+# ---- kernels ---------------------------------------------------------------------------------
 
 
 @njit

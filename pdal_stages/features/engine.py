@@ -25,13 +25,15 @@ if TYPE_CHECKING:
     from .fixed_radius import FixedRadius
 
 
-#: Rows of a block, whatever the memory allows: Ctrl-C waits for the blocks in work.
+#: Rows of a block, whatever the memory allows: large enough that a block's calls cost little, small
+#: enough that Ctrl-C, which waits for the blocks in work, comes at once. Not tuned.
 MOST_ROWS = 4096
-#: Fewest distinct queries of a block.
+#: Fewest distinct queries of a block: large enough that a block's calls cost little. Not tuned.
 LEAST_ROWS = 64
-#: Bytes of a row besides its features.
+#: Bytes of a row besides its features: coordinates, indices and groups take about 80, twice that
+#: where each point has a copy. Rounded up, not measured.
 ROW_BYTES = 200
-#: Bytes of a row for each neighborhood.
+#: Bytes of a row for each neighborhood: 14 moments, a curvature and a seed of 8 bytes each.
 NEIGHBORHOOD_BYTES = 130
 
 #: The queries' own dimensions: (m,) values each, or what gives those of a block's queries, named
@@ -282,8 +284,9 @@ class Run:
         new = np.ones(count, np.bool_)
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
         self.distinct = np.append(np.flatnonzero(new), count)
-        # Two results per thread may wait (map_blocks) and one is being computed; copies of points
-        # double a block.
+        # Two results per thread may wait (`ahead` of map_blocks) and one is being computed. A
+        # feature is a float32, and copies of points double a block. Four blocks or more for each
+        # thread let threads finish together.
         row = NEIGHBORHOOD_BYTES * len(self.plan.neighborhoods) + ROW_BYTES
         row += 8 * len(self.plan.names)
         budget = memory_mb * 2**20 / ((2 * self.threads + 1) * row)
@@ -407,8 +410,8 @@ def compute_features(
     neighborhoods : str or list of str
         Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
     feature_set : str or list of str
-        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``, ``D1`` ..
-        ``D4``) or single features. The defaults of both are those of
+        Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``he2017``,
+        ``A3``, ``D1`` .. ``D4``) or single features. The defaults of both are those of
         ``filters.multiscalefeatures``.
     dimensions : mapping of str to (m,) array
         The queries' own dimensions that the plan uses as features (HeightAboveGround for

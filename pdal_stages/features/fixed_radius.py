@@ -18,9 +18,11 @@ from .plan import FeaturePlan
 from .point_grid import CellGrid
 from .shape_distributions import Axes, NeighborhoodGroup, write_shapes
 
-#: Candidates are filled up to a multiple of this number, so that a vector loop leaves none over.
+#: Candidates are filled up to a multiple of this number, so that a vector loop leaves none over: a
+#: register of AVX-512 holds so many.
 LANES = 8
-#: Meters to the points with which they are filled up.
+#: Coordinates of the points with which they are filled up, meters: beyond any radius, and their
+#: squares are finite.
 FAR = 1e150
 
 
@@ -198,7 +200,7 @@ def copy_points(grid, first, last, candidates, at):
     """Copy the points first..last - 1 of the cloud to the candidates from `at` on."""
     x, y, z = grid.x, grid.y, grid.z
     px, py, pz, keys = candidates
-    # Unsigned: what may be negative is looked up with a detour.
+    # Unsigned: numba would make a branch for negative indices, which count from the end.
     first, at = np.uint64(first), np.uint64(at)
     for i in range(np.uint64(last) - first):
         px[at + i] = x[first + i]

@@ -4,10 +4,10 @@ Functions of eigenvalues are branch-free apart from selections, and inlined wher
 so a loop over arrays of moments is vectorized by LLVM; they set no fast-math flag, so a value does
 not depend on its place in the array or on the loop it is called from.
 
-The method is Jacobi's: unlike the closed form with arc cosines it keeps full accuracy where two
-eigenvalues nearly coincide (thin lines and planes, where the closed form loses half of the
-digits), it gives the eigenvector of the smallest eigenvalue at the cost of a few products, and
-square roots and divisions are vector instructions where arc cosines are not.
+Eigenvalues are computed by Jacobi's rotations. Unlike the closed form with arc cosines they keep
+full accuracy where two eigenvalues nearly coincide (thin lines and planes, where the closed form
+loses half of the digits), they give the eigenvector of the smallest eigenvalue at the cost of a few
+products, and square roots and divisions are vector instructions where arc cosines are not.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.jit import FAST, device, njit
-from .neighborhoods import LEAST_RADIUS
+from .neighborhoods import MIN_RADIUS
 from .registry import MOMENT_FEATURES, rows_of
 
 #: The logarithm of 2 in two parts, as fdlibm has it.
 LN2_HI = 6.93147180369123816490e-01
 LN2_LO = 1.90821492927058770002e-10
 
-#: l2 below this part of l1 counts as a line, whose normal is taken as the steepest perpendicular.
+#: l2 below this part of l1 counts as a line, whose normal is taken as the steepest perpendicular. A
+#: thousand times the error of :func:`eigen3`.
 LINE = 1e-12
 
 
@@ -207,11 +208,11 @@ BATCH = 256
 #: Columns of their scratch: not a power of two, whose rows would compete for the same cache lines.
 WIDTH = BATCH + 8
 
-#: Members that a neighborhood needs to have a structure.
-LEAST_MEMBERS = 3
+#: Members that a neighborhood needs to have a structure: three points make a plane.
+STRUCTURE_MEMBERS = 3
 
-#: A variance below this part of the mean squared distance to the query is rounding: the points
-#: coincide.
+#: A variance below this part of the mean squared distance to the query is rounding (1e-16 for each
+#: of some hundred points): the points coincide.
 COINCIDENT = 1e-13
 
 _MOST = np.int64(2**63 - 1)
@@ -293,7 +294,7 @@ def write_eigen_features(values, j, n, l1, l2, l3, nz):
     all coincide, features are 0 and the surface variation is 1/3 [H17].
     """
     total = l1 + l2 + l3
-    real = (n >= LEAST_MEMBERS) & (total > 0.0)
+    real = (n >= STRUCTURE_MEMBERS) & (total > 0.0)
     scale = 1.0 / (total if real else 1.0)
     e1, e2, e3 = l1 * scale, l2 * scale, l3 * scale
     inverse = 1.0 / (l1 if real else 1.0)
@@ -307,7 +308,7 @@ def write_eigen_features(values, j, n, l1, l2, l3, nz):
     values[ROW.Eigenentropy, j] = entropy if real else 0.0
     values[ROW.EigenvalueSum, j] = total if real else 0.0
     values[ROW.SurfaceVariation, j] = e3 if real else 1.0 / 3.0
-    values[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= LEAST_MEMBERS else 0.0
+    values[ROW.Verticality, j] = max(1.0 - abs(nz), 0.0) if n >= STRUCTURE_MEMBERS else 0.0
 
 
 @device(forceinline=True)
@@ -326,7 +327,7 @@ def _center(moments, heights, count, m, values):
         m[C.XY, j] = moments[M.SXY, j] * inverse - mx * my
         m[C.XZ, j] = moments[M.SXZ, j] * inverse - mx * mz
         m[C.YZ, j] = moments[M.SYZ, j] * inverse - my * mz
-        # Not read from the moments again, which LLVM must fear to overlap with what is written.
+        # Later loops read the count from here: LLVM cannot exclude that writing changes `moments`.
         m[C.COUNT, j] = n if apart else 0.0
         values[ROW.HeightRange, j] = moments[M.HIGH, j] - moments[M.LOW, j] if n > 0.0 else 0.0
         values[ROW.HeightStd, j] = math.sqrt(max(zz, 0.0)) if apart else 0.0
@@ -364,7 +365,7 @@ def finish(table, volume, heights, few, copies, columns, out):
         moments = table[:, start : start + count]
         _center(moments, heights[start:], count, m, values)
         for j in range(count):
-            r = max(moments[M.RADIUS, j], LEAST_RADIUS) if volume == 0.0 else 1.0
+            r = max(moments[M.RADIUS, j], MIN_RADIUS) if volume == 0.0 else 1.0
             values[ROW.Radius, j] = moments[M.RADIUS, j]
             values[ROW.Density, j] = moments[M.N, j] / (
                 4.0 / 3.0 * math.pi * r * r * r if volume == 0.0 else volume
@@ -374,13 +375,13 @@ def finish(table, volume, heights, few, copies, columns, out):
             l1, l2, l3, nx, ny, nz = eigen3(
                 m[C.XX, j], m[C.XY, j], m[C.XZ, j], m[C.YY, j], m[C.YZ, j], m[C.ZZ, j]
             )
-            real = 1.0 if n >= LEAST_MEMBERS else 0.0
+            real = 1.0 if n >= STRUCTURE_MEMBERS else 0.0
             values[ROW.NormalX, j] = real * nx
             values[ROW.NormalY, j] = real * ny
             values[ROW.NormalZ, j] = real * nz
             write_eigen_features(values, j, n, l1, l2, l3, nz)
         for j in range(count):
-            if moments[M.N, j] < LEAST_MEMBERS:
+            if moments[M.N, j] < STRUCTURE_MEMBERS:
                 few[0] += copies[start + j]
         for f in range(len(columns)):
             if columns[f] >= 0:

@@ -23,10 +23,12 @@ import numpy as np
 
 from ..base.jit import device, njit
 
-#: A leaf holds at most this many points.
+#: A leaf holds at most this many points: enough that boxes take 4 to 8 bytes a point, few enough
+#: that most of a leaf's points are near. Not tuned.
 LEAF = 24
 
-#: Room for a depth-first traversal.
+#: Room for a depth-first traversal, which needs 29 entries for 2**32 points: one a level, and one
+#: more.
 STACK = 80
 
 
@@ -153,7 +155,10 @@ def gap2(box, boxes, n):
 
 @device
 def enough2(tree, box, need):
-    """Return a squared distance from the point `box` within which `need` points lie, or all."""
+    """Return a squared distance from a query within which `need` points lie, or all.
+
+    `box` is that of the one query, whose corners are equal.
+    """
     boxes = tree.boxes
     node, count = 0, len(tree.perm)
     for _ in range(tree.depth):
@@ -168,19 +173,19 @@ def enough2(tree, box, need):
 
 
 @device
-def gather(tree, box, reach2, copies, limit, candidates):
+def gather(tree, box, reach2, most_equal, limit, candidates):
     """Collect the points within sqrt(`reach2`) of `box`; return their number, or -1 above `limit`.
 
     `candidates` has room for them: arrays x, y, z, at (positions in the cloud) and a stack.
 
-    Of points that all coincide at most about `copies` are taken, a leaf's worth more where they
+    Of points that all coincide about `most_equal` are taken, up to a leaf's more where they
     share leaves with others.
     """
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     x0, y0, z0, x1, y1, z1 = box
     cx, cy, cz, ci = candidates.x, candidates.y, candidates.z, candidates.at
     stack = candidates.stack
-    # Unsigned: what may be negative is looked up with a detour.
+    # Unsigned: numba would make a branch for negative indices, which count from the end.
     count, step = np.uint64(0), np.uint64(1)
     top = push(stack, 0, 0, 0, len(perm), tree.depth)
     while top > 0:
@@ -192,8 +197,8 @@ def gather(tree, box, reach2, copies, limit, candidates):
         same = (
             boxes[n, 0] == boxes[n, 3] and boxes[n, 1] == boxes[n, 4] and boxes[n, 2] == boxes[n, 5]
         )
-        if same and hi - lo > copies:
-            hi = lo + copies
+        if same and hi - lo > most_equal:
+            hi = lo + most_equal
             depth = 0
         if depth == 0:
             if np.int64(count) + (hi - lo) > limit:
@@ -215,24 +220,31 @@ def gather(tree, box, reach2, copies, limit, candidates):
     return np.int64(count)
 
 
-#: Queries that share one set of candidates.
+# The numbers down to ROOM change how long a search takes, never what it finds. Only their order of
+# magnitude matters; none is tuned.
+
+#: Queries that share one set of candidates: enough to share the traversal of the tree, few enough
+#: that most candidates are near to each of them.
 GROUP = 8
 
-#: Bins of squared distance; behind them what lies beyond the reach.
+#: Bins of squared distance; behind them what lies beyond the reach. Enough that a bin holds a few
+#: of 50 to 100 neighbors, few enough that the counts stay in the fastest cache.
 BINS = 64
 
-#: First guess of the squared reach, square meters.
+#: First guess of the squared reach, square meters: the order of 50 neighbors in a survey of today.
 FIRST2 = 1.0
-#: Least squared reach, square meters.
+#: Least squared reach, square meters: more than 0, which never grows when it is doubled.
 LEAST2 = 1e-6
-#: The next guess is larger by this factor than what the last queries needed.
+#: The next guess is larger by this factor than what the last queries needed, so that most guesses
+#: are large enough at once.
 MORE = 1.2
 
-#: A search for `need` neighbors that meets more than CROWD * need + ROOM candidates looks closer.
+#: A search for `need` neighbors that meets more than CROWD * need + ROOM candidates looks closer:
+#: the reach was guessed far too large.
 CROWD = 4
 ROOM = 256
 
-#: Squared meters too small to divide by.
+#: Squared meters too small to divide by: BINS / TINY is finite.
 TINY = 1e-200
 
 
@@ -323,14 +335,14 @@ def gather_near(tree, queries, lo, hi, wanted, reach2, near):
     need, within2, cap2 = wanted.need, wanted.within2, wanted.cap2
     room = len(near.x)
     limit = room if within2 > 0.0 else min(room, CROWD * need + ROOM)
-    copies = need if within2 == 0.0 else len(tree.perm)
+    most_equal = need if within2 == 0.0 else len(tree.perm)
     while True:
         box = bounding_box(queries.x, queries.y, queries.z, queries.order, lo, hi)
         side = max(box[3] - box[0], box[4] - box[1], box[5] - box[2])
-        if hi - lo > 1 and side * side > 4.0 * reach2:
+        if hi - lo > 1 and side * side > 4.0 * reach2:  # more than two reaches apart
             hi = lo + 1
             continue
-        count = gather(tree, box, reach2, copies, limit, near)
+        count = gather(tree, box, reach2, most_equal, limit, near)
         if count >= need or (count >= 0 and reach2 >= cap2):
             return hi, count, reach2
         if count >= 0:

@@ -1,8 +1,12 @@
-"""Neighborhood tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``copt``) and presets.
+"""Tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``rdim``, ``copt``) and presets.
 
 One token is used alike in options, dimension suffixes, model files and documents. Sources: [B16]
 Blomley, Jutzi, Weinmann 2016, doi:10.5194/isprsannals-III-3-169-2016; [W18] Weinmann, Blomley,
 Weinmann, Jutzi 2018 (DGPF); [H17] He, Chen, Wang, Liu 2017, ISPRS Archives XLII-2/W7.
+
+A new kind of neighborhood has its word in ``_TOKEN``, ``_KNOWN`` and ``_CURE``, its parameters in
+``_DEFAULTS`` and ``_parse_adaptive``, its ``reach`` below, and its search in
+``adaptive._searches``, which finds it among nested neighborhoods.
 """
 
 from __future__ import annotations
@@ -34,24 +38,28 @@ BY_RADIUS = ("ropt", "rdim")
 #: Kinds whose size is chosen point by point.
 ADAPTIVE = ("kopt", *BY_RADIUS, "copt")
 _DEFAULTS = {"kopt": KOPT_DEFAULT, **dict.fromkeys(BY_RADIUS, ROPT_DEFAULT), "copt": ()}
-#: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt`` with
-#: fewer are not candidates, and the curvature is 1/3. The paper gives no number; with ten, its c_t
-#: of 0.03 and the counts of its Table 1 come out (docs/papers.md), with three they do not.
-LEAST_MEMBERS = 10
+#: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt``, ``rdim`` and
+#: ``copt`` with fewer are not candidates, and the curvature is 1/3. The paper gives no number; with
+#: ten, its c_t of 0.03 and the counts of its Table 1 come out (docs/papers.md), with three they do
+#: not.
+RADIUS_MEMBERS = 10
 COPT_REACH = 3.0  # meters: the cap of the scattered branch, the largest radius copt looks at [H17]
+#: Largest k: 100 times the largest of [B16]; the candidates of a search begin with 52 bytes for
+#: each of 4 k, so with 2 MB a thread.
 MAX_K = 10_000
-#: Nearest neighbors whose surface a point is given, where neighbors are summed up by their
-#: surfaces.
+#: Nearest neighbors that make the surface of a point, of which the group ``surfaces`` tells. The
+#: fewest of ``kopt`` [B16]; not tuned.
 AROUND = 10
-#: Density takes smaller radii as this, meters: copies of one point lie at a distance of 0.
-LEAST_RADIUS = 0.001
-MIN_RADIUS = 0.001  #: meters
-MAX_RADIUS = 100_000.0  #: meters
+#: Smallest radius, meters: the step of most surveys' coordinates. Density uses it in place of a
+#: smaller distance to the k-th neighbor, which is 0 among copies of a point.
+MIN_RADIUS = 0.001
+MAX_RADIUS = 100_000.0  #: meters: wider than any tile or file; not tuned
 #: Neighborhoods of one plan: a model file of a few kB must not ask for hours of work.
 MOST = 64
 
 #: Sides of cells of an absolute grid that can be asked for, meters: powers of two, so that corners
-#: are exact.
+#: are exact. From the default voxel of models, 0.125 m, to 64 m, which need a halo of 128; not
+#: tuned.
 SIDES = tuple(2.0**k for k in range(-3, 7))
 
 _KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "rdim", "copt", *PRESETS)

@@ -16,7 +16,7 @@ from . import return_features
 from .neighborhoods import (
     AROUND,
     BY_RADIUS,
-    LEAST_MEMBERS,
+    RADIUS_MEMBERS,
     Neighborhood,
     parse_neighborhoods,
     preset_dimensions,
@@ -33,11 +33,13 @@ from .registry import (
 WITH_DIMENSIONS = ("all", "geometric")
 
 
-#: Neighborhoods of the function and the stage where none are named.
+#: Default neighborhoods of ``compute_features`` and of ``filters.multiscalefeatures``: those of
+#: [B16].
 DEFAULT_NEIGHBORHOODS = ("c1", "c2", "c3", "c5", "kopt")
-#: Features of these.
+#: Their default features: all but the shape distributions, which cost most.
 DEFAULT_FEATURES = ("covariance", "geometric")
-#: Halo of neighborhoods whose size is a number of points, meters: see :attr:`FeaturePlan.halo_m`.
+#: Halo of neighborhoods whose size is a number of points, meters: it holds 100 of them, the most of
+#: ``kopt``, down to 0.15 points a square meter; see :attr:`FeaturePlan.halo_m`.
 POINTS_HALO = 15.0
 
 
@@ -70,8 +72,9 @@ class FeaturePlan:
     features: tuple[str, ...]
     #: The points' own dimensions used as features, after all others.
     dimensions: tuple[str, ...] = ()
-    #: Points a radius of ``ropt`` and ``copt`` must hold, and the sphere of a curvature [H17].
-    least_members: int = LEAST_MEMBERS
+    #: Points a radius of ``ropt``, ``rdim`` and ``copt`` must hold, and the sphere of a curvature
+    #: [H17].
+    least_members: int = RADIUS_MEMBERS
 
     def __post_init__(self) -> None:
         """Refuse a plan with unusable names when it is made."""
@@ -91,8 +94,8 @@ class FeaturePlan:
         neighborhoods : str or iterable of str
             Presets and tokens, e.g. ``"weinmann2018"`` or ``"c1, s2, kopt"``.
         feature_set : str or iterable of str
-            Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``A3``,
-            ``D1`` .. ``D4``), features (``Linearity``) or features of one neighborhood
+            Groups (``all``, ``covariance``, ``geometric``, ``shapes``, ``surfaces``, ``he2017``,
+            ``A3``, ``D1`` .. ``D4``), features (``Linearity``) or features of one neighborhood
             (``Linearity_c1``). Only what is named is computed; columns come in the order of the
             registry, neighborhood by neighborhood.
         dimensions : str or iterable of str
@@ -154,7 +157,9 @@ class FeaturePlan:
         """Edge of the grid's cells in meters, a power of two.
 
         It follows from the largest radius alone: 1 m for radii from 0.75 to 20 m, finer below,
-        coarser above.
+        coarser above. So a radius spans 20 cells at most, as each costs a step of the search, and
+        0.75 at least, as large cells hold many points that are no members; 2**-8 m is 4 mm, which
+        hold a point or none. None of these is tuned.
         """
         radii = [n.parameters[0] for n in self.neighborhoods if n.fixed]
         largest = max(radii, default=1.0)
@@ -181,6 +186,7 @@ class FeaturePlan:
         for columns in self.layout:
             if any(name in columns.at for name in SURFACE_FEATURES):
                 steps = math.sqrt(columns.neighborhood.parameters[0]) + math.sqrt(AROUND)
+                # POINTS_HALO holds 100; a distance grows with the root of the number of points.
                 reach = max(reach, POINTS_HALO * steps / math.sqrt(100))
         return reach + self.cell
 
@@ -202,7 +208,7 @@ class FeaturePlan:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
         """Return the plan that :meth:`to_dict` described; OptionError for unknown words."""
-        members = data.get("least_members", LEAST_MEMBERS)
+        members = data.get("least_members", RADIUS_MEMBERS)
         least = checks.whole("'least_members' of a feature plan", members, 3, 100)
         parsed = tuple(parse_neighborhoods(data["neighborhoods"]))
         return cls(parsed, tuple(data["features"]), tuple(data["dimensions"]), least)

@@ -18,16 +18,16 @@ from ..base.grid import begins_run, cell_numbers, compact_keys
 
 #: Coordinates beyond this many meters are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
-
-#: Values behind the last coordinate that kernels may read.
-SPARE = 8
+#: Largest coordinate in float32, meters: from there on its steps are 8 mm and more, too coarse for
+#: the features of small neighborhoods.
+FLOAT32_LIMIT = 1e5
 
 
 class GridTables(NamedTuple):
     """A sorted cloud and its occupied cells as kernels take them; see :class:`CellGrid`."""
 
     cell: float
-    x: np.ndarray  # with spare values behind, as y and z
+    x: np.ndarray  # (n,) float64, as y and z
     y: np.ndarray
     z: np.ndarray
     cell_ix: np.ndarray
@@ -45,8 +45,7 @@ class CellGrid:
     #: (n,) int32 or int64: ``order[i]`` is the index, in the cloud as it was given, of the i-th
     #: sorted point.
     order: np.ndarray
-    #: (3, n + SPARE): sorted coordinates; kernels that copy whole vectors may read (and ignore)
-    #: what lies behind the last.
+    #: (3, n) float64: sorted coordinates, meters.
     xyz: np.ndarray
     #: Column number of each occupied cell (m,) and its first point (m + 1,); cells ascend by row,
     #: then column.
@@ -63,22 +62,22 @@ class CellGrid:
     @property
     def x(self) -> np.ndarray:
         """Sorted x, meters."""
-        return self.xyz[0, : len(self)]
+        return self.xyz[0]
 
     @property
     def y(self) -> np.ndarray:
         """Sorted y, meters."""
-        return self.xyz[1, : len(self)]
+        return self.xyz[1]
 
     @property
     def z(self) -> np.ndarray:
         """Sorted z, meters."""
-        return self.xyz[2, : len(self)]
+        return self.xyz[2]
 
     @property
     def coordinates(self) -> np.ndarray:
         """The sorted cloud (n, 3), a view."""
-        return self.xyz[:, : len(self)].T
+        return self.xyz.T
 
     def tables(self) -> GridTables:
         """Return the grid as kernels take it."""
@@ -123,7 +122,7 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
         raise StageError(
             f"'{what}' has coordinates beyond {LIMIT:g} m", found=f"{far} of {len(array)} points"
         )
-    if array.dtype == np.float32 and largest > 1e5:
+    if array.dtype == np.float32 and largest > FLOAT32_LIMIT:
         raise StageError(
             f"'{what}' is float32, too coarse for coordinates of this size",
             found=f"up to {largest:.0f} m, where float32 has steps of "
@@ -144,16 +143,16 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
     starts = np.flatnonzero(begins_run(key[order]))
     del key
     ix, iy = (cell_numbers(xyz[order[starts], axis], cell) for axis in range(2))
-    spare = np.zeros((3, n + SPARE))
+    ordered = np.empty((3, n))
     for k in range(3):
-        np.take(xyz[:, k], order, out=spare[k, :n], mode="clip")  # "raise" would make a copy
-    spare += 0.0  # -0.0 becomes 0.0: equal coordinates are equal bits
+        np.take(xyz[:, k], order, out=ordered[k], mode="clip")  # "raise" would make a copy
+    ordered += 0.0  # -0.0 becomes 0.0: equal coordinates are equal bits
     cell_start = np.concatenate((starts, [n])).astype(np.int64)
     rows = np.flatnonzero(begins_run(iy))
     return CellGrid(
         cell=float(cell),
         order=order,
-        xyz=spare,
+        xyz=ordered,
         cell_ix=ix,
         cell_start=cell_start,
         row_iy=iy[rows],

@@ -1,8 +1,12 @@
 """The registry of features: names, groups, units and definitions, in the order of the columns.
 
-A new feature is one entry here and its value in ``features/moments.py``; what goes with it is in
-CONTRIBUTING.md, "Checklists". Columns, groups and kernel rows follow. Model files name their
-features one by one, so none of them needs to be trained again.
+A new feature is one entry here and its value in ``features/moments.py``, without which its column
+holds whatever was in memory; what goes with it is in CONTRIBUTING.md, "Checklists". Columns, groups
+and kernel rows follow. Model files name their features one by one, so none of them needs to be
+trained again.
+
+[B16], [W18] and [H17] are cited in :mod:`.neighborhoods`; [HWS16] is Hackel, Wegner, Schindler
+2016, ISPRS Annals III-3, 177-184.
 """
 
 from __future__ import annotations
@@ -16,9 +20,11 @@ from ..base.errors import OptionError, suggest
 from .neighborhoods import ADAPTIVE, Neighborhood, split_words
 
 #: Raise it when values of existing features change: models that were trained with another version
-#: then warn.
+#: then warn. tests/test_algorithm_versions.py compares values of all kinds of neighborhoods and
+#: features with stored ones; run as a program, it stores those of the new version.
 ALGORITHM_VERSION = 1
-#: Bins of a shape distribution's histogram.
+#: Bins of a shape distribution's histogram [B16 3.2.2]. With another number, models and files of
+#: thresholds that have shapes are refused and must be made again.
 SHAPE_BINS = 10
 #: Groups whose features are computed from the moments of a neighborhood, by ``moments.finish``.
 _OF_MOMENTS = ("covariance", "geometric", "relative")

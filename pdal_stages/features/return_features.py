@@ -30,7 +30,8 @@ FLAGS = {
     "EarlierReturn": "a later return of the pulse exists (ReturnNumber < NumberOfReturns)",
 }
 
-#: The word for all flags, of the point and at three scales.
+#: The word for all flags, of the point and at three scales: boxes of 3 and 6 m, columns of 6 m. Not
+#: tuned.
 GROUP = "returns"
 SCALES = ("", "_box1", "_box2", "_column2")
 NAMES = tuple(flag + scale for scale in SCALES for flag in FLAGS)

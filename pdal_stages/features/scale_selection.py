@@ -1,9 +1,10 @@
-"""The best of nested neighborhoods: the one with the lowest eigenentropy [B16 eq. 1-2].
+"""The best of nested neighborhoods: that of lowest eigenentropy [B16 eq. 1-2] or dimensionality.
 
-It is found in two steps. A vectorized closed form estimates all entropies to 1e-7; those within
-``MARGIN`` of the lowest are computed again by the exact method of the features. Entropies that
-then lie within ``TIE`` of each other count as equal, and the smallest neighborhood wins: in a
-perfect plane or line rounding noise would decide otherwise.
+The lowest eigenentropy is found in two steps. A vectorized closed form estimates all entropies to
+1e-7; those within ``MARGIN`` of the lowest are computed again by the exact method of the features.
+Entropies that then lie within ``TIE`` of each other count as equal, and the smallest neighborhood
+wins: in a perfect plane or line rounding noise would decide otherwise. Entropies of dimensionality
+are all computed by the exact method.
 """
 
 from __future__ import annotations
@@ -75,8 +76,10 @@ def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
     ``NEVER`` where the trace is not above `noise`.
 
     With unit trace, the eigenvalues are 1/3 + 2 p cos(phi + 2 pi i / 3), cos(3 phi) = r. For r >=
-    0 the squared sine of phi is (1 - r) times a smooth function of r, here a polynomial of degree
-    8 (fitted at Chebyshev nodes, error 7e-10); r < 0 is its mirror image.
+    0 the squared sine of phi is (1 - r) times a smooth function g of r, here a polynomial of degree
+    8 (error 7e-10); r < 0 is its mirror image. ``Chebyshev.fit(r, g(r), 8, domain=[0, 1])`` of
+    numpy.polynomial, g(r) = sin(arccos(r) / 3)^2 / (1 - r) at 20 or more Chebyshev nodes of 0..1,
+    gives the coefficients to 1e-11.
     """
     trace = xx + yy + zz
     real = trace > noise

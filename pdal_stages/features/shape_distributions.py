@@ -17,7 +17,7 @@ are 0, as they are. The angle is 0 where b or c coincides with a.
 
 A new metric is an entry of ``registry.SHAPES``, a line in :func:`measure` and an entry of
 :data:`COMPARABLE`; columns, groups and the size of every array follow. Models that were
-trained with shapes before hold no thresholds of it and must be trained again.
+trained with shapes before hold no thresholds of it and are refused: they must be trained again.
 
 **No order matters.** Pull i of a neighborhood draws from a counter-based hash of (seed, the query's
 float64 coordinates, the neighborhood's token, i) and members come in a canonical order, so counts
@@ -97,15 +97,14 @@ class ShapeBins:
 
     Parameters
     ----------
-    thresholds : mapping of str to (5, 9) array
-        Neighborhood token -> ascending inner thresholds of A3, D1, D2, D3, D4, in radians and
-        meters.
+    thresholds : mapping of str to (METRICS, INNER) array
+        Neighborhood token -> ascending inner thresholds of each metric, in radians and meters.
 
     Raises
     ------
     OptionError
-        Where thresholds are not 5 x 9 finite, ascending numbers, angles outside 0..pi or lengths
-        below 0.
+        Where thresholds are not METRICS x INNER finite, ascending numbers, angles outside 0..pi or
+        lengths below 0.
     """
 
     def __init__(self, thresholds: Mapping[str, Any]) -> None:
@@ -115,18 +114,18 @@ class ShapeBins:
 
     @classmethod
     def fit(cls, values: Mapping[str, np.ndarray]) -> ShapeBins:
-        """Return thresholds at the 10 %, 20 %, ... 90 % quantiles of sample values.
+        """Return thresholds that cut sample values into SHAPE_BINS parts of equal size.
 
         A threshold is one of the values, so values that often repeat (areas of 0 on a line) make
-        equal thresholds and empty bins, and nothing else does. `values` are the pulls (m, 5, 255)
-        of m sample neighborhoods by neighborhood token, in the comparable form of
+        equal thresholds and empty bins, and nothing else does. `values` are the pulls (m, METRICS,
+        PULLS) of m sample neighborhoods by neighborhood token, in the comparable form of
         :func:`shape_distributions.shape_values`. NaN (neighborhoods without points) is left out;
         where nothing is left, the thresholds are 0.
         """
         result = {}
         for token, sample in values.items():
             rows = np.zeros((len(METRIC_NAMES), INNER))
-            rows[0] = -1.0  # an angle of 0
+            rows[ROW.A3] = -1.0  # an angle of 0
             for m in range(len(METRIC_NAMES)):
                 column = np.asarray(sample)[:, m, :].ravel()
                 column = np.sort(column[np.isfinite(column)]).astype(np.float64)
@@ -139,7 +138,7 @@ class ShapeBins:
         return cls(result)
 
     def thresholds(self, token: str) -> np.ndarray:
-        """Return thresholds (metrics, 9) float64 of one neighborhood, in radians and meters."""
+        """Return thresholds (METRICS, INNER) float64 of one neighborhood, in radians and meters."""
         try:
             return self._thresholds[token].copy()
         except KeyError:
@@ -150,12 +149,12 @@ class ShapeBins:
             ) from None
 
     def comparable(self, token: str) -> np.ndarray:
-        """Return thresholds as the kernels compare them: (metrics, 9) float32."""
+        """Return thresholds as the kernels compare them: (METRICS, INNER) float32."""
         rows = zip(METRIC_NAMES, self.thresholds(token), strict=True)
         return np.array([COMPARABLE[name][0](row) for name, row in rows], np.float32)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return ``{"c1": {"A3": [9 numbers], "D1": ...}, ...}``, JSON-able and exact."""
+        """Return ``{"c1": {"A3": [INNER numbers], "D1": ...}, ...}``, JSON-able and exact."""
         return {
             token: {
                 name: [float(v) for v in row] for name, row in zip(METRIC_NAMES, rows, strict=True)
@@ -182,7 +181,7 @@ class ShapeBins:
 
 
 def _check(token: str, rows: Any) -> np.ndarray:
-    """Return thresholds as an array (metrics, 9); OptionError where they cannot be."""
+    """Return thresholds as an array (METRICS, INNER); OptionError where they cannot be."""
     try:
         array = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError):

@@ -21,8 +21,11 @@ from ..base.grid import compact_keys
 from ..base.hashing import hash_rows
 from ..base.jit import njit
 
-SMALLEST = 1e-4  #: side of a voxel, meters
-LARGEST = 5.0  #: side of a voxel, meters
+#: Smallest side of a voxel, meters: finer than the steps of most coordinates, so that a voxel holds
+#: copies of one point alone.
+SMALLEST = 1e-4
+#: Largest side of a voxel, meters: the largest radius of the presets. Not tuned.
+LARGEST = 5.0
 
 
 def check_side(side: float) -> float:
@@ -60,27 +63,27 @@ def represent(
     side: float,
     values: Iterable[npt.ArrayLike] = (),
     rows: npt.NDArray[np.int64] | None = None,
-    there: npt.NDArray[np.int64] | None = None,
+    present: npt.NDArray[np.int64] | None = None,
 ) -> Representatives | None:
     """Return representatives of a cloud's points, or None where each stands for itself.
 
     `side` is a voxel's, in meters as `xyz`; 0 for none. `values` (n,) are what else is known of
     the points, and decide between points of the same coordinates. `rows` (m,) are the points asked
-    for; the others are represented too, but are not listed. `there` (k,) are the points that are
+    for; the others are represented too, but are not listed. `present` (k,) are the points that are
     there at all, `rows` among them (default: all n). Both ascend.
     """
     check_side(side)
     small = np.int32 if len(xyz) < 2**31 else np.int64
-    by = _one_each(xyz, side, values, there) if side and len(xyz) else None
-    if by is None and there is None:
+    by = _one_each(xyz, side, values, present) if side and len(xyz) else None
+    if by is None and present is None:
         return None
     is_kept = np.zeros(len(xyz), np.bool_)
-    is_kept[there if by is None else by] = True  # by itself for points that are not there
-    if there is not None:
+    is_kept[present if by is None else by] = True  # by itself for points that are not there
+    if present is not None:
         gone = np.ones(len(xyz), np.bool_)
-        gone[there] = False
+        gone[present] = False
         is_kept[gone] = False
-        rows = there if rows is None else rows
+        rows = present if rows is None else rows
     kept = np.flatnonzero(is_kept)
     place: npt.NDArray[Any] = np.cumsum(is_kept, dtype=small)
     np.subtract(place, 1, out=place)
@@ -100,17 +103,17 @@ def _one_each(
     xyz: npt.NDArray[np.float64],
     side: float,
     values: Iterable[npt.ArrayLike],
-    there: npt.NDArray[np.int64] | None,
+    present: npt.NDArray[np.int64] | None,
 ) -> npt.NDArray[Any] | None:
     """Return the point (n,) that stands for each; None where no voxel holds two.
 
     Points that are not there stand for themselves.
     """
     keys, _ = compact_keys(xyz, side)
-    if there is None:
+    if present is None:
         order = np.argsort(keys)
     else:
-        order = there[np.argsort(keys[there])]
+        order = present[np.argsort(keys[present])]
     by = np.arange(len(xyz), dtype=np.int32 if len(xyz) < 2**31 else np.int64)
     single = choose_one_each(order, keys[order], hash_rows([*xyz.T, *values], 0), by)
     return None if single else by
