@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from .cells import MM
+from .cells import THOUSANDTHS
 from .results import ObjectSettings
 from .roofs import roof_planes
 
@@ -26,11 +26,14 @@ REASONS = (
 
 @dataclass(frozen=True)
 class CheckRules:
-    """Limits beyond which an object is to be checked; lengths in meters, areas in m2."""
+    """Limits beyond which an object is to be checked; lengths in meters, areas in m2.
+
+    Values without a reason are not tuned.
+    """
 
     min_reliability: float = 0.7  #: mean of the object's points
     min_building_area: float = 10.0  #: sheds are kept, yet often something else
-    min_building_width: float = 2.0  #: side of the square that it must hold; wires do not
+    min_building_width: float = 2.0  #: side of the square that it must hold; no wire or wall does
     min_building_height: float = 2.2  #: of the ridge: a door's height
     facade_to_area: float = 50.0  #: larger buildings may hide their walls from the laser
     min_facade: float = 1.5  #: height between points of a cell at the edge that shows a wall
@@ -44,6 +47,10 @@ class CheckRules:
 
 
 RULES = CheckRules()
+#: Percentile of heights at a building's edge that is its eave; not tuned.
+EAVE = 25
+#: Percentile of a building's heights that is its ridge: antennas and chimneys may be above it.
+RIDGE = 98
 #: Width of the pieces of wires whose means form a span's line, meters.
 PIECE = 2.0
 #: Wires that spread no wider than this across their direction lie side by side, meters: a line of
@@ -82,8 +89,8 @@ class ObjectCells(NamedTuple):
     def describe(self, measures: dict[str, Any], reasons: dict[str, bool]) -> dict[str, Any]:
         """Return the measures with points, mean reliability (NaN if unknown) and verdict."""
         rated = int(self.rated.sum())
-        reliability = float(self.reliability.sum()) / rated / MM if rated else math.nan
-        reasons["unsure points"] = reliability < RULES.min_reliability
+        reliability = float(self.reliability.sum()) / rated / THOUSANDTHS if rated else math.nan
+        reasons = {**reasons, "unsure points": reliability < RULES.min_reliability}
         text = ", ".join(reason for reason, holds in reasons.items() if holds)
         verdict = {"verdict": CHECK if text else SURE, "reason": text}
         return {**measures, "points": int(self.points.sum()), "reliab": reliability, **verdict}
@@ -98,11 +105,11 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
     square = np.ones((math.ceil(RULES.min_building_width / size),) * 2, bool)
     planes, slope, planar = roof_planes(raster, size)
     facade = np.mean(np.nan_to_num(cells.z[edge] - cells.low[edge]) >= RULES.min_facade)
-    ridge = float(np.percentile(above, 98))
+    ridge = float(np.percentile(above, RIDGE))
     return cells.describe(
         {
             "area": area,
-            "h_eave": float(np.percentile(above[edge], 25)),
+            "h_eave": float(np.percentile(above[edge], EAVE)),
             "h_ridge": ridge,
             "ground": ground,
             "slope": slope,

@@ -42,13 +42,16 @@ CLASSES: dict[Kind, tuple[int, ...]] = {
 }
 #: Width of a cell of the ground, in cells of the other kinds: ground below objects is sparse.
 GROUND_WIDTH = 2
-#: Heights are stored in millimeters, reliabilities in thousandths.
+#: Heights are stored in millimeters.
 MM = 1000.0
-#: Mean points per cell below which cells are too small: roofs fall apart (see `sparse_kind`).
+#: Reliabilities are stored in thousandths.
+THOUSANDTHS = 1000.0
+#: Mean points of the cells that hold any below which cells are too small: roofs fall apart (see
+#: `sparse_kind`). One point a cell at random gives 1.58, and leaves 37 % of the cells empty.
 MIN_POINTS_PER_CELL = 1.6
-#: Cells of a kind from which that mean is computed; fewer say little.
+#: A kind with no more cells does not decide whether cells are too small; not tuned.
 MIN_CELLS = 100
-#: Most columns west of zero that a key holds.
+#: Smallest column that a key can hold.
 _WESTMOST = 2 - 2**31
 #: Columns of records: type, and the function that joins two records of one cell.
 _COLUMNS: dict[str, tuple[type, np.ufunc]] = {
@@ -93,7 +96,7 @@ class Cells:
 
     size: float  #: side of a cell, meters; cells of the ground are `GROUND_WIDTH` times as wide
     key: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  #: (n,)
-    #: (n,) arrays by name: count, low, high, sum, reliability, rated (see the table in the source)
+    #: (n,) arrays by name: count, low, high, sum, reliability, rated (see `_COLUMNS`)
     columns: dict[str, NDArray] = field(
         default_factory=lambda: {name: np.empty(0, kind) for name, (kind, _) in _COLUMNS.items()}
     )
@@ -149,11 +152,11 @@ class Cells:
         key, height = point_keys(x[used], y[used], kinds[used], size), height.astype(np.int32)
         known = np.full(len(key), np.nan) if reliability is None else np.asarray(reliability)[used]
         rated = ~np.isnan(known)
-        thousandths = np.rint(np.clip(np.where(rated, known, 0.0), 0.0, 1.0) * MM).astype(np.int64)
+        thousandths = np.rint(np.clip(np.where(rated, known, 0.0), 0.0, 1.0) * THOUSANDTHS)
         columns = {
             "count": np.ones(len(key), np.int32),
             **dict.fromkeys(("low", "high", "sum"), height),
-            "reliability": thousandths,
+            "reliability": thousandths.astype(np.int64),
             "rated": rated.astype(np.int32),
         }
         return cls(size, key, columns)._merged()
@@ -215,7 +218,7 @@ class Cells:
 
 
 def point_keys(x: NDArray, y: NDArray, kinds: NDArray, size: float) -> NDArray[np.int64]:
-    """Return keys of the cells that points, all of a kind, lie in."""
+    """Return the key of each point's cell; `kinds` (n,) are of :class:`Kind`."""
     side = np.where(kinds == Kind.GROUND, size * GROUND_WIDTH, size)
     return cell_keys(cell_numbers(x / side, 1.0), cell_numbers(y / side, 1.0), kinds)
 

@@ -1,7 +1,8 @@
 """Compare objects of two vector files: as objects, by area, by boundary; trees by place and height.
 
 Completeness is the share of the reference that was detected, correctness the share of detected
-objects that are in the reference, F1 their harmonic mean. Coordinates are meters.
+objects that are in the reference, F1 their harmonic mean. Coordinates must be in meters: those of
+files in feet are not converted.
 """
 
 from __future__ import annotations
@@ -21,6 +22,17 @@ from ..base.errors import StageError
 from ..base.units import horizontal_part
 from ..base.vector import reading, vector
 
+# Values without a reason are not tuned.
+#: Intersection over union from which outlines match: each then covers at least half of the other.
+MIN_IOU = 0.5
+#: Farthest that matching trees are from each other, meters.
+MAX_DISTANCE = 4.0
+#: Largest difference of matching trees' heights, as a share of the true one.
+MAX_HEIGHT_ERROR = 0.3
+#: Share of a true outline's area from which it counts as covered.
+COVERED = 0.8
+#: Share of a building's area in the compared area from which it counts.
+MIN_SHARE_INSIDE = 0.5
 #: Distance between the places at which boundaries are compared, meters.
 BOUNDARY_STEP = 0.5
 #: Names of columns that hold heights of trees.
@@ -31,7 +43,9 @@ _GEOMETRY = {"buildings": "Polygon", "trees": "Point"}
 Pairs = list[tuple[int, int]]
 
 
-def match_by_overlap(detected: Sequence[Any], true: Sequence[Any], min_iou: float = 0.5) -> Pairs:
+def match_by_overlap(
+    detected: Sequence[Any], true: Sequence[Any], min_iou: float = MIN_IOU
+) -> Pairs:
     """Return pairs (detected, true) by intersection over union, each object once."""
     shapely = vector("shapely")
     if not len(detected) or not len(true):
@@ -48,8 +62,8 @@ def match_by_place(
     heights: NDArray,
     true_places: NDArray,
     true_heights: NDArray,
-    max_distance: float = 4.0,
-    max_height_error: float = 0.3,
+    max_distance: float = MAX_DISTANCE,
+    max_height_error: float = MAX_HEIGHT_ERROR,
 ) -> Pairs:
     """Return pairs (detected, true) of trees, the nearest first, each tree once.
 
@@ -90,10 +104,11 @@ def compare_buildings(detected: Sequence[Any], true: Sequence[Any]) -> dict[str,
     Returns
     -------
     dict
-        ``objects`` (matched at an intersection over union of 0.5), ``area`` (completeness,
+        ``objects`` (matched by :data:`MIN_IOU`), ``area`` (completeness,
         correctness and intersection over union of all area), ``covered`` (share of true outlines
-        that detected ones cover by at least 80 %), ``boundary`` (distance of places along the true
-        boundary from the detected one, of blocks that match: median and 95th percentile, meters).
+        that detected ones cover by :data:`COVERED`), ``boundary`` (distance of places along the
+        true boundary from the detected one, of blocks that match: median and 95th percentile,
+        meters).
     """
     shapely = vector("shapely")
     detected, true = list(shapely.make_valid(list(detected))), list(shapely.make_valid(list(true)))
@@ -117,7 +132,7 @@ def compare_buildings(detected: Sequence[Any], true: Sequence[Any]) -> dict[str,
             "correctness": _share(shared, whole.area),
             "iou": _share(shared, whole.area + whole_true.area - shared),
         },
-        "covered": _mean(covered >= 0.8),
+        "covered": _mean(covered >= COVERED),
         "boundary": {
             "places": len(offset),
             "median": _percentile(offset, 50),
@@ -202,7 +217,7 @@ class VectorObjects:
                 columns = {str(n).lower(): v for n, v in zip(about["fields"], values, strict=True)}
                 title = next((n for n in HEIGHT_NAMES if n in columns), "")
                 column = columns.get(title, exists * np.nan)
-                try:  # of texts empty ones, and None, are not known
+                try:  # a height of None or an empty text is not known
                     heights = np.array([v or np.nan for v in column.tolist()], float)[exists]
                 except ValueError as error:
                     what = f"the column '{title}' must hold heights of trees, in meters"
@@ -230,7 +245,9 @@ class VectorObjects:
             shapes["trees"], heights = shapes["trees"][inside], heights[inside]
         if "buildings" in shapes:
             valid = shapely.make_valid(shapes["buildings"])
-            inside = shapely.area(shapely.intersection(valid, area)) >= 0.5 * shapely.area(valid)
+            inside = shapely.area(
+                shapely.intersection(valid, area)
+            ) >= MIN_SHARE_INSIDE * shapely.area(valid)
             shapes["buildings"] = shapes["buildings"][inside]
         return replace(self, shapes=shapes, heights=heights)
 
@@ -245,7 +262,8 @@ def compare_objects(
     detected, reference : str
         Vector files.
     area : str, optional
-        Vector file of polygons; objects outside are not counted.
+        Vector file of polygons, of several layers the one named ``buildings``; objects outside are
+        not counted.
 
     Returns
     -------
@@ -318,7 +336,8 @@ def table(figures: dict[str, Any]) -> str:
         if layer == "trees":
             place, height = scores["place"], scores["height"]
             lines += [
-                f"F1, matched at 4 m, 30 % of height: {_percent(objects['f1'])}",
+                f"F1, matched at {MAX_DISTANCE:g} m, {100 * MAX_HEIGHT_ERROR:g} % of height: "
+                f"{_percent(objects['f1'])}",
                 f"distance, median: {place['median']:.2f} m",
                 f"height, bias and RMSE: {height['bias']:+.2f} m, {height['rmse']:.2f} m",
                 "",
@@ -326,11 +345,12 @@ def table(figures: dict[str, Any]) -> str:
             continue
         area, edge = scores["area"], scores["boundary"]
         both = f"{_percent(area['completeness'])}, {_percent(area['correctness'])}"
+        covered = _percent(scores["covered"])
         lines += [
-            f"F1, matched at IoU 0.5: {_percent(objects['f1'])}",
+            f"F1, matched at IoU {MIN_IOU:g}: {_percent(objects['f1'])}",
             f"area, complete and correct: {both}",
             f"area, intersection over union: {_percent(area['iou'])}",
-            f"covered by at least 80 %: {_percent(scores['covered'])} of the reference",
+            f"covered by at least {100 * COVERED:g} %: {covered} of the reference",
             f"boundary offset, median and 95 %: {edge['median']:.2f} m, {edge['p95']:.2f} m",
             "",
         ]

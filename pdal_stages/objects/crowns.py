@@ -1,12 +1,12 @@
 """Trees of cells: tops of a smoothed canopy, and the crown around each.
 
 A pit-free canopy height model is smoothed a little. Its tops are its h-maxima (the extended-maxima
-transform of Kwak, Lee, Lee, Biging, Gong 2007): maxima from which every path to higher ground
-descends by at least `depth`. That needs no size of crowns, which in closed stands depends more on
-the neighbors than on the height. A watershed gives the crowns (marker-controlled, Chen, Baldocchi,
-Gong, Kelly 2006): other maxima join the higher ground beside them. Every step has a bounded reach:
-higher ground is searched within half of `REACH`, and a cell that leads farther than `REACH` is
-dropped. So a tile with that much around it has the crowns of the whole forest.
+transform of Kwak, Lee, Lee, Biging, Gong 2007): maxima from which every path to higher canopy
+descends by at least the `saddle`. That needs no size of crowns, which in closed stands depends more
+on the neighbors than on the height. A watershed gives the crowns (marker-controlled, Chen,
+Baldocchi, Gong, Kelly 2006): other maxima join the higher canopy beside them. Every step has a
+bounded reach: higher canopy is searched within half of `REACH`, and a cell that leads farther than
+`REACH` is dropped. So a tile with that much around it has the crowns of the whole forest.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from ..base.jit import device, njit
 
-#: Farthest that a cell lies from the top of its tree, meters.
+# Values without a reason are not tuned.
+#: Farthest that a cell lies from the top of its tree, meters: large enough for crowns 30 m wide,
+#: small enough that a tile needs little around it.
 REACH = 15.0
 #: Canopy lower than this, meters (or half the lowest tree), belongs to no crown.
 LOWEST_CROWN = 1.5
@@ -64,11 +66,11 @@ def _is_higher(z, a, b):
 
 
 @njit
-def crown_cells(s: NDArray, lowest: float, depth: float, reach: float) -> NDArray:
+def crown_cells(s: NDArray, lowest: float, saddle: float, reach: float) -> NDArray:
     """Return the index of the top of each cell's tree in a smoothed canopy; -1 for none.
 
     A cell leads to the highest cell beside it, up to a maximum. A maximum leads to the nearest
-    higher cell that a path over cells at most `depth` meters lower reaches, all within half of
+    higher cell that a path over cells at most `saddle` meters lower reaches, all within half of
     `reach` cells; without one it is a top. A cell belongs to a crown where it is at least
     `CROWN_SHARE` times as high as the top and within `reach` cells of it; tops are at least
     `TOP_SHARE` times as high as the `lowest` tree, meters.
@@ -95,7 +97,7 @@ def crown_cells(s: NDArray, lowest: float, depth: float, reach: float) -> NDArra
             for i in range(max(at // columns - 1, 0), min(at // columns + 2, rows)):
                 for j in range(max(at % columns - 1, 0), min(at % columns + 2, columns)):
                     m, away = i * columns + j, (i - r) ** 2 + (j - c) ** 2
-                    if seen[m] == n or z[m] < z[n] - depth or away > 0.25 * reach * reach:
+                    if seen[m] == n or z[m] < z[n] - saddle or away > 0.25 * reach * reach:
                         continue
                     seen[m] = n
                     if not _is_higher(z, m, n):

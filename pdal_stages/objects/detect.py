@@ -25,9 +25,10 @@ from .cells import Cells, Kind, object_id
 from .raster_view import MARGIN, NEIGHBORS, CellView, pad_evenly
 from .results import Objects, ObjectSettings, ObjectTable
 
+# `LOOKAHEAD` and `BLOCK` change time and memory, not results. The other values are not tuned.
 #: Meters beyond `MARGIN` in the first view: most buildings that reach into a block end there.
 LOOKAHEAD = 64.0
-#: Side of a block, cells.
+#: Side of a block, cells: several times as wide as the surroundings that are read again.
 BLOCK = 2048
 #: Distance around a tower within which wires end, meters.
 TOWER_RADIUS = 1.5
@@ -60,8 +61,8 @@ def find_objects(
     Parameters
     ----------
     cells : Cells
-        Records of all points of the area, by :meth:`Cells.from_points`; objects may be cut a meter
-        or two from its edge.
+        Records of all points of the area, by :meth:`Cells.from_points`; objects near its edge may
+        be incomplete.
     settings : ObjectSettings, optional
         Its `cell` is that of the records.
     block : int
@@ -115,8 +116,8 @@ def _parts(label: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], N
 
 def _detect_surfaces(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
     """Yield buildings or decks."""
-    view, mask = view.widened_to_whole(core, lambda view: view.surface(kind)[0])
-    settings, z = view.settings, view.surface(kind)[1]
+    view, mask = view.widened_to_whole(core, lambda view: view.roof_or_deck(kind)[0])
+    settings, z = view.settings, view.roof_or_deck(kind)[1]
     area = settings.cell**2
     step, part, measure = DECK_STEP, DECK_PART, attributes.measure_deck
     if kind == Kind.BUILDING:
@@ -156,7 +157,7 @@ def _detect_trees(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Obj
     """Yield trees; see :mod:`.crowns`."""
     settings, window = view.settings, view.window
     size, high = settings.cell, view.highest(kind)
-    mask, roof = view.surface(Kind.BUILDING)
+    mask, roof = view.roof_or_deck(Kind.BUILDING)
     with np.errstate(invalid="ignore"):
         high[mask & (high <= roof + ROOF_TOLERANCE)] = np.nan
     height = crowns.canopy(high, view.ground)

@@ -22,19 +22,32 @@ from .results import ObjectTable
 
 @dataclass(frozen=True)
 class OutlineRules:
-    """Thresholds of outlines; lengths in cells."""
+    """Thresholds of outlines; lengths in cells, areas in m2.
 
-    min_hole: float = 4.0  #: m2; smaller holes are closed
-    tolerance: float = 1.6  #: distance of a wall from its cells, and of walls that become one
+    Values without a reason are not tuned.
+    """
+
+    min_hole: float = 4.0  #: smaller holes in buildings and decks are closed
+    min_crown_hole: float = 1.0  #: smaller holes in crowns are closed
+    #: Distance of a wall from its cells, and of walls that become one. Cells along a slanting wall
+    #: form steps, which lie up to a cell's diagonal, 1.41, apart.
+    tolerance: float = 1.6
     max_slant: float = 2.5  #: offset of a wall's ends that is turned into the main direction
-    short_wall: float = 6.0  #: walls up to this length are turned whatever their slant
-    crown_tolerance: float = 1.5  #: distance of a crown's outline from its cells
-    precision: float = 1.0 / 1024.0  #: of corners; so fine that a shift of the area changes no bit
+    short_wall: float = 6.0  #: shorter walls are turned whatever their slant: corners cut by cells
+    #: Weight, beside walls' lengths, of a short wall that is turned against its longer direction.
+    fallback_weight: float = 1e-3
+    corner_tolerance: float = 0.1  #: corners closer to the wall between their neighbors are removed
+    crown_tolerance: float = 1.5  #: of a crown's outline; 3 made triangles of small crowns
+    #: Of corners: a power of two, so that a shift of the area by whole cells changes no bit.
+    precision: float = 1.0 / 1024.0
     min_group_iou: float = 0.75  #: of straight outlines with cells, all of a group together
     min_iou: float = 0.4  #: of each straight outline with its cells
+    angle_step: float = 0.2  #: between the main directions that are tried, degrees
 
 
 RULES = OutlineRules()
+#: Fewest coordinates of a ring, the first of which is also the last.
+MIN_RING = 4
 
 
 def raw_outlines(table: ObjectTable, size: float, *, hole: float = RULES.min_hole) -> list[Any]:
@@ -60,7 +73,7 @@ def straight_outlines(raw: list[Any]) -> list[Any]:
 
     Parameters
     ----------
-    raw : list of shapely Polygon
+    raw : list of shapely Polygon or MultiPolygon
         By :func:`raw_outlines`.
 
     Returns
@@ -70,7 +83,7 @@ def straight_outlines(raw: list[Any]) -> list[Any]:
         much from the cells.
     """
     shapely = vector("shapely")
-    out = np.array([*raw, None], object)[:-1]
+    out = np.array(raw, object)
     for group in _touching(shapely, raw):
         corner = np.floor(shapely.total_bounds(out[group])[:2])  # near 0, coordinates are exact
         local = shapely.transform(out[group], lambda xy, by=corner: xy - by)
@@ -118,7 +131,7 @@ def _straighten(shapely: Any, shapes: NDArray) -> NDArray:
     rings, of_shape = shapely.get_rings(fine, return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)
     kept = np.isin(xy @ [1, 1j], shapely.get_coordinates(simple) @ [1, 1j])
-    too_few = np.bincount(ring[kept], minlength=len(rings)).min() < 4
+    too_few = np.bincount(ring[kept], minlength=len(rings)).min() < MIN_RING
     if too_few or len(np.unique(of_shape)) < len(shapes):
         return np.full(len(shapes), None, object)
     rings = shapely.linearrings(xy[kept], indices=ring[kept])
@@ -136,7 +149,11 @@ def _straighten(shapely: Any, shapes: NDArray) -> NDArray:
     moved = np.round(moved[number] / RULES.precision) * RULES.precision
     out = shapely.polygons(shapely.set_coordinates(rings, moved), indices=of_shape)
     # Remove corners that now lie on a wall.
-    return shapely.coverage_simplify(out, 0.1) if shapely.is_valid(out).all() else out
+    return (
+        shapely.coverage_simplify(out, RULES.corner_tolerance)
+        if shapely.is_valid(out).all()
+        else out
+    )
 
 
 def _segments(shapely: Any, rings: NDArray, values: NDArray) -> NDArray:
@@ -185,7 +202,7 @@ def _adjust(
             if axis == across:
                 parts.append((lengths[n], float(np.median(places[:, axis]))))
             else:
-                parts.append((1e-3, float(places[:, axis].mean())))
+                parts.append((RULES.fallback_weight, float(places[:, axis].mean())))
             total = sum(w for w, _ in parts)
             leader[axis][leader[axis] == second] = first
             value[axis, first], weight[axis, first] = sum(w * v for w, v in parts) / total, total
@@ -205,7 +222,7 @@ def main_direction(walls: NDArray) -> float:
     It is the one in which all walls, weighted by length, extend least along both axes.
     """
     x, y = (walls * np.hypot(*walls.T)[:, None]).T
-    angles = np.radians(np.arange(0.0, 90.0, 0.2))[:, None]
+    angles = np.radians(np.arange(0.0, 90.0, RULES.angle_step))[:, None]
     c, s = np.cos(angles), np.sin(angles)
     extents = (np.abs(c * x + s * y) + np.abs(c * y - s * x)).sum(axis=1)
     return float(angles[np.argmin(np.round(extents, 6)), 0])

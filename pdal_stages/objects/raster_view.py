@@ -15,15 +15,17 @@ from .attributes import ObjectCells
 from .cells import GROUND_WIDTH, MM, Cells, Kind
 from .results import ObjectSettings
 
-#: Farthest that ground is interpolated from, meters: half the width of the largest building.
+# Values without a reason are not tuned.
+#: Farthest that ground is interpolated from, meters: the middle of a building wider than twice this
+#: has no ground.
 GROUND_REACH = 120.0
-#: Surroundings that decide about a place, meters; buildings, spans and decks may extend farther.
+#: Surroundings that decide about a place, meters, but for how far its building, span or deck goes.
 MARGIN = GROUND_REACH + 2 * crowns.REACH
 #: Farthest that a roof is extended into what a classifier took for leaves, meters.
 ROOF_GROWTH = 3.0
 #: Farthest that cells of a hole in a roof (dark or wet, without returns) lie from its rim, meters.
 MAX_HOLE_DEPTH = 6.0
-#: Empty cells around what a view holds, so that filters see no edge.
+#: Empty cells around what a view holds, so that filters of roofs, which reach 2, see no edge.
 EMPTY_RIM = 8
 #: A cell and its eight neighbors.
 NEIGHBORS = np.ones((3, 3), bool)
@@ -66,7 +68,7 @@ class CellView:
             for kind in Kind
         }
         self.window = requested.intersect(_occupied_window(self._records))
-        self.indices, self.surface = cache(self._indices), cache(self._surface)
+        self.indices, self.roof_or_deck = cache(self._indices), cache(self._roof_or_deck)
 
     def _indices(self, kind: Kind) -> NDArray[np.int32]:
         """Return a raster of a kind's indices of records, -1 for none; ground in wider cells."""
@@ -92,7 +94,7 @@ class CellView:
         mean = self._column(Kind.GROUND, "sum") / self._column(Kind.GROUND, "count") / MM
         return _repeat(fill_gaps(mean, round(GROUND_REACH / (self.cells.size * GROUND_WIDTH))))
 
-    def _surface(self, kind: Kind) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    def _roof_or_deck(self, kind: Kind) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Return the cells of decks, or of roofs, and their heights.
 
         Roofs are extended into vegetation that lies in their planes, and over holes without

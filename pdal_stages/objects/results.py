@@ -16,52 +16,57 @@ from ..base.grid import places_among
 from .cells import Kind, point_keys
 
 
-def _number(default: float, low: float, high: float, unit: str, help: str) -> Any:
+def _number(limits: tuple[float, float, float, str], help: str) -> Any:
+    """Return a number's setting from its default, lowest and highest value and unit."""
+    default, low, high, unit = limits
     return setting(default, "number", help, low, high, unit=unit)
 
 
 @dataclass(frozen=True)
 class ObjectSettings(Settings):
-    """Settings of the detection of objects; wrong values raise an OptionError."""
+    """Settings of the detection of objects; wrong values raise an OptionError.
+
+    `saddle` and `smoothing` were chosen on five plots of forest ("chosen" in benchmarks/trees.py).
+    """
 
     cell: float = _number(
-        *(0.5, 0.05, 100, "m"),
+        (0.5, 0.05, 100, "m"),
         "Side of the grid's cells, about 1.4 times the spacing of points (1 for 2 points/m2), so "
         "that few cells of a roof are empty; where points are few the command objects enlarges "
         "the default, up to 4",
     )
     building_height: float = _number(
-        1.5, 0, 100, "m", "Minimum height of a building's cells above the ground"
+        (1.5, 0, 100, "m"), "Minimum height of a building's cells above the ground"
     )
     building_area: float = _number(
-        4.0, 0, 10_000, "m2", "Minimum area of a building; smaller ones are left out"
+        (4.0, 0, 10_000, "m2"), "Minimum area of a building or deck; smaller ones are left out"
     )
     step: float = _number(
-        *(2.5, 0, 100, "m"),
+        (2.5, 0, 100, "m"),
         "Height difference that separates two buildings, along two thirds of their roofs' border; "
         "0 separates none",
     )
     roof_part: float = _number(
-        *(10.0, 0, 10_000, "m2"),
+        (10.0, 0, 10_000, "m2"),
         "Minimum area of a roof part; smaller ones (dormers) join their neighbor",
     )
-    tree_height: float = _number(3.0, 0, 100, "m", "Minimum height of a tree")
-    tree_area: float = _number(1.0, 0, 1000, "m2", "Minimum area of a tree's crown")
+    tree_height: float = _number((3.0, 0, 100, "m"), "Minimum height of a tree")
+    tree_area: float = _number((1.0, 0, 1000, "m2"), "Minimum area of a tree's crown")
     saddle: float = _number(
-        0.3, 0, 10, "m", "Depth of the saddle in the canopy that separates two trees"
+        (0.3, 0, 10, "m"), "Depth of the saddle in the canopy that separates two trees"
     )
     smoothing: float = _number(
-        0.3, 0, 5, "m", "Standard deviation of the Gaussian that smooths the canopy"
+        (0.3, 0, 5, "m"), "Standard deviation of the Gaussian that smooths the canopy"
     )
     dbh_factor: float = _number(
-        *(0.557, 0, 10, ""),
+        (0.557, 0, 10, ""),
         "For the stem diameter at breast height, `dbh`: dbh_factor times (height times crown "
         "diameter) to the power of dbh_power (Jucker and others 2017, who also give both for the "
         "forests of each region)",
     )
-    dbh_power: float = _number(0.809, 0, 2, "", "See dbh_factor")
+    dbh_power: float = _number((0.809, 0, 2, ""), "See dbh_factor")
     span_gap: float = _number(
-        *(2.0, 0.5, 20, "m"),
+        (2.0, 0.5, 20, "m"),
         "Gap between wires that separates two spans, rounded to an even number of cells; where "
         "that is 0, wires in cells that touch, also at a corner, are one span",
     )

@@ -14,10 +14,14 @@ from ..terrain.components import number_sets
 
 @dataclass(frozen=True)
 class RoofRules:
-    """Thresholds of roofs; lengths in meters, areas in m2."""
+    """Thresholds of roofs; lengths in meters, areas in m2.
+
+    Values without a reason are not tuned.
+    """
 
     # Vegetation that belongs to a roof (`extend_roofs`)
-    max_scatter: float = 0.12  #: of the roof around a plane that is extended
+    max_scatter: float = 0.12  #: standard deviation of a roof's heights from its plane
+    plane_reach: float = 1.0  #: height from the vegetation up to which roof cells make its plane
     max_plane_distance: float = 0.2  #: of vegetation from that plane
     max_thickness: float = 0.5  #: between points of a cell: a roof is a surface, a crown is not
     max_slope: float = 2.0  #: rise per meter: 63 degrees
@@ -29,11 +33,13 @@ class RoofRules:
     level_tolerance: float = 1.0  #: of a hole's rim around its median height
     min_level_share: float = 0.65  #: cells of the rim within that tolerance
     # Buildings that touch (`building_parts`)
-    roof_step: float = 1.0  #: height difference of neighboring cells of one roof
+    roof_step: float = 1.0  #: height difference of neighboring cells of one roof, of any width
+    border_reach: float = 1.0  #: height from a cell up to which others make its plane
     inside: int = 2  #: cells from the border inward: beyond rims and walls
     min_meeting_share: float = 0.34  #: border along which the roofs of one building meet
     # Roof planes (`roof_planes`)
-    smooth_scatter: float = 0.25  #: of cells around the plane through them
+    roof_reach: float = 1.5  #: height from a cell up to which others make its plane
+    smooth_scatter: float = 0.25  #: standard deviation of cells' heights from their plane
     max_bend: float = 0.2  #: difference of the gradients of neighboring cells, rise per meter
     min_plane_area: float = 3.0
 
@@ -131,7 +137,7 @@ def extend_roofs(
     """
     for _ in range(reach):
         empty = np.where(np.isnan(high), leaves, np.nan)
-        east, north, above, scatter = planes(high, empty, size, 1.0)
+        east, north, above, scatter = planes(high, empty, size, RULES.plane_reach)
         steepness = east**2 + north**2
         rise = size * np.sqrt(steepness)
         added = scatter <= RULES.max_scatter**2 + RULES.scatter_in_cell * rise**2
@@ -216,7 +222,7 @@ def _sets(a: NDArray, b: NDArray, count: int) -> NDArray[np.int64]:
 def building_parts(
     mask: NDArray[np.bool_], z: NDArray, *, step: float, smallest: int
 ) -> NDArray[np.int64]:
-    """Return labels of buildings, from 0 in the order of their first cells; -1 outside.
+    """Return labels of buildings, or of decks, from 0 by their first cells; -1 outside.
 
     Connected cells whose heights differ by at most `RoofRules.roof_step` are a roof. Roofs of
     fewer than `smallest` cells (dormers, chimneys) join the neighbor with the longest common
@@ -238,7 +244,8 @@ def building_parts(
             break
         label = _join(label, small, b[order][first])
     z = np.where(mask, z, np.nan)
-    surface = z, *planes(z, z, 1.0, 1.0)[:3]
+    # Of a size of 1, so slopes are the rise per cell, as `_border_height` takes them.
+    surface = z, *planes(z, z, 1.0, RULES.border_reach)[:3]
     while True:
         a, b, length, meeting = _borders(label, surface, step)
         meets = meeting >= RULES.min_meeting_share * length
@@ -307,7 +314,7 @@ def roof_planes(z: NDArray[np.float64], size: float) -> tuple[int, float, float]
     size : float
         Side of a cell, meters.
     """
-    east, north, _, scatter = planes(z, z, size, 1.5)
+    east, north, _, scatter = planes(z, z, size, RULES.roof_reach)
     part = connected(scatter < RULES.smooth_scatter**2, RULES.max_bend, east, north)
     cells = np.bincount(part.ravel() + 1)[1:]
     large = np.append(cells * size * size >= RULES.min_plane_area, False)

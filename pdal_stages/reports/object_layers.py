@@ -12,6 +12,7 @@ from ..base.units import Units
 from ..base.vector import vector
 from ..objects.attributes import CHECK
 from ..objects.cells import Kind
+from ..objects.outlines import RULES as OUTLINE_RULES
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines
 from ..objects.results import Objects, ObjectTable
 from .vector_files import Layer, qml, write_layers
@@ -71,7 +72,7 @@ def object_layers(
         columns[kind]["area"] = np.round(np.array([shape.area * size**2 for shape in shapes]), 3)
         layers[name] = polygons(shapes, kind)
     trees = tables[Kind.TREE]
-    crowns = raw_outlines(trees, size, hole=1.0)
+    crowns = raw_outlines(trees, size, hole=OUTLINE_RULES.min_crown_hole)
     layers["crowns"] = polygons(crown_outlines(crowns) if straight else crowns, Kind.TREE)
     x, y = (trees.columns.get(axis, np.empty(0)) / horizontal for axis in "xy")
     layers["trees"] = Layer(list(shapely.points(x, y)), "Point", columns[Kind.TREE])
