@@ -34,7 +34,8 @@ class WireRules(NamedTuple):
 
     min_height_m: float = 4.0  #: above the ground: hedges and fences are lower
     max_thickness_m: float = 0.9  #: of a layer in a cell: a bundle of wires
-    #: layers about as high in the 5 x 5 cells around: 4 wires; saves a third of the time
+    #: layers about as high in the 5 x 5 cells around: 4 wires. Without it results are the same, but
+    #: the detector takes two thirds more time (docs/results/ablation.md)
     max_neighbors: int = 24
     same_height_m: float = 2.0  #: layers up to this much higher or lower are neighbors
     half_m: float = 12.0  #: half the length of a line: a wire bends by decimeters over it
@@ -44,17 +45,24 @@ class WireRules(NamedTuple):
     max_bend: float = 0.02  #: a line's points may lie this much higher or lower per meter along it
     min_run_m: float = 5.0  #: between two layers that give a line its direction
     max_slope: float = 0.6  #: rise over run of a line: wires to a tower on a slope
-    min_filled: int = 8  #: of the 12 pieces of a line
-    clear_m: float = 0.45  #: the air is empty from this much farther from a line
-    around_m: float = 1.6  #: to this far from it: the next wire but one may hang 2.4 m beside
+    #: pieces of a line that hold thin layers; of 2 * `half_m` / `piece_m`, 12. It does not follow
+    #: when these change
+    min_filled: int = 8
+    #: the air is empty from `near_m` + `clear_m`, 0.8 m, above and below a line, and beside it from
+    #: `beside_m` + `clear_m`, 1.45 m
+    clear_m: float = 0.45
+    #: to this far above and below, and 2.25 m beside: the next wire but one hangs 2.4 m beside
+    around_m: float = 1.6
     max_around_ratio: float = 0.1  #: layers there, per layer on the line: roofs have more
     min_length_m: float = 30.0  #: of connected lines: ridges and cables on masts are shorter
     hop_m: float = 6.0  #: gaps in a wire, and how far it goes on into a tree or its tower
+    #: more of `reach_m`, for the 5 x 5 cells around a layer and for whole cells; not tuned
+    reach_margin_m: float = 6.0
 
     @property
     def reach_m(self) -> float:
         """Distance in meters up to which other points decide whether a point is of a wire."""
-        return self.min_length_m + 2 * self.half_m + 2 * self.hop_m + 6.0
+        return self.min_length_m + 2 * self.half_m + 2 * self.hop_m + self.reach_margin_m
 
 
 RULES = WireRules()

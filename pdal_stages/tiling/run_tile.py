@@ -1,6 +1,6 @@
 """Run a round on a tile: its points with a halo go through stages, and its results are saved.
 
-Filtered ground depends on points half a kilometer around a tile, but only through a raster of the
+Filtered ground depends on points some 400 m around a tile, but only through a raster of the
 lowest points and of the positions of ground points in each cell. So squares of some tiles are read
 first, with the halo of the earlier stages (noise is marked before heights are computed). The lowest
 points, possible ground points, and changes by earlier stages are saved. Then blocks of the raster
