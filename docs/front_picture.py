@@ -38,7 +38,7 @@ def picture(folder: Path, width: int = 620) -> np.ndarray:
     light = shading(seen)
     raw, classified = (
         paint(seen, colors, light)
-        for colors in (np.full((*light.shape, 3), 150), CLASS_COLORS[seen.spread(classes, 0)])
+        for colors in (np.full((*light.shape, 3), 150), CLASS_COLORS[seen.per_pixel(classes, 0)])
     )
     return np.concatenate([raw, np.full((len(raw), GAP, 3), 255, np.uint8), classified], axis=1)
 

@@ -17,12 +17,12 @@ from pdal_stages.reports.pictures import (
     CLASS_COLORS,
     RIGHT,
     WRONG,
+    error_colors,
     paint,
     png,
     shading,
     surface,
     triptych,
-    verdict,
     write_png,
 )
 
@@ -34,7 +34,7 @@ def has_color(image: np.ndarray, color) -> bool:
 def top_view(x, y, z, classes, width):
     """Classes from above, unshaded."""
     s = surface(x, y, z, width)
-    return paint(s, CLASS_COLORS[s.spread(classes, 0)], np.ones(s.z.shape))
+    return paint(s, CLASS_COLORS[s.per_pixel(classes, 0)], np.ones(s.z.shape))
 
 
 def block(n=40, step=0.5):
@@ -135,10 +135,10 @@ def test_errors_are_red_even_under_a_roof():
     wrong = np.r_[x < 5, np.zeros(x.size, bool)]
     xyz = np.r_[x, x], np.r_[y, y], np.r_[z, z + 8]
     s = surface(*xyz, 200)
-    image = verdict(s, *xyz, wrong, np.zeros_like(wrong))
+    image = error_colors(s, *xyz, wrong, np.zeros_like(wrong))
     red = (image == np.array(WRONG)).all(axis=2).mean(axis=0)
     assert red[5:45].mean() > 0.2 and red[55:].max() == 0.0
-    assert not has_color(verdict(s, *xyz, np.zeros_like(wrong), np.ones_like(wrong)), WRONG)
+    assert not has_color(error_colors(s, *xyz, np.zeros_like(wrong), np.ones_like(wrong)), WRONG)
 
 
 def test_triptych():

@@ -39,5 +39,7 @@ def top_view(x, y, z, classes=None, *, values=None, width: int = 900, limits=Non
     """The cloud from above, colored by class or by a value between limits."""
     s = surface(x, y, z, width)
     if classes is not None:
-        return paint(s, CLASS_COLORS[s.spread(classes, 0)], shading(s))
-    return paint(s, ramp(s.spread(np.asarray(values, float), np.nan), VALUES, limits), shading(s))
+        return paint(s, CLASS_COLORS[s.per_pixel(classes, 0)], shading(s))
+    return paint(
+        s, ramp(s.per_pixel(np.asarray(values, float), np.nan), VALUES, limits), shading(s)
+    )

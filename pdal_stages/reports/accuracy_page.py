@@ -19,16 +19,25 @@ from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
 from .page import render
-from .pictures import IGNORED, RIGHT, WRONG, embed, nice_step, paint, shading, surface, verdict
+from .pictures import IGNORED, RIGHT, WRONG, embed, error_colors, nice_step, paint, shading, surface
 
-#: Files within this distance share a map, meters.
+# Values without a reason are not tuned.
+#: Files within this distance share a map, meters: tiles of a survey that has gaps.
 MAX_GAP = 1000.0
-#: Places that get maps.
+#: Places that get maps; three maps of each are in the page, which a browser must still open.
 MAX_PLACES = 12
 #: Width of a map, pixels.
 MAX_WIDTH = 820
-#: Pixels of a map in total.
+#: Pixels of a map in total, which bounds the size of the page.
 MAX_PIXELS = 800_000
+#: Width of a map, pixels, however narrow the place is: as narrow as a picture may be.
+MIN_WIDTH = 16
+#: Shorter side of a place / its longer one below which it is a line, and gets no map.
+MIN_SIDES = 0.02
+#: Widest scale bar, about, as a part of the map's width: one in this number.
+SCALE_PART = 6
+#: Width of maps / their height below which the page shows them in a row.
+MAX_IN_A_ROW = 1.7
 
 
 @dataclass(frozen=True)
@@ -36,7 +45,7 @@ class Place:
     """Points of a file, or of several nearby ones, with both classifications before any merge."""
 
     name: str
-    xyz: npt.NDArray[np.float64]  #: (n, 3)
+    xyz: npt.NDArray[np.float64]  #: (n, 3) meters
     reference: npt.NDArray[Any]  #: (n,) class codes
     predicted: npt.NDArray[Any]  #: (n,) class codes
 
@@ -130,12 +139,13 @@ def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
     width, height = np.ptp(points[:, :2], axis=0)
     n = int(compared.sum())
     out: dict[str, Any] = {"points": len(points), "compared": n, "maps": []}
-    if min(width, height) < 0.02 * max(width, height) or max(width, height) == 0:
+    if min(width, height) < MIN_SIDES * max(width, height) or max(width, height) == 0:
         return out
     x, y, z = points.T
-    s = surface(x, y, z, max(16, math.ceil(min(MAX_WIDTH, math.sqrt(MAX_PIXELS * width / height)))))
+    pixels = math.ceil(min(MAX_WIDTH, math.sqrt(MAX_PIXELS * width / height)))
+    s = surface(x, y, z, max(MIN_WIDTH, pixels))
     light, (rows, columns) = shading(s), s.which.shape
-    length = nice_step(columns * s.pixel / 6)
+    length = nice_step(columns * s.pixel / SCALE_PART)
     scale = (100 * length / (columns * s.pixel), f"{length:g} m")
 
     def picture(heading: str, alt: str, colors: npt.NDArray[np.uint8]) -> dict[str, Any]:
@@ -144,7 +154,7 @@ def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
     alt = f"Map of the errors from above: {wrong.sum():,} of {n:,} compared points are wrong"
     codes = np.union1d(true, labels).tolist()
     palette = np.array([class_color(code) for code in codes], np.uint8)
-    classes = [palette[np.searchsorted(codes, s.spread(v, codes[0]))] for v in (true, labels)]
+    classes = [palette[np.searchsorted(codes, s.per_pixel(v, codes[0]))] for v in (true, labels)]
     verdicts = [(RIGHT, "right"), (WRONG, "wrong"), (IGNORED, "not compared")]
     return {
         **out,
@@ -156,7 +166,7 @@ def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
         "maps": [
             picture("Reference", "Map of the reference classes from above", classes[0]),
             picture("Prediction", "Map of the predicted classes from above", classes[1]),
-            picture("Errors", alt, verdict(s, x, y, z, wrong, ~compared)),
+            picture("Errors", alt, error_colors(s, x, y, z, wrong, ~compared)),
         ],
-        "in_a_row": columns < 1.7 * rows,
+        "in_a_row": columns < MAX_IN_A_ROW * rows,
     }

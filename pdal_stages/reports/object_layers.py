@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..base.asprs import class_color
 from ..base.units import Units
 from ..base.vector import vector
-from ..objects.attributes import CHECK
+from ..objects.attributes import CHECK, SURE
 from ..objects.cells import Kind
 from ..objects.outlines import RULES as OUTLINE_RULES
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines
@@ -19,8 +19,8 @@ from .vector_files import Layer, qml, write_layers
 
 #: Layers of objects, in this order.
 LAYERS = ("buildings", "trees", "crowns", "spans", "decks")
-#: Columns of each kind, none longer than a shapefile's ten characters; texts and whole numbers are
-#: listed below.
+#: Columns of each kind, none longer than a shapefile's ten characters; `_TYPES` lists texts and
+#: whole numbers.
 COLUMNS = {
     Kind.BUILDING: "area h_eave h_ridge ground slope planes planar points reliab verdict reason",
     Kind.TREE: "height area diam dbh ground points reliab verdict reason",
@@ -28,7 +28,7 @@ COLUMNS = {
     Kind.DECK: "area z clear ground points reliab verdict reason",
 }
 _TYPES = {"planes": np.int64, "points": np.int64, "verdict": object, "reason": object}
-#: Class whose color the sure objects of a layer have, and their opacity.
+#: Class whose color the sure objects of a layer have, and their opacity of 255.
 _COLORS = {
     "buildings": (6, 140),
     "trees": (5, 255),
@@ -36,6 +36,7 @@ _COLORS = {
     "spans": (14, 255),
     "decks": (17, 140),
 }
+#: Color (red, green, blue, opacity) of objects to be checked, in all layers.
 _CHECK_COLOR = "255,225,0,200"
 
 
@@ -107,4 +108,4 @@ def _style(kind: str, name: str) -> str:
     code, opacity = _COLORS[name]
     sure = ",".join(map(str, (*class_color(code), opacity)))
     check = ("check", f"verdict = '{CHECK}'", _CHECK_COLOR)
-    return qml(kind, [("sure", "verdict = 'sure'", sure), check])
+    return qml(kind, [("sure", f"verdict = '{SURE}'", sure), check])

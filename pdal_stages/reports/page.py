@@ -1,6 +1,6 @@
 """Render web pages from templates: self-contained HTML, escaped throughout, without scripts.
 
-One of them is the page about a tiled run, made from its JSON report.
+One of them is the page about a run, in tiles or in one piece, made from its JSON report.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from ..base.asprs import class_color, class_name
 from ..base.messages import count_of, duration, plain
 from ..base.version import __version__
 
-#: Rows of the table of the slowest tiles.
-MAX_ROWS = 200
+#: Rows of a table on a page: large enough for a person to read, small enough for a browser.
+TABLE_ROWS = 200
 #: Titles of the settings on the page, by their names in the JSON report.
 _TITLES = {
     "pipeline": "pipeline",
@@ -110,8 +110,9 @@ def run_page(run: Mapping[str, Any]) -> str:
         what=_settings(run),
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
         slowest=[
-            (t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:MAX_ROWS]
+            (t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:TABLE_ROWS]
         ],
+        most=TABLE_ROWS,
         done=len(done),
         objects={kind: counts for kind, counts in objects.items() if counts["objects"]},
     )

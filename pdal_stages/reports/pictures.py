@@ -35,8 +35,39 @@ HEIGHT_COLORS = (
     (38, 84, 106), (62, 128, 112), (132, 170, 104), (208, 200, 130), (206, 152, 98),
     (172, 102, 84), (233, 204, 186),
 )  # fmt: skip
+#: Color of pixels whose value is not known: a gray, each of red, green and blue.
+UNKNOWN = 150
 #: Pixels between the panels of a picture.
 PANEL_GAP = 12
+
+
+@dataclass(frozen=True)
+class PictureRules:
+    """Sizes of pictures, and light on relief. Values without a reason are not tuned."""
+
+    min_width: int = 16  #: pixels
+    max_width: int = 3000  #: pixels; at most 22 million in all
+    max_tallness: float = 2.5  #: height of a picture / its width
+    min_extent: float = 1e-3  #: of a cloud, in the unit of x and y, so that pixels have a size
+    gap_reach: float = 1.6  #: farthest point that an empty pixel takes, in spacings of points
+    sun: tuple[float, float] = (0.5, 0.75)  #: direction: west and north alike, and up
+    relief_blur: float = 0.45  #: standard deviation, in spacings of points
+    surroundings: float = 4.0  #: standard deviation that makes them, in the unit of x and y
+    min_surroundings: float = 1.2  #: the same at least, in spacings of points
+    max_surroundings: float = 0.1  #: the same at most, as a share of the picture's longer side
+    depth: float = 4.8  #: below or above the surroundings that changes light most, in z's unit
+    blur_cut: float = 2.0  #: standard deviations at which a blur is cut off
+    base_light: float = 0.62
+    sunlight: float = 0.34  #: added on level ground
+    max_sun: float = 1.35  #: on a slope towards the sun; level ground is 1
+    skylight: float = 0.22  #: added on high places, taken off in low ones
+    min_light: float = 0.42
+    max_light: float = 1.18
+    error_size: float = 0.4  #: half the side of a wrong point, in spacings of points
+    max_error_size: int = 5  #: half the side of a wrong point, pixels
+
+
+RULES = PictureRules()
 
 
 def png(rgb: npt.NDArray[np.uint8]) -> bytes:
@@ -73,7 +104,7 @@ class Surface:
     z: np.ndarray  #: (height, width) its height, NaN for none
     spacing: float  #: typical distance of neighboring points in pixels, at least 1
 
-    def spread(self, values: np.ndarray, missing) -> np.ndarray:
+    def per_pixel(self, values: np.ndarray, missing) -> np.ndarray:
         """Return values of points as values of pixels."""
         return np.where(self.which >= 0, values[self.which], np.array(missing, values.dtype))
 
@@ -89,12 +120,14 @@ class Surface:
 def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
     """Return the map of points, (n,) float each.
 
-    It is `width` pixels wide, or narrower where it would be more than 2.5 times as tall. An empty
-    pixel takes the nearest point within 1.6 times the spacing of points. Points that are not finite
-    are left out.
+    It is `width` pixels wide, or narrower where it would be taller than `RULES.max_tallness` times
+    that. An empty pixel takes the nearest point within `RULES.gap_reach`. Points that are not
+    finite are left out.
     """
-    if not 16 <= int(width) <= 3000:
-        raise StageError("'width' must be from 16 to 3000 pixels", where="picture", found=width)
+    low, high = RULES.min_width, RULES.max_width
+    if not low <= int(width) <= high:
+        what = f"'width' must be from {low} to {high} pixels"
+        raise StageError(what, where="picture", found=width)
     good = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
     if not good.size:
         raise StageError(
@@ -105,8 +138,8 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
         )
     x, y, z = (np.asarray(a[good], np.float64) for a in (x, y, z))
     x0, y0 = float(x.min()), float(y.min())
-    wide, tall = max(float(x.max()) - x0, 1e-3), max(float(y.max()) - y0, 1e-3)
-    pixel = max(wide / width, tall / (2.5 * width))
+    wide, tall = (max(float(v.max() - v.min()), RULES.min_extent) for v in (x, y))
+    pixel = max(wide / width, tall / (RULES.max_tallness * width))
     shape = max(2, math.ceil(tall / pixel)), max(2, math.ceil(wide / pixel))
     full = Surface(x0, y0, pixel, np.full(shape, -1), np.full(shape, np.nan), 1.0)
     order = np.argsort(z, kind="stable")
@@ -120,12 +153,12 @@ def surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, width: int) -> Surface:
     # Spacing inside the cloud: pixels near a point, per pixel that has one.
     expected = math.sqrt(seen.size / seen.sum())
     spacing = max(1.0, math.sqrt((distance <= expected).sum() / seen.sum()))
-    near = np.where(distance <= 1.6 * spacing, full.which[tuple(at)], -1)
+    near = np.where(distance <= RULES.gap_reach * spacing, full.which[tuple(at)], -1)
     return Surface(x0, y0, pixel, near, np.where(near >= 0, full.z[tuple(at)], np.nan), spacing)
 
 
 def shading(s: Surface) -> np.ndarray:
-    """Return the light on each pixel, about 0.4 (dark) to 1.2.
+    """Return the light on each pixel, `RULES.min_light` (dark) to `RULES.max_light`.
 
     The sun is in the north-west, and there is less sky where the surroundings are higher.
     """
@@ -134,17 +167,20 @@ def shading(s: Surface) -> np.ndarray:
 
     def smooth(size: float) -> np.ndarray:
         total, weight = (
-            ndimage.gaussian_filter(values, size, mode="nearest", truncate=2.0)
+            ndimage.gaussian_filter(values, size, mode="nearest", truncate=RULES.blur_cut)
             for values in (above, known.astype(np.float32))
         )
         return total / np.maximum(weight, 1e-6)
 
-    fine = smooth(0.45 * s.spacing)
+    fine = smooth(RULES.relief_blur * s.spacing)
     south, east = np.gradient(fine, s.pixel)
-    sun = (0.5 * east + 0.5 * south + 0.75) / np.sqrt(1 + east**2 + south**2) / 0.75
-    surroundings = smooth(min(max(4.0 / s.pixel, 1.2 * s.spacing), 0.1 * max(s.z.shape)))
-    light = 0.62 + 0.34 * np.clip(sun, 0, 1.35) + 0.22 * np.clip((fine - surroundings) / 4.8, -1, 1)
-    return np.where(known, np.clip(light, 0.42, 1.18), 1.0)
+    flat, up = RULES.sun
+    sun = (flat * east + flat * south + up) / np.sqrt(1 + east**2 + south**2) / up
+    width = max(RULES.surroundings / s.pixel, RULES.min_surroundings * s.spacing)
+    surroundings = smooth(min(width, RULES.max_surroundings * max(s.z.shape)))
+    light = RULES.base_light + RULES.sunlight * np.clip(sun, 0, RULES.max_sun)
+    light += RULES.skylight * np.clip((fine - surroundings) / RULES.depth, -1, 1)
+    return np.where(known, np.clip(light, RULES.min_light, RULES.max_light), 1.0)
 
 
 def paint(s: Surface, colors: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -168,23 +204,23 @@ def ramp(
     out = np.stack(
         [np.interp(share, np.arange(len(colors)), colors[:, c]) for c in range(3)], axis=-1
     )
-    out[~good] = 150
+    out[~good] = UNKNOWN
     return np.round(out).astype(np.uint8)
 
 
-def verdict(
+def error_colors(
     s: Surface, x: np.ndarray, y: np.ndarray, z: np.ndarray, wrong: np.ndarray, left_out: np.ndarray
 ) -> np.ndarray:
     """Return colors of the pixels of a surface, (height, width, 3) uint8.
 
     A wrong point is drawn over right ones of its pixel, so that no error hides under a roof.
     """
-    kinds = s.spread(np.where(left_out, 2, wrong).astype(np.int64), 0)
+    kinds = s.per_pixel(np.where(left_out, 2, wrong).astype(np.int64), 0)
     shown = np.array([RIGHT, WRONG, IGNORED], dtype=np.uint8)[kinds]
     good = wrong & np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     mask = np.zeros(s.which.shape, bool)
     mask[s.cells(x[good], y[good])] = True
-    grow = min(int(0.4 * s.spacing), 5)  # about as large as a point
+    grow = min(int(RULES.error_size * s.spacing), RULES.max_error_size)  # about as large as a point
     shown[ndimage.binary_dilation(mask, iterations=grow) if grow else mask] = WRONG
     return shown
 
@@ -205,10 +241,10 @@ def triptych(
     """
     panels = 2 if truth is None else 3
     s = surface(x, y, z, (int(width) - PANEL_GAP * (panels - 1)) // panels)
-    shown = [ramp(s.z, HEIGHT_COLORS), CLASS_COLORS[s.spread(predicted, 0)]]
+    shown = [ramp(s.z, HEIGHT_COLORS), CLASS_COLORS[s.per_pixel(predicted, 0)]]
     if truth is not None:
         wrong = predicted != truth
-        shown.append(verdict(s, x, y, z, wrong, np.zeros_like(wrong)))
+        shown.append(error_colors(s, x, y, z, wrong, np.zeros_like(wrong)))
     light, gap = shading(s), np.full((len(s.z), PANEL_GAP, 3), BACKGROUND, np.uint8)
     return np.concatenate(
         [part for colors in shown for part in (gap, paint(s, colors, light))][1:], axis=1

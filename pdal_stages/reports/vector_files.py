@@ -47,7 +47,7 @@ def check_target(path: str | Path, layers: Sequence[str]) -> None:
     vector("pyogrio")
     vector("shapely")
     for name in target_files(path, layers):
-        check_writable(name, "objects")
+        check_writable(name, "vector file")
 
 
 def target_files(path: str | Path, layers: Sequence[str]) -> list[Path]:
@@ -81,7 +81,7 @@ def write_layers(
     driver, files = DRIVERS[Path(path).suffix.lower()], target_files(path, list(layers))
     many_layers = driver == MANY_LAYERS
     style_files = [] if many_layers else [file.with_suffix(".qml") for file in files]
-    with whole_files(*files, *style_files, what="objects") as parts:
+    with whole_files(*files, *style_files, what="vector") as parts:
         for number, (name, layer) in enumerate(layers.items()):
             _write(parts[0 if many_layers else number], name, layer, driver, wkt)
             if not many_layers:
@@ -101,7 +101,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
             warnings.filterwarnings("ignore", "Passed SRS uses EPSG")
             pyogrio.raw.write(
                 path,
-                shapely.to_wkb(np.array([*layer.shapes, None], object)[:-1]),
+                shapely.to_wkb(np.array(layer.shapes, object)),
                 list(layer.columns.values()),
                 list(layer.columns),
                 driver=driver,
@@ -120,7 +120,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
         raise StageError(what, found=str(error), cure=cure) from None
     if info["features"] != len(layer.shapes):
         lost = f"{info['features']:,} of {len(layer.shapes):,} {name}"
-        what = "objects could not be written completely"
+        what = "the vector file could not be written completely"
         raise StageError(what, found=lost, cure="Make room on the disk")
 
 
