@@ -69,6 +69,6 @@ def test_quotas_of_control_groups(tmp_path, files, cores):
 
 def test_a_worker_takes_the_cores_that_it_is_told():
     code = "from pdal_stages.base.threads import available_threads; print(available_threads())"
-    every = int(processes.python(code, env={threads.CORES: "many"}))
+    every = int(processes.python(code, env={threads.CORES_VARIABLE: "many"}))
     for value, cores in (("1", 1), ("0", 1), ("4000", every)):
-        assert int(processes.python(code, env={threads.CORES: value})) == cores
+        assert int(processes.python(code, env={threads.CORES_VARIABLE: value})) == cores

@@ -1,4 +1,4 @@
-"""Agreement of classes with a reference: measures, confidence, text."""
+"""Agreement of classes with a reference: labels, measures, reliability, text."""
 
 from .measures import Accuracy
 

@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.asprs import HIGH, LOW, MEDIUM, NAMES, UNINFORMATIVE
+from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION, NAMES, UNINFORMATIVE
 from ..base.errors import StageError
 
 #: Largest label: that of uint16; Classification itself ends at 255.
 MAX_LABEL = 65535
-#: A dimension with more different values than this is not a class dimension.
+#: A dimension with more different values than this is not a class dimension: Classification, of one
+#: byte, has no more.
 MAX_CLASSES = 256
-#: Points counted at a time, which bounds the memory.
+#: Points counted at a time, whose pairs take some 30 MB. Not tuned.
 CHUNK = 1 << 20
 
 
@@ -109,7 +110,9 @@ class Merge:
             if len(codes) > 1:
                 listed = ", ".join(map(str, sorted(codes)))
                 names[target] = (
-                    "Vegetation" if codes <= {LOW, MEDIUM, HIGH} else f"Classes {listed}"
+                    "Vegetation"
+                    if codes <= {LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION}
+                    else f"Classes {listed}"
                 )
         return cls(to, names)
 

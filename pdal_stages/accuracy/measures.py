@@ -8,11 +8,14 @@ Rules for what is not defined, so that no measure is ever NaN:
 
 - Means are over the classes present in the reference.
 - A class present in the reference that was never predicted has precision 0 and F1 0.
-- A class with no reference points (named in `classes`, or predicted only) has recall None; its
-  precision, where it was predicted, is 0.
+- A class named in `classes` that has no reference points has recall None; its precision, F1 and
+  IoU are 0 where it was predicted, else None.
 - Kappa is None where chance alone would agree on everything (one class, predicted throughout).
-- A predicted class that is not a class of the reference (1 where points were rejected, say) gets
-  a column of its own, and its points count as errors.
+- A predicted class that is not a class of the reference (1 where points were rejected, say) is in
+  `extra`: it has a column of its own and no measures, and its points count as errors.
+
+A new measure is a property of :class:`Accuracy` (or a field of :class:`ClassMeasures`), its entry
+of :meth:`Accuracy.to_dict` and of ``accuracy-1.json``, and a line of ``text``, where users read it.
 """
 
 from __future__ import annotations
@@ -41,7 +44,8 @@ from .text import table
 
 #: Points graded at a time, which bounds the memory.
 CHUNK = 1 << 20
-#: Bins of a reliability between 0 and 1; areas are exact to one of them.
+#: Bins of a reliability between 0 and 1: a multiple of the curve's ten, and so many that the area
+#: under the ROC curve is exact to a thousandth.
 BINS = 1000
 
 
@@ -279,7 +283,7 @@ class Accuracy:
                 found=f"{dict(self.merged)} and {dict(other.merged)}",
                 cure="Compare both with the same 'merge'",
             )
-        # An empty tile has no calibration; where another part lacks one, the sum has none either.
+        # An empty tile has no reliability; where another part lacks it, the sum lacks it, too.
         first, second = self.reliability, other.reliability
         if first is not None and second is not None:
             histogram: ReliabilityHistogram | None = first + second

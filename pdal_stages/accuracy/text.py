@@ -1,4 +1,4 @@
-"""Measures of a comparison as text tables."""
+"""Measures of a comparison as text tables; see ``measures`` for what a new one needs."""
 
 from __future__ import annotations
 

@@ -36,9 +36,9 @@ NAMES = {code: name for code, (name, _) in _CLASSES.items()}
 NOISE = (7, 18)
 #: Ground.
 GROUND = 2
-LOW = 3  #: low vegetation
-MEDIUM = 4  #: medium vegetation
-HIGH = 5  #: high vegetation
+LOW_VEGETATION = 3
+MEDIUM_VEGETATION = 4
+HIGH_VEGETATION = 5
 WIRE = 14  #: conductors
 TOWER = 15  #: transmission towers
 BRIDGE = 17  #: bridge decks
@@ -54,7 +54,7 @@ LEGACY_LIMIT = 31
 
 
 def class_name(code: int) -> str:
-    """Return the ASPRS name of a class, ``Reserved`` up to 63, ``User class`` up to 255."""
+    """Return ASPRS's name of a class, or ``Reserved`` below 64 and ``User class`` from there on."""
     code = int(code)
     return NAMES.get(code, f"Reserved {code}" if code < 64 else f"User class {code}")
 
@@ -78,7 +78,7 @@ def by_height(
 
     Heights below ``limits[0]`` become low, below ``limits[1]`` medium vegetation; in meters.
     """
-    high = chosen & (codes == HIGH)
+    high = chosen & (codes == HIGH_VEGETATION)
     low, medium = limits
-    codes[high & (height < medium)] = MEDIUM
-    codes[high & (height < low)] = LOW
+    codes[high & (height < medium)] = MEDIUM_VEGETATION
+    codes[high & (height < low)] = LOW_VEGETATION

@@ -161,15 +161,16 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return out
 
 
-def setting(default: Any, kind: str, help: str, *bounds: float | None, **rule: Any) -> Any:
-    """Declare a field with a description of one sentence and, for a number, its `bounds`.
+def setting(default: Any, kind: str, help: str, *limits: float | None, **rule: Any) -> Any:
+    """Declare a field with a description of one sentence and, for a number, its two `limits`.
 
-    `kind` and `rule` (``exclusive``, ``unit``, ``choices``) are those of an option of a stage; or
-    `rule` has a ``check``, a function of a name and the value that returns what the field holds.
-    With MISSING as `default` it is required.
+    `kind` is ``boolean``, ``integer``, ``number`` or another word, whose values are checked only by
+    ``choices`` or ``check`` in `rule`: ``check`` is a function of a name and the value that returns
+    what the field holds. `rule` may also have the ``unit`` of a number, and ``exclusive`` for one
+    that must be above its lower limit (not of integers). With MISSING as `default` it is required.
     """
-    if bounds:
-        rule |= {"minimum": bounds[0], "maximum": bounds[1]}
+    if limits:
+        rule |= {"minimum": limits[0], "maximum": limits[1]}
     return field(default=default, metadata={"kind": kind, "help": help, **rule})
 
 
@@ -193,7 +194,7 @@ def _check(what: str, value: Any, rule: Mapping[str, Any]) -> Any:
         return flag(what, value)
     if "minimum" not in rule:
         return value
-    if rule["kind"] == "integer":
-        return whole(what, value, rule["minimum"], rule["maximum"])
     above, unit = rule.get("exclusive", False), rule.get("unit", "")
+    if rule["kind"] == "integer":
+        return whole(what, value, rule["minimum"], rule["maximum"], unit=unit)
     return number(what, value, rule["minimum"], rule["maximum"], above=above, unit=unit)

@@ -61,7 +61,7 @@ def kind_of(path: str | os.PathLike) -> str:
     for beginning, kind in _BEGINNINGS.items():
         if head.startswith(beginning):
             return kind
-    if head.startswith(b"PK\x03\x04"):
+    if head.startswith(b"PK\x03\x04"):  # its first file's name: length at 26, text from 30
         first = head[30 : 30 + int.from_bytes(head[26:28], "little")]
         known = {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}
         return known.get(first, "a zip archive")
@@ -71,6 +71,8 @@ def kind_of(path: str | os.PathLike) -> str:
     return JSON if text.startswith((b"{", b"[")) else ""
 
 
+#: Kind of a written file of no known kind: it equals none, so that it replaces no known one.
+_UNKNOWN = "a file of another kind"
 #: The longest file name, in bytes, on common file systems.
 _LONGEST_NAME = 255
 #: The most links that Linux follows one after the other.
@@ -248,7 +250,7 @@ def _identity(path: str | os.PathLike) -> tuple[int, int] | None:
 
 
 def _numbered(output: Path, inputs: list[Path]) -> Path | None:
-    """Return the input that a numbered output might become."""
+    """Return the input that a numbered output might overwrite."""
     if "#" not in output.name:
         return None
     before, _, after = output.name.partition("#")
@@ -323,7 +325,7 @@ def whole_files(
         inside = False
         moves = [(*move, number) for number, place in enumerate(places) for move in place.written()]
         for partial, target, number in moves:
-            check_writable(target, what, kind_of(partial) or "a file of another kind")
+            check_writable(target, what, kind_of(partial) or _UNKNOWN)
             if check is not None:
                 check(partial, target, number)
         for partial, target, _ in moves:

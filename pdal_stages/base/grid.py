@@ -20,7 +20,8 @@ from .errors import StageError
 
 Integers = npt.NDArray[np.int64]
 
-#: Largest number of a cell, either side of zero: larger ones are not exact as a double.
+#: Largest number of a cell, either side of zero: doubles are exact up to twice this, so that sums
+#: of two numbers are, too.
 LARGEST_NUMBER = 2**52
 #: Columns and rows of keys lie below this, either side of zero.
 _KEY_LIMIT = 2**31 - 1
@@ -72,7 +73,7 @@ def cell_keys(column: npt.NDArray, row: npt.NDArray, layer: Any = 0) -> Integers
     Parameters
     ----------
     column, row : arrays of int64
-        One shape, below 2**31 either side of zero.
+        One shape, below 2**31 - 1 either side of zero.
     layer : int or array of int64
         From 0 to 7: keeps cells of several kinds apart. Rows lie below 2**26 then.
 

@@ -5,6 +5,7 @@ first called, so that commands that need none, and errors, come at once. numba k
 its own source file only, so a changed *device function* in another module would leave stale code
 behind: the key here is a digest of the sources of the kernel and of all that it calls. Compiled
 code is cached at first use rather than shipped, because it is made for the processor it runs on.
+This file is digested, too: a changed default below, or ``FAST``, compiles everything again.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from .progress import Progress
 #: Flags that allow sums to be reordered and contracted, but keep NaN and infinity meaningful.
 FAST = frozenset({"reassoc", "contract", "nsz", "arcp"})
 
-#: Divisions as in NumPy: a check for zero in a loop keeps it from being vectorized.
-_ERRORS = {"error_model": "numpy"}
+#: Divisions as in NumPy, without an exception: a check for zero keeps a loop from being vectorized.
+_DIVISION = {"error_model": "numpy"}
 
 #: Kernels and device functions, and what each was made of.
 _functions: dict[Any, Callable] = {}
@@ -89,19 +90,23 @@ class Kernel:
 
 
 def njit(function: Callable | None = None, **options):
-    """``numba.njit`` with the package's defaults. Use as ``@njit`` or ``@njit(...)``."""
+    """Declare a kernel: ``numba.njit`` with the package's defaults, as ``@njit`` or ``@njit(...)``.
+
+    ``_nrt`` is numba's runtime, which allocates arrays and counts who holds them.
+    """
     if function is None:
         return lambda f: njit(f, **options)
     defaults = {"nogil": True, "cache": True, "no_cfunc_wrapper": True, "_nrt": True}
-    return Kernel(function, {**defaults, **_ERRORS, **options})
+    return Kernel(function, {**defaults, **_DIVISION, **options})
 
 
 def device(function: Callable | None = None, **options):
     """Declare a function that kernels call: compiled into them, without an entry for Python.
 
-    That entry would take as long to compile as many a function. Where Python calls it, it runs as
-    it is written. It borrows arrays: counting who holds them was a tenth of a job. One that makes
-    or returns some asks for ``_nrt=True``.
+    That entry would often take as long to compile as the function. Where Python calls it, it runs
+    as it is written. It works without numba's runtime (``_nrt``): counting who holds the arrays
+    that it is given took a tenth of a job. A function that makes or returns arrays needs
+    ``_nrt=True``.
     """
     return njit(function, **{"cache": False, "no_cpython_wrapper": True, "_nrt": False, **options})
 
@@ -109,7 +114,7 @@ def device(function: Callable | None = None, **options):
 def _numba() -> Any:
     try:
         import numba
-    except ValueError as error:  # of an environment variable of its own
+    except ValueError as error:  # an environment variable of numba has a bad value
         raise DependencyError(
             "numba cannot be started",
             found=str(error),
@@ -134,7 +139,7 @@ def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:
         rtsys.initialize(target)
         codegen.unserialize_library = partial(_library, codegen)
         return cache._load_overload(signature, target)
-    except AttributeError:  # of another numba: nobody promises these methods
+    except AttributeError:  # numba does not promise these methods: another version lacks one
         return usual(signature, target)
     finally:
         vars(codegen).pop("unserialize_library", None)
@@ -153,7 +158,7 @@ def _library(codegen: Any, state: tuple[str, str, tuple[bytes, bytes]]) -> Any:
     library._set_compiled_object(code)
     library._finalize_final_module()
     library._get_module_for_linking = lru_cache(partial(parse_bitcode, intermediate))
-    # Which names it has numba reads from the intermediate code; what is asked for is there.
+    # numba would read the intermediate code for the names of functions; the compiled code has them.
     library.get_pointer_to_function = codegen._engine.get_function_address
     return library
 
@@ -192,9 +197,9 @@ def _file_digest(path: str) -> str:
 def _sources(kernel: Any) -> set[str]:
     """Return digests of a kernel's source and constants, and of those of all that it calls.
 
-    Asked when the kernel is first called, since what it calls may stand below it.
+    Called when the kernel is first called, since functions that it calls may be defined below it.
     """
-    digests, seen, todo = set(), {kernel}, [kernel]
+    digests, seen, todo = {_file_digest(__file__)}, {kernel}, [kernel]
     while todo:
         function = _functions[todo.pop()]
         digests.add(_file_digest(function.__code__.co_filename))

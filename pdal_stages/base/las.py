@@ -20,7 +20,8 @@ import numpy as np
 
 from .errors import StageError
 
-#: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18).
+#: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18). A format that
+#: is not here is refused; PDAL and laspy must read it as well.
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 #: Point formats with waveforms, and the same formats without.
 WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
@@ -128,7 +129,7 @@ def records(file: BinaryIO, header: LasHeader) -> Iterator[Record]:
         if index == header.records:
             place = header.after
         size = 60 if after else 54
-        if place >= 2**62:
+        if place >= 2**62:  # a damaged length; files cannot be searched from 2**63 on
             return
         file.seek(place)
         head = file.read(size)
@@ -145,9 +146,9 @@ def _text(field: bytes) -> bytes:
     return field.split(b"\0")[0]
 
 
-#: Most records of a file that are searched.
+#: Most records of a file that are searched: files have some ten, damaged headers count up to 2**32.
 _MOST_RECORDS = 10_000
-#: Largest record that is read, in bytes.
+#: Largest record that is read, in bytes: references and descriptions of extra bytes take some kB.
 LARGEST_RECORD = 1 << 20
 
 
@@ -206,7 +207,7 @@ def supersede_copc(path: str | os.PathLike) -> None:
             file.write(b"LASF_Spec".ljust(16, b"\0") + struct.pack("<H", 7))
 
 
-def projection(path: str | os.PathLike) -> str:
+def projection_digest(path: str | os.PathLike) -> str:
     """Return a digest of the records that hold a file's spatial reference; empty without any.
 
     Raises

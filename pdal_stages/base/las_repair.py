@@ -32,7 +32,8 @@ from .las import (
     records_of,
 )
 
-#: A file whose points begin later is read as it is; its records are no usual ones.
+#: A file whose points begin later, in bytes, is read as it is: what lies before them is held in
+#: memory, and the records of usual files take a few kB.
 LARGEST_HEAD = 1 << 26
 #: Texts of a header: offset and length in bytes.
 _HEADER_TEXTS = ((26, 32), (58, 32))

@@ -13,21 +13,21 @@ import numpy as np
 
 from .errors import OptionError
 
-#: Free memory in bytes that is assumed where the system does not report it.
+#: Free memory in bytes that is assumed where the system does not report it: a small computer's.
 _ASSUMED_FREE = 4 * 10**9
-#: The least amount of memory that is accepted, in bytes.
+#: The least amount of memory that is accepted, in bytes: a smaller one lacks its unit.
 _LEAST_SIZE = 1e6
 #: Limit and use of a control group, of version 2 and of version 1.
 _GROUP_FILES = (
     ("memory.max", "memory.current"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
 )
-#: A larger limit of a control group is none.
+#: A control group whose limit is larger has no limit: version 1 reports nearly 2**63 then.
 _NO_LIMIT = 2**60
 
 
 def parse_size(text: str) -> int:
-    """Return the bytes of ``4GB``, ``500 MB``, ``4GiB`` or a plain number, which is large.
+    """Return the bytes of ``4GB``, ``500 MB``, ``4GiB`` or a plain number of a million or more.
 
     Raises
     ------

@@ -32,7 +32,7 @@ _DEEPEST = 31
 _COPC_INFO = struct.Struct("<5d2Q2d")
 #: Entry of a page: level, x, y, z, offset, bytes, points.
 _COPC_ENTRY = struct.Struct("<4iQ2i")
-#: Bytes of an EPT description that are read.
+#: Bytes of an EPT description that are read: it takes a few kB, and a wrong address may never end.
 _LARGEST = 2**24
 #: Endings of the files of an EPT source, by their type.
 _ENDINGS = {"binary": "bin", "laszip": "laz", "zstandard": "zst"}
@@ -52,7 +52,7 @@ def check_copc(path: str | os.PathLike) -> None:
         return  # which PDAL says
     x, y, z, half, spacing, begin, length, _, _ = _COPC_INFO.unpack_from(about[0])
     try:
-        # Its cube holds all points, but for what programs round.
+        # Its cube holds all points, but for what programs round: a hundredth of it. Not tuned.
         beyond = [abs(end - middle) for end, middle in zip(header.box, (x, y, x, y), strict=True)]
         if not (half > 0 and max(beyond) <= 1.01 * half and math.isfinite(z) and spacing > 0):
             raise ValueError(
@@ -103,6 +103,7 @@ def read_ept(path: str) -> dict[str, Any]:
 
     try:
         remote = "://" in path
+        # 60 s: long enough for slow servers; not tuned.
         with urllib.request.urlopen(path, timeout=60) if remote else open(path, "rb") as file:
             about = strict_json(file.read(_LARGEST))
         x0, y0, _, x1, y1, _ = map(float, about["boundsConforming"])

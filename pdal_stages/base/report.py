@@ -22,7 +22,10 @@ class Report:
     codes: dict[str, int] | None = None
 
     def merge(self, other: Report) -> None:
-        """Merge another report into this one. Existing figures stay; dicts are merged by key."""
+        """Merge another report into this one. Existing figures stay; dicts are merged by key.
+
+        ``codes`` are not merged: those of the last stage count, which its own report holds.
+        """
         _merge(self.figures, other.figures)
         _merge(self.beyond_halo, other.beyond_halo)
         self.reach = max(self.reach, other.reach)

@@ -25,17 +25,17 @@ _QUOTAS = ("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")
 
 #: The environment variable with the number of cores of a worker; joblib, and so scikit-learn,
 #: respect it as well.
-CORES = "LOKY_MAX_CPU_COUNT"
+CORES_VARIABLE = "LOKY_MAX_CPU_COUNT"
 
 
 @cache
 def available_threads() -> int:
-    """Return the cores this process may use: affinity, bounded by a quota and :data:`CORES`."""
+    """Return the cores this process may use: the least of affinity, quota and CORES_VARIABLE."""
     bounds = [os.cpu_count() or 1, *_quota()]
     if hasattr(os, "sched_getaffinity"):
         bounds.append(len(os.sched_getaffinity(0)))
     with contextlib.suppress(ValueError):
-        bounds.append(int(os.environ.get(CORES, "")))
+        bounds.append(int(os.environ.get(CORES_VARIABLE, "")))
     return max(1, min(bounds))
 
 

@@ -22,7 +22,8 @@ NAMED = {
 }
 
 
-#: The smallest plausible unit, in meters.
+#: The smallest plausible unit, in meters: a thousandth of a millimeter. Beyond it and _LARGEST a
+#: reference is damaged.
 _SMALLEST = 1e-6
 #: The largest plausible unit, in meters.
 _LARGEST = 1e6
@@ -52,7 +53,8 @@ class UnitDoubts:
     vegetation_share: float = 0.01  #: single points may be birds or tips of masts
     least_points: int = 1000  #: fewer say little
     cell_m: float = 10.0  #: wide enough that walls and noise do not make slopes
-    #: of the ground; the steepest of 60 surveyed places, a canyon side in California, has 0.86
+    #: of the ground; the steepest of 60 surveyed places, a canyon side in California, had 0.86 (no
+    #: command keeps that table)
     median_slope: float = 1.5
     least_cells: int = 20  #: with two neighbors; fewer may be a single cliff
     most_points: int = 200_000  #: a slope is as good from a sample
@@ -190,7 +192,10 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
 
 
 def refuse_likely_degrees(count: int, x0: float, y0: float, x1: float, y1: float) -> None:
-    """Refuse a thousand points or more without a reference whose extent looks like degrees."""
+    """Refuse a thousand points or more without a reference whose extent looks like degrees.
+
+    As degrees 0.2 are 22 km, wider than a file; as meters they are too few for so many points.
+    """
     on_globe = max(-x0, x1) <= 180.0 and max(-y0, y1) <= 90.0
     if count >= 1000 and on_globe and max(x1 - x0, y1 - y0) < 0.2:
         code = utm_code(x0, y0) or "CODE"

@@ -122,7 +122,7 @@ class Overlay:
             )
         return cls(file.strip(), layer.strip(), int(code), tuple(map(int, replaced)))
 
-    def check(self) -> str:
+    def find_layer(self) -> str:
         """Return the layer to read; StageError where there is not exactly one."""
         if "://" not in self.file and not Path(self.file).exists():
             raise StageError(
@@ -158,7 +158,7 @@ def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[
     columns, in SQL.
     """
     pyogrio, shapely = vector("pyogrio"), vector("shapely")
-    layer = overlay.check()
+    layer = overlay.find_layer()
     note, forward = "", None
     with reading(overlay.file) as name:
         crs = pyogrio.read_info(name, layer=layer)["crs"]
@@ -194,6 +194,7 @@ def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
         what = "the polygons' reference system cannot be made the points'"
         cure = "Reproject the file first: ogr2ogr -t_srs"
         raise StageError(what, where=file, found=str(error), cure=cure) from None
+    # The box's edges are curves in the other system, of which pyproj takes 21 points each.
     rim = 0.01 * max(east - west, north - south)
     padded = (west - rim, south - rim, east + rim, north + rim)
     return lambda x, y: forward.transform(x, y), padded

@@ -11,9 +11,9 @@ __version__ = "0.2.0"
 
 @cache
 def build() -> str:
-    """Return the version and a digest of code and models, which differ where results may."""
+    """Return the version and a digest of what results follow from: code, models, calibrations."""
     root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
-    for path in sorted([*root.rglob("*.py"), *root.glob("models/*.model")]):
+    for path in sorted([*root.rglob("*.py"), *root.glob("models/*.*")]):
         name = path.relative_to(root).as_posix().encode()
         digest.update(name + b"\0" + path.read_bytes() + b"\0")
     return f"{__version__} ({digest.hexdigest()[:12]})"

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
 from ..base.las import geotiff_code, header_there, named_copc, named_las, source_id
-from ..base.las_check import DAMAGED, check_readable
+from ..base.las_check import CURE_OF_DAMAGE, check_readable
 from ..base.las_repair import LARGEST_HEAD, corrected, overwritten
 from .inputs_outputs import readers_files, writers_outputs
 
@@ -244,7 +244,9 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         if read and _CUT_POINTS.search(str(error)):
             what, files = "the LAS file is damaged: its points cannot be decoded", ", ".join(read)
             where = f"one of {files}" if len(read) > 1 else files
-            raise PipelineError(what, where=where, found=str(error).strip(), cure=DAMAGED) from None
+            raise PipelineError(
+                what, where=where, found=str(error).strip(), cure=CURE_OF_DAMAGE
+            ) from None
         raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
     except MemoryError:
         cure = "Work in tiles (--tile), or read less, e.g. with filters.crop"

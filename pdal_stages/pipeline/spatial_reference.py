@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..base.errors import PipelineError, StageError
-from ..base.las import header_there, named_las, projection
+from ..base.las import header_there, named_las, projection_digest
 from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
 from . import pdal as pdal_env
 from .inputs_outputs import readers_files
@@ -141,7 +141,7 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
     for stage in stages:
         options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}
         for path in readers_files([stage], las=True):
-            kind_of[path] = f"{projection(path)} {options}"
+            kind_of[path] = f"{projection_digest(path)} {options}"
             kinds[kind_of[path]] = {**options, "filename": path, "count": 1}
     if len(kinds) < 2:
         return []

@@ -23,7 +23,7 @@ from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
 from ..base.messages import PlainStream
 from ..base.progress import Progress
-from ..base.threads import CORES, available_threads
+from ..base.threads import CORES_VARIABLE, available_threads
 from .pdal import check_interrupt, deferred_interrupts
 
 #: The reason where a worker died.
@@ -187,7 +187,7 @@ def _environment(threads: int) -> Iterator[None]:
     It gets its share of the cores, no modules of the current folder, and no Ctrl-C. The program is
     not imported in it, so a script needs no ``if __name__ == "__main__"``.
     """
-    names = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES]
+    names = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES_VARIABLE]
     wanted = dict.fromkeys(names, str(threads))
     wanted |= {"PDAL_STAGES_PROGRESS": "0", "PYTHONSAFEPATH": "1"}
     before = {name: os.environ[name] for name in wanted if name in os.environ}

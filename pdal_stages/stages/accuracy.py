@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
-from ..base.asprs import HIGH, LOW, MEDIUM, UNINFORMATIVE
+from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION, UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, whole_files
 from ..base.messages import plain
@@ -27,8 +27,8 @@ from .base import Stage, StageContext, files_read
 from .options import Selection, option
 from .points import Points
 
-#: Classes that count as HIGH where vegetation is one class.
-LOWER = (LOW, MEDIUM)
+#: Classes that count as HIGH_VEGETATION where vegetation is one class.
+LOWER = (LOW_VEGETATION, MEDIUM_VEGETATION)
 
 
 class Sides(NamedTuple):
@@ -197,11 +197,14 @@ class AccuracyStage(Stage):
         parts = [code for code in LOWER if code in true and target[code] == code]
         if (
             parts
-            and HIGH in (predicted if known is None else known)
+            and HIGH_VEGETATION in (predicted if known is None else known)
             and not {*LOWER} & {*(known or ()), *predicted}
-            and target[HIGH] == HIGH
+            and target[HIGH_VEGETATION] == HIGH_VEGETATION
         ):
-            rule["merge"] = {**(rule["merge"] or {}), HIGH: sorted({HIGH, *LOWER})}
+            rule["merge"] = {
+                **(rule["merge"] or {}),
+                HIGH_VEGETATION: sorted({HIGH_VEGETATION, *LOWER}),
+            }
             report.notes.append(
                 "vegetation is one class, 5, in what is judged: of the reference "
                 f"{' and '.join(map(str, parts))} count as "

@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import GROUND, LOW, MEDIUM, by_height
-from ..base.asprs import HIGH as HIGH_VEGETATION
+from ..base.asprs import (
+    GROUND,
+    HIGH_VEGETATION,
+    LOW_VEGETATION,
+    MEDIUM_VEGETATION,
+    by_height,
+)
 from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, median_slope
@@ -118,7 +123,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
                 found=f"{self.model_file}, a forest",
                 cure="Use 'margin'",
             )
-        if self.vegetation_heights and (HIGH_VEGETATION not in codes or {LOW, MEDIUM} & set(codes)):
+        if self.vegetation_heights and (
+            HIGH_VEGETATION not in codes or {LOW_VEGETATION, MEDIUM_VEGETATION} & set(codes)
+        ):
             raise OptionError(
                 "option 'vegetation_heights' is for models that know vegetation as one class, 5",
                 found=f"classes {', '.join(map(str, codes))}",
@@ -208,7 +215,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
     def written_classes(self) -> set[int]:
         """Return the class codes that may be written."""
         rejected = set() if self._rejected is None else {self._rejected}
-        heights = {LOW, MEDIUM} if self.vegetation_heights else set()
+        heights = {LOW_VEGETATION, MEDIUM_VEGETATION} if self.vegetation_heights else set()
         return {code for code, _ in self.model.classes} | rejected | heights
 
     @property
@@ -259,7 +266,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
             by_height(codes, wanted & ~rejected, points.dimension(HEIGHT), self.vegetation_heights)
             prediction.report.figures["classes"] = class_counts(codes[wanted])
         if HEIGHT in points.arrays:
-            leaves = wanted & np.isin(codes, (LOW, MEDIUM, HIGH_VEGETATION))
+            leaves = wanted & np.isin(codes, (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION))
             leaf_heights = points.dimension(HEIGHT)[leaves]
             doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical)
             points.report.warnings += [doubt] if doubt else []

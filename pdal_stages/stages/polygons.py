@@ -34,7 +34,7 @@ class Polygons(ClassStage):
         """Refuse options that contradict each other."""
         self.overlays = [Overlay.parse(str(text)) for text in self.polygons]
         for overlay in self.overlays:
-            with_vector(overlay.check)
+            with_vector(overlay.find_layer)
 
     def inputs(self) -> list[str]:
         """Return the files that are read."""

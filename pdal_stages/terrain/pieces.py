@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.grid import GridWindow, cell_keys, group_by_key, key_offset, places_among
-from ..base.las_check import DAMAGED
+from ..base.las_check import CURE_OF_DAMAGE
 from .components import number_sets
 
 #: Cells of the largest raster that is made in one piece.
@@ -74,7 +74,7 @@ def refuse_scattered(counts: Collection[int]) -> None:
             "thousands of points lie alone, far from any other",
             found=f"{alone:,} of {sum(counts):,} points",
             cure="Look whether the file's scale and unit are right: pdal info --summary FILE. "
-            f"{DAMAGED}",
+            f"{CURE_OF_DAMAGE}",
         )
 
 

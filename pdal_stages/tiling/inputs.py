@@ -302,7 +302,9 @@ class Survey:
             if source.path in self.unreadable:
                 continue
             ept = source.kind == "ept"
-            projection = read_ept(source.path).get("srs") if ept else las.projection(source.path)
+            projection = (
+                read_ept(source.path).get("srs") if ept else las.projection_digest(source.path)
+            )
             kind = fingerprint(source.reader, projection)
             try:
                 if kind not in known:

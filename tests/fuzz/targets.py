@@ -150,7 +150,7 @@ def cloud(data: bytes) -> str:
     """A LAS or LAZ file: what passes the look at its header is read, whole or with an error."""
     path = put("cloud.laz", data)
     las_check.check_readable(path)
-    las.projection(path)
+    las.projection_digest(path)
     extra_dimensions(path)
     extent = inputs.las_extent(str(path))
     assert (
