@@ -22,8 +22,11 @@ from ..pipeline.las_chunks import can_read_chunks, laspy_header, read_chunks
 from ..pipeline.las_output import finish
 from ..pipeline.spatial_reference import reference_of_file
 
-#: Share of points without a partner beyond which two files hold different points.
+#: Share of points without a partner beyond which two files hold different points: large enough for
+#: points that a person deleted, small enough to notice another file; not tuned.
 MAX_LOST_SHARE = 0.1
+#: Farthest that editing moves a point, in steps of the coarser coordinates, which round; not tuned.
+MAX_STEPS = 3.0
 #: Layer of a review that holds patches.
 PATCHES = "patches"
 #: Column of that layer, 1 for checked patches.
@@ -161,7 +164,7 @@ def _edited_codes(
     both = {*las.point_format.dimension_names} & {*other.point_format.dimension_names}
     names = [name for name in _DISTINGUISHING if name in both]
     pairs = [(np.asarray(las[name]), np.asarray(other[name])) for name in names]
-    index = match_points(xyz, theirs, step, pairs, max_distance=3.0 * step)
+    index = match_points(xyz, theirs, step, pairs, max_distance=MAX_STEPS * step)
     lost, extra = int((index < 0).sum()), len(theirs) - int((index >= 0).sum())
     if max(lost, extra) > MAX_LOST_SHARE * len(xyz):
         raise StageError(
@@ -180,7 +183,10 @@ def _edited_codes(
 def _in_area(
     area: str, xyz: NDArray[np.float64], wkt: str, warnings: list[str]
 ) -> NDArray[np.bool_]:
-    """Return which points lie in polygons of a file; of a review's patches, in checked ones."""
+    """Return which points lie in polygons of a file.
+
+    Where polygons have a column `DONE`, as a review's patches do, those with a 1 count.
+    """
     file, _, layer = area.partition("|layername=")
     pyogrio = vector("pyogrio")
     with reading(file) as name:

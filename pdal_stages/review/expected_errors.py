@@ -1,7 +1,8 @@
 """Expected errors (sums of 1 - Reliability) in cells of an absolute grid, and patches to check.
 
-Cells add up, so files can be read one after the other, in parts, in any order. On surveys that a
-model was not trained on, a tenth of the area holds 14 to 81 % of the wrong points.
+Cells add up, so files can be read one after the other, in parts, in any order. What share of the
+wrong points the first patches hold, benchmarks/surveys/review.py measures on surveys that a model
+was not trained on.
 """
 
 from __future__ import annotations
@@ -17,16 +18,19 @@ from ..base.grid import cell_numbers
 
 @dataclass(frozen=True)
 class ReviewRules:
-    """Sizes of cells and patches, and the time it takes to check these."""
+    """Sizes of cells and patches, and the time it takes to check these.
+
+    Values without a reason are not tuned.
+    """
 
     min_side: float = 1.0  #: of a cell, meters
-    max_side: float = 16.0  #: of a cell, meters
-    points_per_cell: float = 4.0  #: on average, where cells are not as wide as allowed
-    max_cells: int = 1 << 24  #: held at a time, about
-    hot_share: float = 0.1  #: cells, those with most expected errors, that form their own patches
+    max_side: float = 16.0  #: of a cell, meters; a whole part of a block
+    points_per_cell: float = 4.0  #: on average; cells with fewer are widened, up to `max_side`
+    max_cells: int = 1 << 24  #: of the whole area; more are widened likewise, to bound the memory
+    hot_share: float = 0.1  #: of the cells of all files: those with most expected errors
     block: float = 64.0  #: side of the blocks at whose borders patches end, meters
-    seconds_to_reach: float = 5.0  #: for a person to go to a patch
-    seconds_per_100_m2: float = 2.5  #: for a person to check it
+    seconds_to_reach: float = 5.0  #: for a person to go to a patch; an estimate, not measured
+    seconds_per_100_m2: float = 2.5  #: for a person to check it; an estimate, not measured
 
 
 RULES = ReviewRules()
@@ -138,8 +142,8 @@ class Patches:
 def find_patches(cells: ReviewCells) -> Patches:
     """Group cells into patches.
 
-    The cells of a block with most expected errors are seen at a glance, so they are a patch, and
-    the rest another one.
+    The hot cells of a block, those among the `hot_share` of all files' cells with most expected
+    errors, are a patch, and its other cells another one.
     """
     total = cells.errors.sum(axis=1)
     limit = np.quantile(total, 1.0 - RULES.hot_share) if len(total) else 0.0

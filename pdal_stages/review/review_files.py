@@ -29,21 +29,23 @@ from ..pipeline.inputs_outputs import input_files
 from ..pipeline.las_chunks import can_read_chunks, read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
-from ..reports.page import render
+from ..reports.page import TABLE_ROWS, render
 from ..reports.vector_files import Layer, check_target, qml, write_layers
 from ..stages.points import Points
 from .expected_errors import Patches, ReviewCells, cell_side, find_patches
 
 #: Dimensions that are read where they exist.
 DIMENSIONS = ("Reliability", "ReturnNumber", "NumberOfReturns")
-#: Patches in the JSON file.
-MAX_ROWS = 1000
+#: Patches in the JSON file: more than a person checks in an hour, at 5 s or more each.
+JSON_ROWS = 1000
 #: Layers of the vector file.
 LAYERS = ("patches", "tiles")
-#: Rows in the page's tables.
-PAGE_ROWS = 200
-#: Rows in the text.
+#: Rows in the text: few enough for a terminal.
 TEXT_ROWS = 10
+#: Shares of the expected errors for which the page has the time that finds them.
+TIMED_SHARES = (0.25, 0.5, 0.75, 0.9)
+#: Quantiles of patches' expected errors at which the colors change; not tuned.
+COLOR_QUANTILES = (0.5, 0.8, 0.95)
 #: Fill colors (red, green, blue, opacity) of patches, from fewest to most expected errors.
 PATCH_COLORS = ("255,237,160,110", "254,178,76,150", "240,59,32,170", "165,0,38,190")
 #: Fill color of patches that were checked.
@@ -111,7 +113,7 @@ class Review:
             "listed": self.listed,
             "cell": self.cells.side,
             "tiles": self.tiles,
-            "worst": self.rows[:MAX_ROWS],
+            "worst": self.rows[:JSON_ROWS],
         }
 
 
@@ -215,15 +217,15 @@ def _points_and_area(files: Sequence[str], references: dict[str, Any]) -> tuple[
             west, south, east, north = header.box
             points += header.count
             area += (east - west) * (north - south) * references[path].units.horizontal ** 2
-    return (points, area) if area > 0 else (1, 1e-9)
+    return points, area
 
 
-def compute_reliability(points: Mapping[str, NDArray], name: str) -> NDArray[np.float32]:
+def compute_reliability(points: Mapping[str, NDArray], model_name: str) -> NDArray[np.float32]:
     """Return the probability (n,) that a model gives to the class of each point.
 
     It is 1 for classes that the model does not know.
     """
-    model = loaded_model(name)
+    model = loaded_model(model_name)
     dimensions = {name: points[name] for name in model.optional_dimensions if name in points}
     result: Any = model.predict(points["xyz"], dimensions, probabilities=True)
     column_of_code = np.full(256, -1)
@@ -298,7 +300,7 @@ def review_page(review: Review) -> str:
         ("Patches", f"{result['listed']:,}", "", "in the vector file, worst first"),
     ]
     errors, minutes = np.cumsum(review.patches.errors), np.cumsum(review.patches.minutes)
-    for share in (0.25, 0.5, 0.75, 0.9) if expected > 0 else ():
+    for share in TIMED_SHARES if expected > 0 else ():
         place = min(int(np.searchsorted(errors, share * errors[-1])), len(minutes) - 1)
         time = duration(60 * minutes[place])
         figures.append((f"{100 * share:.0f} % of these", time, "", "of looking"))
@@ -307,9 +309,10 @@ def review_page(review: Review) -> str:
         title="Where to look",
         subtitle=count_of(len(result["tiles"]), "file"),
         figures=figures,
-        tiles=result["tiles"][:PAGE_ROWS],
-        hidden=max(0, len(result["tiles"]) - PAGE_ROWS),
-        patches=result["worst"][:PAGE_ROWS],
+        tiles=result["tiles"][:TABLE_ROWS],
+        hidden=max(0, len(result["tiles"]) - TABLE_ROWS),
+        patches=result["worst"][:TABLE_ROWS],
+        listed=result["listed"],
     )
 
 
@@ -346,7 +349,7 @@ def styles(errors: NDArray[np.float64]) -> dict[str, str]:
     outlines.
     """
     positive = errors[errors > 0]
-    steps = np.quantile(positive, [0.5, 0.8, 0.95]) if len(positive) else np.array([1.0, 2.0, 3.0])
+    steps = np.quantile(positive, COLOR_QUANTILES) if len(positive) else np.array([1.0, 2.0, 3.0])
     low, middle, high = (f"{value:.0f}" for value in steps)
     rules = [  # some match nothing where steps coincide
         (f"below {low} points expected wrong", f"done = 0 and expected < {low}"),
