@@ -45,7 +45,7 @@ def town(tmp_path_factory, write_las):
 @pytest.fixture(scope="module", autouse=True)
 def few_samples():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adapting, "COUNT", 500)
+        patch.setattr(adapting, "SAMPLES_OF_A_CLASS", 500)
         yield
 
 
@@ -63,7 +63,8 @@ def test_is_a_model_that_says_what_it_is_of(model, town, tmp_path, capsys):
     standard = ps.load_model("standard")
     assert made.voxel == standard.voxel and made.info["preparation"] == standard.info["preparation"]
     assert (
-        made.info["teacher"]["name"] == "standard" and made.info["teacher"]["sure"] == adapting.SURE
+        made.info["teacher"]["name"] == "standard"
+        and made.info["teacher"]["sure"] == adapting.LEAST_RELIABILITY
     )
     assert "what standard is sure of (0.7 and more)" in str(made)
     assert "not scored" in str(made) and "overall accuracy" not in str(made)

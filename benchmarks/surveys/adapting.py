@@ -25,7 +25,7 @@ from surveys import SURVEYS
 
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.train_survey import SURE, adapt
+from pdal_stages.tiling.train_survey import LEAST_RELIABILITY, adapt
 
 CODES = (2, 5, 6)
 
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the clouds")
     parser.add_argument("--models", type=Path, required=True, help="folder of the models left out")
     parser.add_argument("--surveys", nargs="+", default=list(SURVEYS), choices=list(SURVEYS))
-    parser.add_argument("--sure", type=float, default=SURE)
+    parser.add_argument("--sure", type=float, default=LEAST_RELIABILITY)
     parser.add_argument("--json", type=Path, help="where the figures go")
     given = parser.parse_args()
     rows = []

@@ -27,10 +27,11 @@ from .configuration import Configuration
 COVERAGE = 4.0
 #: Farthest point a batch takes, in spacings. A batch of full size in even density has 1.13.
 REACH = 1.5
-#: How often a cell may be halved.
+#: How often a cell may be halved: of a spacing of 16 m a cell is then a micrometer.
 DEEPEST = 24
-#: Points of a bucket of the farthest point sampling.
+#: Points of a bucket of the farthest point sampling: for speed alone.
 BUCKET = 64
+# [WM19] does not augment; the numbers of augmentation were not tuned.
 #: Augmentation: most that a batch's center moves along x and y, in spacings.
 SHIFT = 0.5
 #: Augmentation: standard deviation of noise on coordinates, meters; it is cut at three times that.

@@ -21,7 +21,8 @@ from .network import NumpyNetwork, Weights, check_weights
 #: A network whose batch would need more megabytes is not loaded; the published ones need a few
 #: thousand.
 MOST_MB = 32_768
-#: Meters that become 1 where X, Y or Z is an input.
+#: Meters that become 1 where X, Y or Z is an input (not tuned). Model files do not hold it, so
+#: another number makes networks wrong that were trained before.
 METERS = 10.0
 
 

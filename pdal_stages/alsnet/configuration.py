@@ -17,7 +17,7 @@ from ..base import checks
 from ..base.checks import Settings, setting
 from ..base.errors import OptionError, suggest
 
-#: A configuration's largest number of shared layers: a model file holds 63 arrays.
+#: A configuration's largest number of layers, each an array; a model file may hold 95 arrays.
 MAX_LAYERS = 60
 
 

@@ -1,6 +1,6 @@
 """The network: PointNet++ as [WM19] uses it, its weights, and NumPy that applies it.
 
-Only training needs PyTorch.
+Training and a GPU need PyTorch: :mod:`.torch_network`.
 """
 
 from __future__ import annotations

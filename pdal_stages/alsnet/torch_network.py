@@ -24,7 +24,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 torch: Any = optional_import("torch", "deep", "training an alsNet, or applying one on a GPU")
 nn: Any = torch.nn
 
-#: Share of a batch's statistics in the running ones.
+#: Share of a batch's statistics in the running ones (PyTorch's default is 0.1; not tuned).
 MOMENTUM = 0.05
 #: First part of what a checkpoint must agree with; changes with what is stored.
 CHECKPOINT_FORMAT = "pdal-stages alsnet checkpoint 4"
@@ -96,7 +96,7 @@ def apply_on_device(
 
     It runs on a device of PyTorch.
 
-    They equal those of ``weights.NumpyNetwork`` up to rounding.
+    They equal those of ``network.NumpyNetwork`` up to rounding.
     """
     network = Network(configuration, inputs, classes).load(weights).to(device).eval()
 

@@ -28,7 +28,8 @@ from .configuration import NetworkOptions
 from .network import Weights, check_weights, initial_weights
 from .training_data import TrainingData, class_weights, cover, select_batches
 
-#: Share of the first learning rate that is left at the last epoch; in between it follows a cosine.
+#: Share of the first learning rate that is left at the last epoch; in between it follows a cosine
+#: (not tuned).
 LAST_RATE = 0.01
 
 optional_inputs: dict[str, tuple[str, ...]] = {}

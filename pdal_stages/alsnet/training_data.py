@@ -20,6 +20,9 @@ from .classifier import AlsNet, make_pyramid, normalize_inputs
 
 #: An input whose standard deviation is lower is not divided by it.
 _LEAST_DEVIATION = 1e-6
+#: Spacings between two clouds that are joined. A batch's points lie within `REACH` of its grid
+#: point, so more than two of these would do.
+_APART = 8.0 * REACH
 
 
 class TrainingData:
@@ -122,7 +125,7 @@ def join_clouds(
         if len(xyz):
             steps = 0.0 if right is None else np.ceil((right - xyz[:, 0].min()) / spacing)
             xyz = xyz + np.array([steps * spacing, 0.0, 0.0])
-            right = float(xyz[:, 0].max()) + 8.0 * REACH * spacing
+            right = float(xyz[:, 0].max()) + _APART * spacing
         out.append(xyz)
     return np.concatenate(out)
 
@@ -160,7 +163,10 @@ def select_batches(
 def hold_out(
     xyz: npt.NDArray[np.float64], labels: npt.NDArray[Any], share: float, block_size: float
 ) -> npt.NDArray[np.bool_]:
-    """Return which labeled points (not -1) lie in the blocks held out for validation."""
+    """Return which labeled points (not -1) lie in the blocks held out for validation.
+
+    These are one fold of a whole number: of `share` 0.4 it is one of two, a half.
+    """
     out, use = np.zeros(len(xyz), bool), np.flatnonzero(labels >= 0)
     if share == 0.0:
         return out

@@ -26,8 +26,15 @@ from .context_features import HEIGHT, CellContext, Context, count_shares, rows_n
 from .feature_forest import CloudFeatures, FeatureForest, Features
 from .interface import Block, InputPlan, PredictRequest, weigh
 
-#: Points of a band at most, but for a band of one strip.
+#: Points of a band at most, but for a band of one strip: the features of a few bands are held (not
+#: tuned; results do not depend on it).
 BAND = 150_000
+
+#: Width of strips where there is no context, meters.
+_ANY_WIDTH_M = 8.0
+#: Share of the memory for blocks under way: features that are held for later passes need some, too
+#: (not tuned).
+_SHARE_OF_BLOCKS = 0.5
 
 
 def plan_of(passes: Sequence[Any]) -> FeaturePlan | InputPlan:
@@ -137,7 +144,8 @@ class PassRun:
         for later in self._contexts[:0:-1]:
             wanted.insert(0, rows_needed(request.xyz, wanted[0], later))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
-        width = max((each.strip for each in self._contexts[1:]), default=0.0) or 8.0
+        # Where no pass reads strips beside its own any width will do.
+        width = max((each.strip for each in self._contexts[1:]), default=0.0) or _ANY_WIDTH_M
         self._strips = Strips(request.xyz, wanted[0], width)
         n = len(self._strips)
         #: (n, classes) of each step but the last, in the order of the strips
@@ -183,7 +191,7 @@ class PassRun:
                     yield kept, result
         elif features is not None and len(rows):
             held[features] = []
-            run = features.run(rows, memory_share=0.5)
+            run = features.run(rows, memory_share=_SHARE_OF_BLOCKS)
             on_blocks = replace(work, run=run, keep=features in self._features[step + 1 :])
             for block, result in map_blocks(on_blocks.compute, run.ranges, threads):
                 features.count(run, block)

@@ -18,7 +18,8 @@ from ..base.checks import strict_json
 from ..base.errors import ModelError, OptionError
 from ..base.messages import one_line
 
-#: Bins of reliability from 0 to 1; the last one holds 1.
+#: Bins of reliability from 0 to 1; the last one holds 1. Model files hold so many counts, so
+#: another number needs another version of their format (not tuned).
 BINS = 64
 #: End of the name of the file beside a model that holds its calibration.
 SUFFIX = ".calibration.json"

@@ -5,6 +5,8 @@ Space is cut into cells of an absolute grid. The probabilities of the pass befor
 the number of points there. So a value has the same bits for any order of points, number of threads,
 and in any tile that holds those cells; and a point costs as much in a dense cloud as in a sparse
 one.
+
+What a token means has no version in model files: a change gets a new token (CONTRIBUTING.md).
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..base.asprs import GROUND
 from ..base.errors import ModelError, OptionError
 from ..base.grid import compact_keys, places_among
 from ..base.threads import map_blocks
@@ -36,8 +39,6 @@ OWN = "own"
 SEGMENTS = "segments"
 #: Dimension that segments read.
 HEIGHT = "HeightAboveGround"
-#: Code of the class whose votes do not count against those of a segment.
-GROUND = 2
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,7 @@ class Context:
         segments = {}
         for token, code in self.segment_codes.items():
             assert height is not None
+            # Votes for ground do not count against those of a segment.
             target, ground = codes.index(code), codes.index(GROUND) if GROUND in codes else None
             heights = np.asarray(height, np.float64)
             segments[token] = describe_segments(xyz, shares, heights, target, ground)

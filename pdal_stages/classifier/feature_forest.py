@@ -20,6 +20,9 @@ from .random_forest import Forest
 from .refinement import Blend
 from .registry import FOREST, REFINED_FOREST
 
+#: Blocks of features get so many megabytes at least, whatever the request says (not tuned).
+_LEAST_MB = 16.0
+
 
 @dataclass(frozen=True, eq=False)
 class Features:
@@ -99,7 +102,7 @@ class CloudFeatures:
         return self._engine.run(
             rows,
             dimensions=self._take,
-            memory_mb=max(request.memory_mb * memory_share, 16.0),
+            memory_mb=max(request.memory_mb * memory_share, _LEAST_MB),
         )
 
     def blocks(

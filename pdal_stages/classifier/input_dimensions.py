@@ -15,7 +15,9 @@ from ..features import return_features
 COORDINATES = ("X", "Y", "Z")
 #: Dimensions that a model is trained on by default.
 DEFAULT_DIMENSIONS = ("HeightAboveGround",)
-#: Dimensions that a model is trained on as well where the points have them.
+#: Dimensions that a model is trained on as well where the points have them: what `PREPARATION` in
+#: stages/preprocessing.py makes. Widths of 5 and 17 m: what they gain is in docs/trials.md. Models
+#: name their dimensions, so changing these changes only models trained from then on.
 OPTIONAL_DIMENSIONS = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17")
 #: Dimension that is 1 where a person has checked a point's class.
 CHECKED = "Checked"

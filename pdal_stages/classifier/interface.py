@@ -66,9 +66,10 @@ class PassClassifier(Protocol):
     """Classifier that is one pass of a model.
 
     A kind that reads features and the context of the pass before has ``probabilities(values,
-    rows)``: (b, classes) from features and context (b, inputs) at `rows`. One that reads the points
-    themselves can only be the first pass, and has ``predict(request)``, which yields a
-    :class:`Block` after the other, with each row wanted once.
+    rows)``: (b, classes) from features and context (b, inputs) at `rows`, and
+    ``classes_before(codes)``: the classes of the pass before, where its own are `codes`. One that
+    reads the points themselves can only be the first pass, and has ``predict(request)``, which
+    yields a :class:`Block` after the other, with each row wanted once.
     """
 
     #: arrays that the kind stores in a model file; a name that ends in ``*`` stands for many

@@ -36,7 +36,8 @@ from .prediction import (
 )
 from .registry import classifier_of, preprocessing
 
-#: How many times sparser or denser than those trained on a cloud may be without a warning.
+#: How many times sparser or denser than those trained on a cloud may be without a warning (not
+#: tuned).
 DENSITY_TOLERANCE = 2.0
 #: What importances are summed by.
 GROUPINGS = ("column", "feature", "group", "neighborhood")
@@ -426,7 +427,7 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
                 raise ModelError(f"{here} must have {length} {key}", found=len(entry[key]))
         if bool(number) != bool(entry["context"]) or (number and passes[0].features is None):
             raise ModelError(
-                "every pass but the first must read context, and a network is the only one",
+                "the first pass reads no context, each later one does, and none follows a network",
                 found=here,
             )
         classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, of_pass, codes_here)
@@ -434,9 +435,11 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
             raise ModelError("a pass reads other classes than the one before gives", found=here)
         passes.append(classifier)
         before = codes_here
-    priors = manifest.get("priors") or {"factors": codes}
-    if before != codes or len(priors["factors"]) != len(codes):
+    if before != codes:
         raise ModelError("the last pass has other classes than the model", found=before[:10])
+    priors = manifest.get("priors")
+    if priors is not None and len(priors["factors"]) != len(codes):
+        raise ModelError("priors need a factor for each class", found=len(priors["factors"]))
     info = {k: value for k, value in manifest.items() if k not in ("format", "version", "arrays")}
     scores = ("importances", "codes", "factors")
     info["passes"] = [

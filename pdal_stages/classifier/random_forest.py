@@ -24,9 +24,10 @@ from .interface import ArrayRule
 if TYPE_CHECKING:
     from .training_options import TrainingOptions
 
-#: Levels below the root a tree may have.
+#: Levels below the root a tree may have: a bound for files from strangers.
 MAX_DEPTH = 10_000
 #: Rows that walk a tree together: many nodes are loaded at a time.
+#: For speed alone, like GROUP: results do not depend on it.
 LANES = 8
 #: Rows that walk one tree before the next one's turn: their values stay in a core's cache.
 GROUP = 2048

@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 
-#: Labeled points of the rarest class with which a forest counts as much as its base.
+#: Labeled points of the rarest class with which a forest counts as much as its base (not
+#: tuned).
 EVEN = 30
 #: Least sum of probabilities that is divided by.
 _SMALLEST = 1e-300

@@ -28,18 +28,17 @@ from ..base.grid import places_among
 from ..base.hashing import hash_rows
 from ..base.progress import Progress
 
-#: Side of a cell of the curve in meters.
+#: Side of a cell of the curve in meters (not tuned).
 CELL = 0.5
-#: Points of a class that are put in order at a time; of more, those with the smallest hashes.
-MOST = 5_000_000
-
-
+#: Points of a class that are put in order at a time, to bound memory (not tuned); of more, those
+#: with the smallest hashes.
+MOST_IN_ORDER = 5_000_000
 #: Side of a block of ground held out, in meters: wider than the neighborhoods of features.
-BLOCK = 25.0
+BLOCK_M = 25.0
 #: Where too few blocks have samples the side is halved, but not below this many meters.
 SMALLEST_BLOCK = 0.02
 #: Fewer surveys than this are cut into blocks: else too little would be left to train on.
-SURVEYS = 3
+FEWEST_SURVEYS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +126,7 @@ def draw_samples(
             state = [seed, position]
             if not is_alone:
                 state.append(crc32(str(names[group]).encode()))
-            share = min(1.0, MOST / there[group, position])
+            share = min(1.0, MOST_IN_ORDER / there[group, position])
             numbers = np.flatnonzero(of_cloud == group).tolist()
             keys, row, cloud = _keys_of_class(clouds, numbers, position, seed, share, progress)
             cell = np.zeros_like(keys["cell"]) if random_order else keys["cell"]
@@ -236,7 +235,7 @@ class Folds:
     surveys: dict[str, int]  #: fold of each, where whole surveys are folds
     #: of blocks in meters, which are anchored to absolute coordinates: overlapping clouds share
     #: them
-    side: float = BLOCK
+    side: float = BLOCK_M
     #: (m,) number of each block that has samples, ascending; other blocks are dealt by their number
     blocks: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     #: (m,) their folds
@@ -287,10 +286,10 @@ class Folds:
         Of surveys there are up to twice as many folds.
         """
         names = sorted(set(surveys))
-        if len(names) >= SURVEYS:
+        if len(names) >= FEWEST_SURVEYS:
             folds = min(2 * folds, len(names))
             return cls(folds, {name: number % folds for number, name in enumerate(names)})
-        side = BLOCK
+        side = BLOCK_M
         while side >= SMALLEST_BLOCK:
             try:
                 return cls.of_blocks(xy, label, weight, folds, side)

@@ -29,7 +29,9 @@ from ..terrain.components import number_sets
 class SegmentRules:
     """Sizes of cells and windows, and the limits of what is reported; lengths in meters.
 
-    Limits keep the forest from splitting at heights that only one town of its training has.
+    Limits (``max_...``) keep the forest from splitting at heights that only one town of its
+    training has. The values were not tuned; docs/trials.md has what segments gain as they are.
+    Whoever changes one changes what models of older releases read: see CONTRIBUTING.md.
     """
 
     cell: float = 2.0  #: side of a cell: at 0.3 points per square meter they still touch

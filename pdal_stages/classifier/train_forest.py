@@ -28,15 +28,17 @@ from .interface import PredictRequest, weigh
 from .model import Model
 from .random_forest import Forest, grow_forest
 from .refinement import Blend, describe_refinement, trust
-from .sampling import BLOCK, Folds, Samples, draw_samples, figures, split
+from .sampling import BLOCK_M, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 
-#: Folds of the cross-validation by default.
+#: Folds of the cross-validation by default (not tuned).
 DEFAULT_FOLDS = 5
-#: Trees of a forest that judges a fold, as a share of the final one's.
+#: Trees of a forest that judges a fold, as a share of the final one's: five folds then cost about
+#: as much as it (not tuned).
 FOLD_TREES = 0.25
-#: Parts of the training ground held out in turn to train the passes after the first.
+#: Parts of the training ground held out in turn to train the passes after the first, where they are
+#: blocks; of whole surveys there are up to twice as many (not tuned).
 PASS_FOLDS = 5
 #: Key of the count of samples of tiles whose nearest neighbors lie beyond the halo of their
 #: features.
@@ -232,9 +234,7 @@ class ForestTraining:
         """Yield for each fold the samples held out, and a forest grown without them.
 
         Samples within `gap` meters of the fold are left out as well. OptionError where fewer than
-        `needed` classes are left.
-
-        OptionError where so few samples are left that fewer classes have any than are `needed`.
+        `needed` classes have samples left.
         """
         label, weight, count = self.samples.label, self.samples.weight, int(fold.max()) + 1
         with self.progress(count * self.fold_trees, what, "trees") as bar:
@@ -272,7 +272,7 @@ class ForestTraining:
             here = 0.0 if by == "surveys" else gap
             try:
                 if by == "blocks":
-                    blocks = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK)
+                    blocks = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK_M)
                     fold = blocks.points(self.xy)
                 else:
                     fold = (index % folds).astype(np.int16)
@@ -288,8 +288,8 @@ class ForestTraining:
                     by_groups["instead"] = reason
                 continue
             score = {"trees": self.fold_trees, **figures(matrix, codes)}
-            more = {"folds": int(fold.max()) + 1, "block_size": BLOCK, "gap": here, "chosen": score}
-            return {"by": by, **by_groups, **more}, {}
+            cut = {"folds": int(fold.max()) + 1, "block_size": BLOCK_M, "gap": here}
+            return {"by": by, **by_groups, **cut, "chosen": score}, {}
         return None, {"unscored": self._unscored(reason, gap)}
 
     def _groups(self, number: int) -> npt.NDArray[Any]:
@@ -315,14 +315,14 @@ class ForestTraining:
 
         It is the class on the fewest blocks of ground.
         """
-        cell = np.floor(self.xy / BLOCK)
+        cell = np.floor(self.xy / BLOCK_M)
         of_class = [self.samples.label == place for place in range(len(self.codes))]
         least = int(np.argmin([len(np.unique(cell[rows], axis=0)) for rows in of_class]))
         xy = self.xy[of_class[least]]
         x, y = (xy.min(axis=0) + xy.max(axis=0)) / 2
         return (
             f"there is no score on ground held out: {reason}. Label next, at least "
-            f"{BLOCK + gap:.0f} m away: "
+            f"{BLOCK_M + gap:.0f} m away: "
             f"{self.codes[least]} {self.labeled.classes.names[least]}, which lies around {x:.0f}, "
             f"{y:.0f}"
         )

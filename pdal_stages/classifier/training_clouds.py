@@ -28,7 +28,8 @@ from .class_map import MAX_LABEL, ClassMap
 from .input_dimensions import list_values
 from .training_options import TrainingOptions
 
-#: A thinned copy is made where it would have less than this share of the points.
+#: A thinned copy is made where it would have less than this share of the points: one of nearly all
+#: teaches nothing new (not tuned).
 WORTH = 0.75
 
 
@@ -149,7 +150,10 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
 
 
 def _left_out(options: TrainingOptions) -> list[int]:
-    """Return the labels that do not become classes by themselves: 0 and 1, unless of the base."""
+    """Return the labels that do not become classes by themselves, but for classes of the base.
+
+    They are 0, 1, noise (7, 18) and overlap (12).
+    """
     known = () if options.base is None else options.base.codes
     return [label for label in UNINFORMATIVE if label not in known]
 

@@ -20,17 +20,18 @@ from .context_features import OWN, Context
 from .recipes import with_recipe
 from .registry import FOREST, kinds, trainer_of
 
-#: Most passes a model can have.
+#: Most passes that training makes: a third one gained nothing (docs/trials.md).
 MOST_PASSES = 3
 #: Without `max_samples` a tree draws a third of the samples of a class, on average at least so many
+#: (not tuned)
 LEAST_PER_TREE = 1_000
-#: and at most so many.
+#: and at most so many: as in the trials of 40,000 samples of a class (docs/trials.md).
 PER_TREE = 10_000
 #: Passes by default.
 DEFAULT_PASSES = 2
-#: Context of passes after the first by default.
+#: Context of passes after the first by default: the five sizes of docs/trials.md.
 DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8")
-#: Context of the pass on top of a base by default.
+#: Context of the pass on top of a base by default (not tuned).
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
@@ -219,10 +220,9 @@ class TrainingOptions(Settings):
     context: Any = setting(
         None,
         "list",
-        "What passes after the first use: own, or box, boxvotes, column, columnvotes and a cell "
-        "size (box0.5); default: "
-        f"{','.join(DEFAULT_CONTEXT)}; with a base {','.join(CONTEXT_OF_BASE)}, or for several "
-        "passes own and the former",
+        "What passes after the first use: own; box, boxvotes, column, columnvotes and a cell size "
+        "(box0.5); segments and a class (segments6); default: "
+        f"{','.join(DEFAULT_CONTEXT)}; with a base {','.join(CONTEXT_OF_BASE)}",
     )
     base: Any = setting(
         None,

@@ -102,7 +102,7 @@ def _classify(options: argparse.Namespace) -> int:
     files, overrides = run_files(options), list(options.overrides)
     objects: WriteObjects | None = None
     if options.objects:
-        from ..tiling.objects_from_files import OPTIONS_OF, refuse_tiles, writer
+        from ..tiling.objects_from_files import OPTIONS_OF, objects_stage, refuse_tiles
 
         of_objects = [o for o in overrides if not o.by_tag and o.selector in OPTIONS_OF]
         overrides = [override for override in overrides if override not in of_objects]
@@ -117,7 +117,7 @@ def _classify(options: argparse.Namespace) -> int:
     print_messages(*task.request.cost)
     if wants_objects:
         with task.folders():
-            objects = writer(options.objects, of_objects)
+            objects = objects_stage(options.objects, of_objects)
             refuse_tiles(task)
     names = {code: one_line(name) for code, name in task.request.loaded.classes}
     if task.in_one_piece:

@@ -57,10 +57,10 @@ def add_commands(parser: Parser) -> None:
 
 def _objects(options: argparse.Namespace) -> None:
     """Write the objects of classified files."""
-    from ..tiling.objects_from_files import objects_of_files, writer
+    from ..tiling.objects_from_files import objects_of_files, objects_stage
 
     values = stage_options(options, *_OBJECT_OPTIONS)
-    stage = writer(options.output, options.overrides, **values)
+    stage = objects_stage(options.output, options.overrides, **values)
     objects_of_files(options.inputs, stage, options.workers, options.metadata)
 
 

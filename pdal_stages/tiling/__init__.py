@@ -1,1 +1,20 @@
-"""Run pipelines over inputs of any number and size: tiles with a halo, without seams."""
+"""Run pipelines over inputs of any number and size: tiles with a halo, without seams.
+
+Words of this room:
+
+- **head, tail**: the stages up to the last one that sees neighbors run on a tile and its
+  surroundings (the head); those after it, with the writers, on the points of one output (the tail).
+- **halo**: what is read around a tile, in meters (``_m``) or units of the coordinates (``_units``).
+  A tile that was read too narrowly is read again with a wider halo.
+- **piece**: the points of one input in a tile and its halo, as a temporary LAS file.
+- **round**: steps of the head that run on the whole survey, and save their results, before the next
+  round's steps see these. The last round runs on the tiles.
+- **square**: several tiles together, which the rounds before the last one run on.
+- **block**: a square of a far-reaching stage's raster (:class:`..stages.base.FarReaching`),
+  computed between two rounds; its grid is not that of the tiles. (In :mod:`.sorted_points` a
+  ``BLOCK`` is so many points.)
+- **job**: a tile, square, block or output, or an input that is to be read, and its state.
+- **mark**: fingerprint of everything that affects a job's result; ``--resume`` keeps what has the
+  same one. The marks of points (``_MARKS`` of :mod:`.run_tile`) are dimensions that say where a
+  point comes from.
+"""

@@ -15,7 +15,7 @@ from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR
 if TYPE_CHECKING:
     from .inputs import InputSource
 
-#: Most distinct warnings of tiles that a run repeats.
+#: Most distinct warnings of tiles that a run repeats (not tuned).
 _MOST_MESSAGES = 20
 _CHANGED = (
     "it changed during the run, so outputs may hold results from before and after. Once it no "
@@ -25,7 +25,7 @@ _CHANGED = (
 
 @dataclass
 class Job:
-    """A task of a run and its state: a tile, an output of tiles, or a part of the first round."""
+    """A task of a run and its state: a tile, square, block or output, or an input to be read."""
 
     name: str  #: its key in the work folder
     points: int = 0  #: its own; 0 where unknown before it is read
@@ -35,6 +35,7 @@ class Job:
     outputs: list[str] | None = None
     jobs: list[Job] = field(default_factory=list)  #: those that it needs: an output its tiles
     mark: str = ""  #: fingerprint of everything that affects its result
+    target: str = ""  #: of an input to be read: the path of its sorted copy
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier
     #: run) or ``failed``.
     state: str = "waiting"

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 OPTIONS_OF = ("writers.objects", "filters.objects")
 #: Dimensions that are read of LAZ 1.4 (see :func:`.las_chunks.read_chunks`).
 _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
-#: Cells are not enlarged beyond this automatically: neighboring houses would merge.
-LARGEST = 4.0
+#: Meters; cells are not enlarged beyond this automatically: neighboring houses would merge.
+LARGEST_CELL = 4.0
 
 
 def refuse_tiles(task: ClassifyTask) -> None:
@@ -81,7 +81,7 @@ def objects_of_files(
     return {"files": files, **summary}
 
 
-def writer(output: str, overrides: Sequence[Override] = (), **options: Any) -> WriteObjects:
+def objects_stage(output: str, overrides: Sequence[Override] = (), **options: Any) -> WriteObjects:
     """Return the stage with the options of the command, ``--writers.objects.NAME=VALUE``."""
     for override in overrides:
         if override.by_tag or override.selector not in OPTIONS_OF:
@@ -108,7 +108,7 @@ def _find_in_files(
         if "cell" in stage.set_options:
             message += f"objects may fall apart: try --cell {2 * size:g}"
         else:
-            while cells.sparse_kind() and cells.size < LARGEST:
+            while cells.sparse_kind() and cells.size < LARGEST_CELL:
                 cells = cells.doubled()
             message += (
                 f"cells of {cells.size:g} m are used, where roofs look rougher; --cell {size:g} "

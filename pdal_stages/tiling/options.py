@@ -21,7 +21,9 @@ PER = ("auto", "file", "tile")
 #: Largest side of a tile, in units of the coordinates, and buffer: more than the Earth's
 #: circumference in feet.
 LARGEST_TILE = 1e9
-#: Bytes of a worker for programs and model; all memory is described in docs/large-areas.md.
+# The bytes of memory follow measured peaks of workers, which a run's report has as
+# `peak_mb_of_a_worker`; docs/large-areas.md says how they add up.
+#: Bytes of a worker for programs and model.
 BASE = 350 << 20
 #: Bytes of a point of a tile with its halo.
 TILE_POINT = 285
@@ -29,17 +31,18 @@ TILE_POINT = 285
 FILE_POINT = 250
 #: Bytes that the `memory` option of our stages allows.
 STAGES = 512 << 20
-#: Memory of a raster cell of a block in the first round.
+#: Bytes of a raster cell of a block of a far-reaching stage.
 _CELL = 200
 #: Larger output files are assembled in parts of this many points, so that memory does not grow with
 #: the file.
 MOST_AT_ONCE = 4_000_000
-#: Memory of the main process.
+#: Bytes of the main process.
 PARENT = 350 << 20
-#: Most points of a tile of automatic size: a failed tile is lost, and progress is counted in tiles.
+#: Most points of a tile of automatic size: larger ones gained nothing (docs/large-areas.md), a
+#: failed tile is lost, and progress is counted in tiles.
 _MOST_OF_A_TILE = 3_000_000
-#: A square of the first round is as many times wider than its halo: what is read twice is then
-#: about a half.
+#: A square of a round before the last is as many times wider than its halo: what is read twice is
+#: then about a half, as (1 + 2/8)² is 1.56.
 _HALOS_OF_A_SQUARE = 8
 #: Sides to choose from, in units of the coordinates: round numbers, from 1 to 8,000,000.
 _SIDES = [
@@ -66,7 +69,8 @@ class TilingOptions:
     #: the free memory
     memory: int | None = None
     resume: bool = False  #: keep what an earlier run finished
-    most_points: int = 5_000_000  #: most points of a tile that is read again with a wider halo
+    #: most points of a tile that is read again with a wider halo (not tuned)
+    most_points: int = 5_000_000
 
     def __post_init__(self) -> None:
         """Check the options; OptionError where they are wrong or contradict each other."""
@@ -164,7 +168,7 @@ class Density:
 
 
 def block_bytes(blocks: Blocks, area_m2: float) -> float:
-    """Return the bytes of a block of the first round, with at most `area_m2` of points."""
+    """Return the bytes of a block of a far-reaching stage, with at most `area_m2` of points."""
     return min((blocks.side + 2 * blocks.reach) ** 2, area_m2) / blocks.cell**2 * _CELL
 
 
@@ -236,7 +240,7 @@ def choose_tiles(
 def tiles_per_square(
     options: TilingOptions, density: Density, side: float, halo_units: float
 ) -> int:
-    """Return how many tiles of a `side` make the side of a square of the first round.
+    """Return how many tiles of a `side` make the side of a square of rounds before the last.
 
     Its halo is wide, so squares are eight times as wide where as many points fit into the memory as
     a tile may have.

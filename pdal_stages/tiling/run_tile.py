@@ -47,7 +47,8 @@ from .write_outputs import (
     write_tile,
 )
 
-#: How many times a tile is read again with a wider halo.
+#: How many times a tile is read again with a wider halo (not tuned); one that needs more is
+#: reported as ``short``.
 _MOST_WIDENINGS = 3
 _MARKS = (ROW, INPUT, OUTSIDE)
 
@@ -296,7 +297,7 @@ class _HeadRun:
             self.reduced.append(stage.reduce_points(points))
 
 
-def _joined(parts: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+def _concatenate_by_name(parts: list[dict[str, NDArray]]) -> dict[str, NDArray]:
     """Return the arrays of all views together, by name."""
     return {
         name: np.concatenate([part[name] for part in parts if name in part])
@@ -322,7 +323,7 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
 
 
 def _marked(number: int, piece: Piece, unit: float, changed: ChangedValues) -> NewValues:
-    """Return new values that number a piece's points, with those of the first round."""
+    """Return new values that number a piece's points, with those that an earlier round changed."""
     count = len(piece.index)
     marks = {
         ROW: np.arange(count, dtype=np.uint32),
@@ -401,7 +402,7 @@ def run_tile(
         if number + 1 < len(context.plan.rounds):
             arrays = arrays if part.kept else {}
         if part.blocks is not None:
-            arrays |= _joined([{"around": np.empty((0, 3))}, *head.reduced])
+            arrays |= _concatenate_by_name([{"around": np.empty((0, 3))}, *head.reduced])
         save_arrays(target, arrays)
         return record | {"outputs": written([target])}
 

@@ -33,8 +33,9 @@ from .sorted_points import TEMPORARY, is_intact, sort_points
 from .tile_grid import Box, TileGrid
 from .write_outputs import write_file
 
-#: A run stops when this many tiles failed for the same reason and none succeeded.
+#: A run stops when this many tiles failed for the same reason and none succeeded (not tuned).
 _HOPELESS = 10
+# These estimate a dry run's need of disk; the true number depends on the dimensions of the stages.
 #: Bytes on disk for the results of a point until its output is written.
 _KEPT = 60
 #: Bytes on disk for a point until the far-reaching stage has run.
@@ -184,9 +185,9 @@ class _Run:
         self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
         self.cpu_seconds = 0.0  #: of tasks, including failed ones
         self.peak_mb = 0.0  #: peak memory of a process
-        self.messages_before: list[list[str]] = []  #: warnings and notes of the first round
+        self.messages_before: list[list[str]] = []  #: of the rounds before the last
         #: How far around a tile, in units of the coordinates, inputs are available: its halo may
-        #: have to grow.
+        #: have to grow (four halos are room for that, not tuned).
         halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
         self.farthest = max(4 * survey.halo_units, halo_units + survey.grid.size)
 
@@ -267,11 +268,11 @@ class _Run:
                 if known and (not wanted or is_intact(index)):
                     survey.indexes[source.path] = index
                     continue
-            waiting.append(Job(name, survey.extents[source.path].count, source=source, mark=copy))
+            waiting.append(Job(name, survey.extents[source.path].count, source=source, target=copy))
 
         def task_of(job: Job) -> Callable[[], Any]:
             assert job.source is not None
-            return partial(sort_points, job.source.path, survey.grid, job.mark)
+            return partial(sort_points, job.source.path, survey.grid, job.target)
 
         for job in self._do("reading the inputs", waiting, task_of):
             assert job.source is not None
@@ -281,7 +282,7 @@ class _Run:
             if job.reason:
                 survey.unreadable[path] = job.reason
                 continue
-            index = survey.indexes[path] = CloudIndex.parse(job.record, job.mark)
+            index = survey.indexes[path] = CloudIndex.parse(job.record, job.target)
             if index.count and (odd := las_check.beyond_box(path, index.box)):
                 survey.messages.append(odd)
         survey.place()
@@ -437,7 +438,7 @@ class _Run:
         for number, (squares, blocks) in enumerate(layers):
             for job in squares:
                 job.fail_with(job.jobs)
-            label = "lowest points of cells" if blocks else f"round {number + 1}"
+            label = f"round {number + 1}"
             task_of = partial(self._tile_task, number)
             for job in self._do(label, self._unkept(squares), task_of):
                 self.messages_before.append(job.record.get("messages", []))
@@ -449,7 +450,7 @@ class _Run:
                 )
             for job in blocks:
                 job.fail_with(job.jobs)
-            for _ in self._do("ground by blocks", self._unkept(blocks), self._block_task):
+            for _ in self._do(f"{label}, blocks", self._unkept(blocks), self._block_task):
                 pass
             self.squares += self._known_squares(number, squares)
         for job in waiting:

@@ -47,7 +47,8 @@ from .plan import plan_of_files, readers_of
 from .tiled_run import run_plan
 from .write_outputs import NewValues, PieceResults, of_own_points, read_with
 
-#: Memory of a point in training in one piece, with voxels and neighborhoods of samples.
+#: Bytes of a point in training in one piece, with voxels and neighborhoods of samples: 20 million
+#: points took 7,922 MiB (docs/train.md).
 TRAIN_POINT = 400
 #: Array of points that a person checked: see :mod:`..stages.checked_points`.
 _WANTED = "PdalStagesWanted"
@@ -58,13 +59,14 @@ _NAMED = 3
 
 #: Least reliability of points to train on. With 0.55 the gain is smaller, as errors are learned,
 #: too.
-SURE = 0.7
-#: Samples of each class: enough for one survey, and quick to train.
-COUNT = 6_000
-#: A class with fewer sure points is left out: they may well be errors of the teacher.
-FEWEST = 200
-#: Most points to classify: of a larger survey, only some files spread over it.
-MOST = 20_000_000
+LEAST_RELIABILITY = 0.7
+#: Samples of each class, for one survey; quick to train (not tuned).
+SAMPLES_OF_A_CLASS = 6_000
+#: A class with fewer sure points is left out: they may well be errors of the teacher (not
+#: tuned).
+FEWEST_SURE = 200
+#: Most points to classify: of a larger survey, only some files spread over it (not tuned).
+MOST_TO_CLASSIFY = 20_000_000
 
 
 def _training_stage(options: Mapping[str, Any]) -> TrainModel:
@@ -404,7 +406,7 @@ def adapt(
     inputs: Sequence[str],
     model: str,
     teacher: str = "standard",
-    sure: float = SURE,
+    sure: float = LEAST_RELIABILITY,
     options: TilingOptions | None = None,
 ) -> list[str]:
     """Write a model adapted to a survey without labels; return messages.
@@ -435,10 +437,10 @@ def adapt(
         task = ClassifyTask(tuple(chosen), f"{folder}/classified/", request, options)
         classified = _classified(task)
         counts = sure_points(classified, sure, teacher_model.codes.tolist())
-        codes = [code for code, count in counts.items() if count >= FEWEST]
+        codes = [code for code, count in counts.items() if count >= FEWEST_SURE]
         if len(codes) < 2:
             raise StageError(
-                f"'{teacher}' is sure of {FEWEST:,} points in fewer than two of its classes",
+                f"'{teacher}' is sure of {FEWEST_SURE:,} points in fewer than two of its classes",
                 found=_listed(counts, counts),
                 cure="Adapt to more of the survey, or use that model itself",
             )
@@ -446,7 +448,7 @@ def adapt(
             "classes": ",".join(map(str, codes)),
             "where": f"Reliability >= {sure:g}",
             "voxel": teacher_model.voxel,
-            "count": COUNT,
+            "count": SAMPLES_OF_A_CLASS,
             "folds": 0,  # scoring against the teacher's own answers means nothing
         }
         unnamed = str(folder / "adapted.model")
@@ -482,7 +484,7 @@ def _classified(task: ClassifyTask) -> list[str]:
     return sorted(str(path) for path in Path(task.output).rglob("*.la[sz]"))
 
 
-def spread(files: Sequence[str], most: int = MOST) -> tuple[list[str], list[str]]:
+def spread(files: Sequence[str], most: int = MOST_TO_CLASSIFY) -> tuple[list[str], list[str]]:
     """Return files at regular steps that have about `most` points together; and messages."""
     headers = [las.header_there(name) for name in files] if all(map(is_las, files)) else []
     points = sum(header.count for header in headers if header)

@@ -209,11 +209,11 @@ def read_with(
         last = ["merged"]
     counts = [len(each.kept) for each in new]
     holds_flags = np.repeat([flags_in_classes(reader["filename"]) for reader in readers], counts)
-    stages += _put(callbacks, joined(new), last, holds_flags)
+    stages += _put(callbacks, _join_readers(new), last, holds_flags)
     return stages, stages[-1]["tag"]
 
 
-def joined(new: Sequence[NewValues]) -> NewValues:
+def _join_readers(new: Sequence[NewValues]) -> NewValues:
     """Return new values for the points of several readers, one after the other."""
     if len(new) == 1:
         return new[0]
