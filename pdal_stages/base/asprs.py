@@ -39,6 +39,7 @@ GROUND = 2
 LOW_VEGETATION = 3
 MEDIUM_VEGETATION = 4
 HIGH_VEGETATION = 5
+BUILDING = 6
 WIRE = 14  #: conductors
 TOWER = 15  #: transmission towers
 BRIDGE = 17  #: bridge decks

@@ -1,6 +1,7 @@
 """What stands on the town's blocks, and on the streets on their low sides, as solids.
 
-Houses, cars, masts, wires and plants are boxes, bars and ellipsoids, as rows of arrays.
+Houses, cars, masts, wires and plants are boxes, bars and ellipsoids, as rows of arrays. Their
+sizes, meters, are plausible ones without a source.
 """
 
 from __future__ import annotations
@@ -12,19 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..base.asprs import BRIDGE, BUILDING, TOWER, WIRE
 from . import townplan as t
 
 UNCLASSIFIED = 1
-BUILDING = 6
-WIRE = 14
-POLE = 15
-BRIDGE = 17
 VEGETATION = 255  #: stands for 3, 4 or 5, which follows from the height above ground
 
 #: From the axis of a street to the land that may be built on, meters.
 MARGIN = 6.2
-#: The same from other lines.
-MARGINS = {t.BANK: 14.0, t.CANAL: 15.5}
+#: The same from the axes of a railway and a canal.
+MARGINS = {t.RAILWAY: 14.0, t.CANAL: 15.5}
 
 
 class Footprint(NamedTuple):
@@ -148,9 +146,9 @@ def filled_site(plan: t.Plan, i: int, j: int) -> Site:
     """Return block (i, j), and the streets on its low sides, with everything that stands there."""
     site = Site(plan, i, j)
     kind = t.block_at(t.FIRST_U + t.PITCH_U * (i + 0.5), t.FIRST_V + t.PITCH_V * (j + 0.5), plan)[2]
-    (_fill_rows, _fill_court, _fill_villas, _fill_hall, _fill_park)[kind](site)
+    _FILLERS[kind](site)
     _fill_street(site)
-    {t.BANK: _fill_bank, t.CANAL: _fill_canal}.get(j % 4, _fill_cross_street)(site)
+    {t.RAILWAY: _fill_railway, t.CANAL: _fill_canal}.get(j % 4, _fill_cross_street)(site)
     return site
 
 
@@ -250,12 +248,21 @@ def _fill_park(s: Site) -> None:
     _plant(s, 12, 5, 8, 20, (2, s.d - 10, s.w - 4, 8))
 
 
+_FILLERS = {
+    t.ROWS: _fill_rows,
+    t.COURT: _fill_court,
+    t.VILLAS: _fill_villas,
+    t.HALL: _fill_hall,
+    t.PARK: _fill_park,
+}
+
+
 def _fill_street(s: Site) -> None:
     """Fill the street on the low-u side: cars, and poles with wires, or lamps, trees, boxes."""
     _park_cars(s, (-2.3 - MARGIN, 2.3 - MARGIN), np.arange(2, s.d - 2, 6.0), ACROSS)
     if s.i % 2:
         ends = [2, s.d / 2]
-        if (s.j + 1) % 4 != t.BANK:  # no wire crosses the railway
+        if (s.j + 1) % 4 != t.RAILWAY:  # no wire crosses the railway
             ends.append(s.d + s.high + MARGINS.get((s.j + 1) % 4, MARGIN) + 2)
         _string_wires(s, [(-1.3, b) for b in ends], (1, 0))
     else:
@@ -276,7 +283,7 @@ def _string_wires(s: Site, stations: list[tuple[float, float]], across: tuple[in
     """Put poles with three conductors between stations, the last of which is the next block's."""
     tops = [(a, b, s.z(a, b) + POLE_HEIGHT) for a, b in stations]
     for p, q in itertools.pairwise(tops):
-        s.bar((*p[:2], p[2] - POLE_HEIGHT), (*p[:2], p[2] + 0.2), 0.13, POLE, "bark")
+        s.bar((*p[:2], p[2] - POLE_HEIGHT), (*p[:2], p[2] + 0.2), 0.13, TOWER, "bark")
         for off in (-0.6, 0.0, 0.6):
             start, end = ((a + off * across[0], b + off * across[1], z) for a, b, z in (p, q))
             cable(s, start, end, 0.02 * math.dist(p, q))
@@ -295,7 +302,7 @@ def _fill_canal(s: Site) -> None:
     s.built.append(("deck", deck))
 
 
-def _fill_bank(s: Site) -> None:
+def _fill_railway(s: Site) -> None:
     """Put a mast on the crest of the railway bank, and shrubs on its slopes."""
     mast(s, s.w / 2, s.axis + 3.0, -ACROSS, 7.2, 3.0)
     _plant(s, 0, 12, land=(0, s.axis - t.BANK_FOOT, t.PITCH_U, 2 * t.BANK_FOOT))
@@ -388,8 +395,8 @@ def hedge(s: Site, a, b, turn, length, height, half=0.4, *, wall=False) -> None:
 def mast(s: Site, a, b, turn, height, arm) -> None:
     """Put up a lamp post or a railway mast: a pole with an arm."""
     z = s.z(a, b) + height
-    s.bar((a, b, z - height), (a, b, z), 0.1, POLE, "metal")
-    s.bar((a, b, z - 0.3), (*beside(a, b, turn, arm, 0), z - 0.2), 0.1, POLE, "metal")
+    s.bar((a, b, z - height), (a, b, z), 0.1, TOWER, "metal")
+    s.bar((a, b, z - 0.3), (*beside(a, b, turn, arm, 0), z - 0.2), 0.1, TOWER, "metal")
 
 
 def cable(s: Site, start, end, sag: float) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..base.jit import device, njit
 from .districts import VEGETATION
-from .townplan import GRASS, LAWN, REFLECTANCE, SOIL, WATER, Plan, ground, patches
+from .townplan import GRASS, LAWN, REFLECTANCE, SOIL, WATER, Plan, ground, smooth_noise
 
 # Columns of a solid after its bounding box (lowest u, v, z, highest u, v, z).
 FIRST = 6  #: its first plane
@@ -31,6 +31,24 @@ SUB_BEAMS = 5
 HALF_DIVERGENCE = 0.25e-3
 #: Returns closer in range are one, meters: half the length of a pulse of 4 ns.
 SEPARATION = 0.6
+# The echo of surfaces; not measured.
+#: A face whose normal points up by more is made of a solid's top material, others of its side's.
+TOP_NORMAL = 0.3
+#: Lowest cosine of the angle at which a beam meets a leaf, and how far others are above it.
+LEAF_COSINE = 0.45
+LEAF_COSINES = 0.5
+#: Share of beams that water returns from everywhere, and more of them from straight above.
+WATER_SHARE = 0.015
+MIRROR_SHARE = 0.25
+#: The latter falls to 1/e where 1 - the cosine of the beam's angle is 1 over this: 7 degrees.
+MIRROR_NARROWNESS = 120.0
+# High grass on soil and lawns: it stands where smooth noise exceeds a limit.
+GRASS_FREQUENCY = 1.5  #: of that noise / that of the paving of courts
+SOIL_LIMIT = 0.45
+LAWN_LIMIT = 0.72
+GRASS_RISE = 2.2  #: its height for each unit above the limit, meters
+MAX_GRASS = 0.55  #: its largest height, meters
+MIN_GRASS = 0.08  #: lower grass is ground, meters
 
 
 class Scene(NamedTuple):
@@ -164,18 +182,19 @@ def _sub_beam(scene, plan, ray, guess, tested, beam, rng):
     x, y, code, cosine = ox + t * dx, oy + t * dy, 2, -dz
     if n >= 0:
         normal, solid = scene.planes[face], scene.solids[n]
-        code, material = int(solid[CLASS]), int(solid[TOP if normal[2] > 0.3 else SIDE])
+        code, material = int(solid[CLASS]), int(solid[TOP if normal[2] > TOP_NORMAL else SIDE])
         cosine = abs(normal[0] * dx + normal[1] * dy + normal[2] * dz)
         if solid[EXTINCTION] > 0.0:
-            cosine = 0.45 + 0.5 * rng.random()
+            cosine = LEAF_COSINE + LEAF_COSINES * rng.random()
     elif material == WATER:  # a mirror: little returns, and less the farther from the vertical
         code = 9
-        if rng.random() > 0.015 + 0.25 * math.exp(-120.0 * (1.0 + dz)):
+        if rng.random() > WATER_SHARE + MIRROR_SHARE * math.exp(-MIRROR_NARROWNESS * (1.0 + dz)):
             t = math.inf
     elif material in (SOIL, LAWN):  # high grass here and there
-        wild = patches(1.5 * x, 1.5 * y) - (0.45 if material == SOIL else 0.72)
-        tall = min(0.55, 2.2 * max(wild, 0.0)) * rng.random()
-        if tall > 0.08:
+        wild = smooth_noise(GRASS_FREQUENCY * x, GRASS_FREQUENCY * y)
+        wild -= SOIL_LIMIT if material == SOIL else LAWN_LIMIT
+        tall = min(MAX_GRASS, GRASS_RISE * max(wild, 0.0)) * rng.random()
+        if tall > MIN_GRASS:
             t, code, material = t + tall / dz, VEGETATION, GRASS
     return t, x, y, oz + t * dz, code, cosine * REFLECTANCE[material] / SUB_BEAMS, limit
 

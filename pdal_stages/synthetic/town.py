@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base import checks
+from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION
 from ..base.files import whole_files
 from ..base.progress import Progress
 from ..base.threads import map_blocks
@@ -19,7 +20,8 @@ from .districts import VEGETATION, fill
 from .ray_casting import build_scene, cast
 from .townplan import block_at, heights, plan_town
 
-#: Of the aircraft above the quays, meters.
+# A town's points depend on these: another value gives another town for the same seed.
+#: Of the aircraft above the quays, meters; above all solids.
 ALTITUDE = 350.0
 #: Of the aircraft, meters a second.
 SPEED = 60.0
@@ -37,8 +39,22 @@ BESIDE = 25.0
 PULSES_PER_CHUNK = 60_000
 #: Pulses of the trial that shows how many returns a pulse gives.
 SAMPLE = 20_000
-#: Farthest that a beam travels sideways from the highest solid to the lowest ground, meters.
+#: Farthest that a beam travels sideways from the highest solid to the lowest ground, meters: at
+#: `SCAN_ANGLE` that is enough for 96 m between them. A wider angle or higher solids need more.
 SIDEWAYS = 45.0
+#: Side of the square over which the trial flies at most, meters.
+TRIAL_SIZE = 400.0
+#: Blocks that are kept for later scan lines; not tuned.
+CACHED_BLOCKS = 1500
+#: Intensity of a perfect reflector that faces the sensor at `ALTITUDE`.
+FULL_INTENSITY = 4000.0
+#: Standard deviation of the logarithm of intensities; not measured.
+SPECKLE = 0.12
+#: Heights below which vegetation is low, and medium, meters.
+LOW_HEIGHT = 0.5
+MEDIUM_HEIGHT = 2.0
+#: Scan angles in a LAS file are whole numbers of this, degrees (LAS 1.4, point formats 6 to 10).
+SCAN_ANGLE_STEP = 0.006
 #: Farthest that a solid reaches out of its block, meters: wires to the next one.
 SPAN = 65.0
 
@@ -159,9 +175,9 @@ class FlownTown:
     def __init__(self, size: float, density: float, seed: int, noise: float) -> None:
         self.seed, self.noise, self.plan = seed, noise, plan_town(seed)
         # Blocks are made when first needed; the latest ones are kept.
-        self.block = lru_cache(1500)(lambda i, j: fill(self.plan, i, j))
+        self.block = lru_cache(CACHED_BLOCKS)(lambda i, j: fill(self.plan, i, j))
         # The returns of a coarse flight over the middle of the town give the spacing.
-        sizes = min(size, 400.0), size
+        sizes = min(size, TRIAL_SIZE), size
         trial, coarse = (Flight(seed, side, side / math.sqrt(SAMPLE)) for side in sizes)
         returns = sum(len(self.town(trial, *part)) for part in trial.parts(SAMPLE))
         coarse_density = max(returns, 1) / trial.aimed(SAMPLE) * coarse.aimed(SAMPLE) / size**2
@@ -192,9 +208,11 @@ class FlownTown:
         keep = ~np.isin(pulse, pulse[outside])  # a pulse has all its returns or none
         mm, pulse, distance, (code, echo) = mm[keep], pulse[keep], hits[keep, 0], hits[keep, 4:6].T
         above = mm[:, 2] / 1000.0 - heights((mm[:, :2] / 1000.0 - flight.size / 2) @ turn, plan)
-        code = np.where(code == VEGETATION, np.select([above < 0.5, above < 2.0], [3, 4], 5), code)
-        speckle = np.exp(0.12 * rng.standard_normal(len(echo)))
-        echo = 4000.0 * echo * (ALTITUDE / distance) ** 2 * speckle
+        lower = [above < LOW_HEIGHT, above < MEDIUM_HEIGHT]
+        plants = np.select(lower, [LOW_VEGETATION, MEDIUM_VEGETATION], HIGH_VEGETATION)
+        code = np.where(code == VEGETATION, plants, code)
+        speckle = np.exp(SPECKLE * rng.standard_normal(len(echo)))
+        echo = FULL_INTENSITY * echo * (ALTITUDE / distance) ** 2 * speckle
         _, start, nth, count = np.unique(
             pulse, return_index=True, return_inverse=True, return_counts=True
         )
@@ -252,7 +270,7 @@ def make_town(
         for piece in map_blocks(lambda part: flown.town(flown.flight, *part), parts, threads):
             line.update(len(piece))
             pieces.append(piece)
-    names = [field.name for field in dataclasses.fields(Town)][:-2]
+    names = [f.name for f in dataclasses.fields(Town) if f.name not in ("size", "seed")]
     columns = {name: np.concatenate([getattr(each, name) for each in pieces]) for name in names}
     return Town(**columns, size=size, seed=seed)
 
@@ -273,6 +291,6 @@ def write_town(town: Town, path: str | os.PathLike) -> None:
     names = "classification intensity return_number number_of_returns gps_time point_source_id"
     for name in names.split():
         las[name] = getattr(town, name)
-    las["scan_angle"] = np.round(town.scan_angle / 0.006).astype(np.int16)
+    las["scan_angle"] = np.round(town.scan_angle / SCAN_ANGLE_STEP).astype(np.int16)
     with whole_files(path) as (part,), open(part, "wb") as file:
         las.write(file, do_compress=Path(path).suffix.lower() == ".laz")

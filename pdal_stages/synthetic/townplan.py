@@ -24,22 +24,26 @@ ROAD_HALF = 3.4  #: half the width of a road
 KERB = 0.12  #: height of pavements above the road
 WATER_HALF = 6.5  #: half the width of the canal's water
 CANAL_HALF = 8.0  #: half the width of the canal with its sloping walls
-CANAL_DEPTH = 1.5  #: of the water below the quays, which all lie at height 0
+#: Of the water below the quays, which all lie at height 0. At most the width of a wall,
+#: CANAL_HALF - WATER_HALF: rays find ground whose slope is at most one.
+CANAL_DEPTH = 1.5
 QUAY_ROAD = 11.0  #: from the canal's axis to the axis of the roads beside it
 BANK_CREST = 3.5  #: half the width of the railway bank's top
 BANK_FOOT = 12.0  #: half the width of its foot
 BANK_HEIGHT = 5.0
 
-#: Kinds of lines along u: line j is of kind j % 4; kinds 0 and 2 are streets.
-BANK = 1
+# Kinds of lines along u: line j is of kind j % 4; kinds 0 and 2 are streets.
+RAILWAY = 1  #: on a bank
 CANAL = 3
-#: Kinds of blocks.
-KINDS = 5
-COURT = 1
+# Kinds of blocks.
+ROWS = 0  #: terraced houses
+COURT = 1  #: a closed block around a courtyard
+VILLAS = 2
 HALL = 3
 PARK = 4
+KINDS = 5  #: number of kinds
 
-#: Materials and their reflectance at 1064 nm.
+#: Materials and their reflectance, as if at 1064 nm: not measured, and from no source.
 REFLECTANCES = {
     "asphalt": 0.14, "paving": 0.28, "lawn": 0.48, "soil": 0.3, "stone": 0.32, "water": 0.04,
     "grass": 0.52, "tile": 0.33, "slate": 0.16, "metal": 0.5, "plaster": 0.55, "brick": 0.36,
@@ -91,7 +95,7 @@ def _from_line(value, first, every):
 
 
 @device
-def patches(u, v):
+def smooth_noise(u, v):
     """Return a number in [0, 1] that changes smoothly within some ten meters."""
     a, b = u / 3.1 + 1.7 * math.sin(v / 7.3), v / 3.7 + 1.3 * math.sin(u / 5.9)
     return 0.5 + 0.25 * (math.sin(a) + math.sin(b))
@@ -110,7 +114,7 @@ def ground(u, v, plan):
     if canal < CANAL_HALF:  # sloping stone, and water
         z = -CANAL_DEPTH * min((CANAL_HALF - canal) / (CANAL_HALF - WATER_HALF), 1.0)
         return z, (WATER if canal < WATER_HALF else STONE)
-    bank = _from_line(v, FIRST_V + BANK * PITCH_V, 4 * PITCH_V)
+    bank = _from_line(v, FIRST_V + RAILWAY * PITCH_V, 4 * PITCH_V)
     if bank < BANK_FOOT:
         z += BANK_HEIGHT * min((BANK_FOOT - bank) / (BANK_FOOT - BANK_CREST), 1.0)
         return z, (STONE if bank < BANK_CREST else LAWN)
@@ -120,7 +124,7 @@ def ground(u, v, plan):
     kind = block_at(u, v, plan)[2]
     if edge < 0.0 or (kind == HALL and canal > QUAY_ROAD):
         return z, ASPHALT
-    if edge < 2.1 or canal < QUAY_ROAD or (kind == COURT and patches(u, v) > 0.45):
+    if edge < 2.1 or canal < QUAY_ROAD or (kind == COURT and smooth_noise(u, v) > 0.45):
         return z, PAVING
     return z, (SOIL if kind == PARK else LAWN)
 
