@@ -41,7 +41,7 @@ def add_commands(parser: Parser) -> None:
     add("before", help="LAS or LAZ file as classified")
     add("after", nargs="?", help="The same points after a person's corrections, in any order")
     add("--out", required=True, metavar="FILE", help="File to write: new classes, and Checked")
-    area = "Polygons in which all points were checked; of review's file, those with 'done' 1"
+    area = "Polygons in which all points were checked; with a column 'done', those with 1"
     add("--area", action="append", default=[], metavar="FILE", help=area)
     radius = "Radius checked around changes (1)"
     add("--around", type=float, default=1.0, metavar="METERS", help=radius)
