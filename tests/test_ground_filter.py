@@ -15,7 +15,7 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.grid import GridWindow
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground
-from pdal_stages.terrain.openings import FILL_RINGS, fill_holes, objects_of, opening_radii
+from pdal_stages.terrain.openings import FILL_RINGS, fill_holes, growing_radii, objects_of
 from pdal_stages.terrain.smrf import FilterOptions
 from pdal_stages.terrain.surface import GroundRaster, planes_of_blocks
 
@@ -87,7 +87,7 @@ def test_openings_and_objects_equal_the_slow_reference(shape):
     for radius in range(1, 25):
         assert np.array_equal(opened[radius], slow_opening(filled, radius)), radius
     want, want_floor, before = np.zeros(shape, bool), raster.copy(), filled
-    for radius in opening_radii(window):
+    for radius in growing_radii(window):
         after = slow_opening(filled, radius)
         new = measured & ~want & (before - after > np.float32(0.1 * radius * 1.5))
         want_floor[new] = after[new]

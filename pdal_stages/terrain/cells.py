@@ -12,8 +12,8 @@ from ..base.grid import begins_run, cell_keys, cell_numbers
 HOLE = np.float32(np.inf)
 #: Heights beyond this, in meters, are no terrain, and too much for the sums.
 HIGHEST = 1e6
-#: Least distance of the vertical layers of a cell, in meters.
-GAP = 1.0
+#: Least distance of the vertical layers of a cell, in meters; not tuned.
+LAYER_GAP_M = 1.0
 
 
 def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
@@ -123,4 +123,4 @@ def levels(
     rank = np.empty(len(z), np.int64)
     rank[np.argsort(z)] = np.arange(len(z))
     order = np.argsort(cell * len(z) + rank)
-    return order, begins_run(cell[order]) | (np.diff(z[order], prepend=-np.inf) > GAP)
+    return order, begins_run(cell[order]) | (np.diff(z[order], prepend=-np.inf) > LAYER_GAP_M)

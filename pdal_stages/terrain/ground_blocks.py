@@ -16,6 +16,8 @@ from ..base.grid import GridWindow, cell_keys, cell_numbers, group_by_key
 from .cells import HIGHEST, HOLE, lowest_of_cells
 from .openings import FILL_RINGS
 from .smrf import (
+    RIM,
+    WIDE_RIM,
     CellMeans,
     FilterOptions,
     GroundPoints,
@@ -26,7 +28,7 @@ from .smrf import (
 from .surface import GroundRaster, cells_around, heights_above, surface
 from .surface import reach as planes_reach
 
-#: Side of a block in cells.
+#: Side of a block in cells: larger ones take more memory, smaller ones more time; not tuned.
 BLOCK_SIDE = 1024
 
 
@@ -40,7 +42,7 @@ def _reach_of_ground(options: FilterOptions) -> int:
 
     The provisional surface of its points is fitted through these.
     """
-    return planes_reach(options.near_levels) + 4
+    return planes_reach(options.near_levels) + WIDE_RIM
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ def cells_of_block(
     """
     core = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     # Openings reach into cells without points.
-    spill = max([*options.opening_radii, 0]) + FILL_RINGS + 2
+    spill = max([*options.requested_radii, 0]) + FILL_RINGS + RIM
     margin = max(spill, _reach_of_ground(options))
     low = _in_cells(outer, options)
     if not core.padded(margin).contains(low.column, low.row).any():
@@ -170,7 +172,7 @@ def cells_of_block(
     kept = core.padded(1).intersect(raster.window)
     raster, planes = raster.cut(kept), planes[kept.slices_in(raster.window)].copy()
     means = _ground_means(points, planes, kept, options)
-    return GroundCells(_records(raster, core, means, options.opening_radii))
+    return GroundCells(_records(raster, core, means, options.requested_radii))
 
 
 def _in_cells(xyz: NDArray[np.float64], options: FilterOptions) -> GroundPoints:

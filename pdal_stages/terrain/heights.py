@@ -40,6 +40,7 @@ from .ground_blocks import GroundCells
 from .openings import FILL_RINGS, above_opening, fill_holes, opening_names, openings_of
 from .pieces import patches
 from .smrf import (
+    RIM,
     CellMeans,
     FilterOptions,
     GroundPoints,
@@ -184,7 +185,7 @@ def _known_pieces(
     for rows, core in patches(points.column, points.row, 0, options.link):
         window = GridWindow.enclosing(points.column[rows], points.row[rows])
         window = window.padded(options.reach_of_cells)
-        yield _Piece(rows, core, *cells.raster(window, options.opening_radii))
+        yield _Piece(rows, core, *cells.raster(window, options.requested_radii))
 
 
 def _given_pieces(
@@ -194,7 +195,7 @@ def _given_pieces(
 
     These are surveyed, edited, or found by another program.
     """
-    margin = 2 + FILL_RINGS + max([0, *options.opening_radii])
+    margin = RIM + FILL_RINGS + max([0, *options.requested_radii])
     for rows, core in patches(points.column, points.row, options.reach_of_given, options.link):
         part = points.take(rows)
         window = GridWindow.enclosing(part.column, part.row).padded(margin)
@@ -203,7 +204,7 @@ def _given_pieces(
         opened = {}
         if options.openings:  # of all points, without low outliers
             _, lowest, _ = minimum_grid(part, window, options.cell)
-            opened = dict(openings_of(fill_holes(lowest), {*options.opening_radii}))
+            opened = dict(openings_of(fill_holes(lowest), {*options.requested_radii}))
         yield _Piece(rows, core, GroundRaster(window, heights, place, held, heights, opened), means)
 
 
@@ -250,7 +251,7 @@ def _measure(
     out: dict[str, NDArray] = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
     if options.slope_too:
         out["Slope"] = np.degrees(np.arctan(gradient))
-    for name, radius in zip(opening_names(options.openings), options.opening_radii, strict=True):
+    for name, radius in zip(opening_names(options.openings), options.requested_radii, strict=True):
         values = out[name] = np.empty(len(x), np.float32)
         opening = raster.opened[radius]
 

@@ -1,7 +1,8 @@
 """Tell low outliers, as of multiple reflections, from ground that is deep.
 
 A low place is an outlier if it lies below the plane through its surroundings, and if no ground as
-deep is near, as a street is to a courtyard.
+deep is near, as a street is to a courtyard. The ground filter and noise both use it: a change of
+results here raises `algorithm_version` of both stages.
 """
 
 from __future__ import annotations
@@ -21,23 +22,33 @@ from .openings import highest_around
 class LowRules(NamedTuple):
     """Thresholds of low outliers; a NamedTuple, as kernels read it.
 
-    Columns are those of the raster: of 1 m for the ground filter, 1.5 m for noise.
+    Columns are those of the raster: of 1 m for the ground filter, 1.5 m for noise. What the search
+    for ground as deep and its support are worth is in docs/results/ablation.md; the values
+    themselves are not tuned.
     """
 
     near: int = 9  #: columns to each side through which the plane is fitted
-    min_columns: int = 12  #: that a plane needs
-    far_m: float = 30.0  #: where ground as deep is searched: the width of a block of houses
-    min_company: int = 4  #: columns of such ground that show that a deep place is ground
-    #: others of the 5 x 5 columns around that differ by `level_m` at most, or it may be noise too,
-    min_support: int = 2
-    min_support_share: float = 0.2  #: and this share more of those that hold points
-    level_m: float = 1.0  #: such ground is this much higher than the place at most,
-    max_rise: float = 0.05  #: and this much more per meter away
+    min_columns: int = 12  #: columns that a plane needs
+    first_lowest: int = 10  #: the first fit trusts heights above the lowest tenth
+    first_highest: int = 2  #: the first fit trusts heights up to the median
+    first_weight: float = 0.01  #: weight of other heights in the first fit
+    fits: int = 8  #: fits of a plane, each with the weights of the one before
+    above_weight: float = 0.1  #: factor of the weight of columns above the plane: plants, roofs
+    level_weight: float = 1e-3  #: pulls a plane level where columns lie on a line; square columns
+    far_m: float = 30.0  #: distance up to which ground as deep is searched: a block of houses
+    min_company: int = 4  #: columns of ground as deep that show that a place is ground
+    company_depth: float = 0.5  #: least depth of such ground below the plane, by that of the place
+    level_m: float = 1.0  #: ground as deep is at most this much higher than the place
+    max_rise: float = 0.05  #: ground as deep may be this much higher again per meter away
+    support: int = 2  #: columns to each side in which ground as deep needs others of its level
+    min_support: int = 2  #: columns there that differ by at most `level_m`: else it may be noise
+    min_support_share: float = 0.2  #: this share of the columns there with points is needed besides
     link: int = 3  #: cells of a minimum grid that are at most this far from each other are linked
-    max_step_m: float = 0.35  #: across a step of at most this height: a curb,
-    max_grade: float = 0.15  #: and this much more per meter
+    max_step_m: float = 0.35  #: height of a step across which cells are linked: a curb
+    max_grade: float = 0.15  #: that step grows by this much per meter
     max_island: int = 30  #: cells of a set of linked cells that may be outliers
     max_extent: int = 20  #: cells along either axis of such a set
+    reach_margin: int = 2  #: columns added to reaches: the support of ground as deep
 
 
 RULES = LowRules()
@@ -45,7 +56,7 @@ RULES = LowRules()
 
 def reach(side: float) -> int:
     """Return how far away, in columns of a `side` in meters, points change what is an outlier."""
-    return RULES.near + math.ceil(RULES.far_m / side) + 2
+    return RULES.near + math.ceil(RULES.far_m / side) + RULES.reach_margin
 
 
 @device(_nrt=True, fastmath=set(FAST))
@@ -67,9 +78,11 @@ def _plane_under(low, j, i, rules):
     lowest = zs[:n].min()
     zs = zs[:n] - lowest
     order = np.sort(zs)
-    weight = np.where((zs >= order[n // 10]) & (zs <= order[n // 2]), 1.0, 0.01)
+    trusted = zs >= order[n // rules.first_lowest]
+    trusted &= zs <= order[n // rules.first_highest]
+    weight = np.where(trusted, 1.0, rules.first_weight)
     p0 = p1 = p2 = 0.0
-    for _ in range(8):
+    for _ in range(rules.fits):
         s0 = s1 = s2 = s11 = s12 = s22 = t0 = t1 = t2 = 0.0
         for k in range(n):
             g = weight[k]
@@ -82,7 +95,7 @@ def _plane_under(low, j, i, rules):
             t0 += g * zs[k]
             t1 += g * u[k] * zs[k]
             t2 += g * v[k] * zs[k]
-        s11, s22 = s11 + 1e-3 * s0, s22 + 1e-3 * s0
+        s11, s22 = s11 + rules.level_weight * s0, s22 + rules.level_weight * s0
         # Cramer's rule.
         c0 = s11 * s22 - s12 * s12
         c1 = s12 * s2 - s1 * s22
@@ -94,7 +107,7 @@ def _plane_under(low, j, i, rules):
         for k in range(n):
             off = zs[k] - p0 - p1 * u[k] - p2 * v[k]
             g = 1.0 / (1.0 + off * off)
-            weight[k] = g * g if off < 0.0 else 0.1 * g
+            weight[k] = g * g if off < 0.0 else rules.above_weight * g
     return p0 + lowest, p1, p2
 
 
@@ -107,8 +120,8 @@ def _supported(base, rules):
         for i in range(w):
             level, seen = 0, 0
             if base[j, i] < np.inf:
-                for b in range(max(j - 2, 0), min(j + 3, h)):
-                    for a in range(max(i - 2, 0), min(i + 3, w)):
+                for b in range(max(j - rules.support, 0), min(j + rules.support + 1, h)):
+                    for a in range(max(i - rules.support, 0), min(i + rules.support + 1, w)):
                         seen += base[b, a] < np.inf
                         level += abs(base[b, a] - base[j, i]) <= rules.level_m
             out[j, i] = level > rules.min_support + rules.min_support_share * seen
@@ -119,18 +132,19 @@ def _supported(base, rules):
 def _has_company(base, supported, side, j, i, z, plane, rules):
     """Tell whether enough other columns are about as deep as z.
 
-    They lie at least half as far below the plane.
+    They lie at least `company_depth` as far below the plane.
     """
     h, w = base.shape
-    far, half, company = int(np.ceil(rules.far_m / side)), 0.5 * (plane[0] - z), 0
+    far, company = int(np.ceil(rules.far_m / side)), 0
+    least = rules.company_depth * (plane[0] - z)
     for b in range(max(j - far, 0), min(j + far + 1, h)):
         for a in range(max(i - far, 0), min(i + far + 1, w)):
             if not supported[b, a]:
                 continue
             away = side * np.sqrt(float((b - j) ** 2 + (a - i) ** 2))
             below = plane[0] + plane[1] * (a - i) + plane[2] * (b - j) - base[b, a]
-            most = z + min(half, rules.level_m + rules.max_rise * away)
-            company += away <= rules.far_m and base[b, a] <= most and below >= half
+            most = z + min(least, rules.level_m + rules.max_rise * away)
+            company += away <= rules.far_m and base[b, a] <= most and below >= least
     return company >= rules.min_company
 
 

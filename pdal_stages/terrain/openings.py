@@ -30,8 +30,8 @@ def opening_radius(window: float, cell: float) -> int:
     return max(1, round((window / cell - 1) / 2))
 
 
-def opening_radii(largest: int) -> list[int]:
-    """Return radii in cells, each larger than the one before by a fifth, but by 1 or 2 cells.
+def growing_radii(largest: int) -> list[int]:
+    """Return radii in cells, each larger by a fifth, at least 1 and at most 2 cells.
 
     With larger steps slopes would drop as objects do.
     """
@@ -180,7 +180,7 @@ def objects_of(
     objects, floor, before = np.zeros(raster.shape, bool), raster.copy(), filled
     # An opening lowers nothing by more than all heights differ.
     range_m = np.ptp(raster[measured]) if measured.any() else 0.0
-    drops = {radius: np.float32(slope * radius * cell) for radius in opening_radii(window)}
+    drops = {radius: np.float32(slope * radius * cell) for radius in growing_radii(window)}
     drops = {radius: drop for radius, drop in drops.items() if drop < range_m}
     for radius, opened in openings_of(filled, {*drops, *keep}):
         if radius in keep:

@@ -15,9 +15,10 @@ from ..base.grid import GridWindow, cell_keys, group_by_key, key_offset, places_
 from ..base.las_check import CURE_OF_DAMAGE
 from .components import number_sets
 
-#: Cells of the largest raster that is made in one piece.
+#: Cells of the largest raster that is made in one piece: it bounds memory. Neither this nor the
+#: numbers below are tuned: results do not depend on them.
 LARGEST_RASTER = 2100 * 2100
-#: Side in cells of the squares that larger rasters are cut into.
+#: Side in cells of the squares that larger rasters are cut into; it need not equal `BLOCK_SIDE`.
 SQUARE_SIDE = 1024
 #: Rasters up to this size are never searched for empty land, in cells.
 SMALL_RASTER = 1 << 16
@@ -25,6 +26,8 @@ SMALL_RASTER = 1 << 16
 MAX_CELLS_PER_POINT = 32
 #: Blocks of the coarse grid that finds groups, per `link`.
 BLOCKS_PER_LINK = 4
+#: Places with a single point beyond which a cloud is refused, if most places have one.
+MAX_ALONE = 4000
 
 
 def patches(
@@ -69,7 +72,7 @@ def refuse_scattered(counts: Collection[int]) -> None:
     `counts` are the points of each place.
     """
     alone = sum(n == 1 for n in counts)
-    if alone > 4000 and 2 * alone > len(counts):
+    if alone > MAX_ALONE and 2 * alone > len(counts):
         raise StageError(
             "thousands of points lie alone, far from any other",
             found=f"{alone:,} of {sum(counts):,} points",

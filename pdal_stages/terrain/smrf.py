@@ -24,12 +24,18 @@ from .openings import FILL_RINGS, objects_of, opening_radius
 from .surface import GroundRaster, from_parents, planes_of_blocks
 from .surface import reach as planes_reach
 
-#: Side in meters of the coarsest blocks of the provisional surface, which tells ground points.
+#: Side in meters of the coarsest blocks of the provisional surface, which tells ground points. The
+#: mean error of the ISPRS samples is 0.13 points higher with 8 m (docs/results/ablation.md).
 NEAR = 16.0
 #: Side of those of the surface that heights are measured from: it spans holes under large roofs.
+#: Not tuned.
 FAR = 32.0
-#: Largest radius of a window in cells: beyond it memory and halo of a tile become too large.
+#: Largest radius of the filter's window, and largest width of a requested opening, in cells: beyond
+#: it memory and halo of a tile become too large.
 _MOST_CELLS = 300
+#: Cells added to the reach of one step, and of several: more than the one by which points blend the
+#: cells around them. If they are too small, tiles no longer get the bits of the whole cloud.
+RIM, WIDE_RIM = 2, 4
 #: How often ground that openings took from ridges and dams is regained from the surface through the
 #: rest. Without it the mean error of the ISPRS samples is 0.7 points higher, with one round 0.2
 #: (docs/results/ablation.md).
@@ -45,10 +51,10 @@ class FilterOptions:
 
     cell: float = 1.0
     slope: float = 0.1
-    window: float = 18.0
+    window: float = 18.0  #: radius of the largest window
     threshold: float = 0.5
     scalar: float = 1.25
-    openings: Sequence[float] = ()
+    openings: Sequence[float] = ()  #: widths of the requested openings
     slope_too: bool = False
 
     def __post_init__(self) -> None:
@@ -74,7 +80,7 @@ class FilterOptions:
         return max(1, round(self.window / self.cell))
 
     @property
-    def opening_radii(self) -> list[int]:
+    def requested_radii(self) -> list[int]:
         """Radii of the requested openings, in cells."""
         return [opening_radius(size, self.cell) for size in self.openings]
 
@@ -115,8 +121,8 @@ class FilterOptions:
         through ground after.
         """
         surfaces = ROUNDS * planes_reach(self.near_levels)
-        openings = 2 * max([self.radius, *self.opening_radii]) + 2 * FILL_RINGS
-        return outlier_reach(self.cell) + openings + surfaces + 2
+        openings = 2 * max([self.radius, *self.requested_radii]) + 2 * FILL_RINGS
+        return outlier_reach(self.cell) + openings + surfaces + RIM
 
     @property
     def reach_of_points(self) -> int:
@@ -134,9 +140,9 @@ class FilterOptions:
         Or above an opening.
         """
         if not self.openings:
-            return self._reach_of_surfaces + 4
-        openings = 2 * max(self.opening_radii) + 2 * FILL_RINGS + outlier_reach(self.cell)
-        return max(self._reach_of_surfaces, openings) + 4
+            return self._reach_of_surfaces + WIDE_RIM
+        openings = 2 * max(self.requested_radii) + 2 * FILL_RINGS + outlier_reach(self.cell)
+        return max(self._reach_of_surfaces, openings) + WIDE_RIM
 
     @property
     def _reach_of_surfaces(self) -> int:
@@ -145,7 +151,7 @@ class FilterOptions:
     @property
     def reach_of_cells(self) -> int:
         """Distance in cells within which cells of known ground matter to points."""
-        return planes_reach(self.far_levels) + 4
+        return planes_reach(self.far_levels) + WIDE_RIM
 
     @property
     def link(self) -> int:
@@ -153,8 +159,8 @@ class FilterOptions:
 
         No step of the filter sees from a point to another across more empty land.
         """
-        openings = max([self.radius, *self.opening_radii]) + 2 * FILL_RINGS
-        return max(outlier_reach(self.cell), openings, planes_reach(self.far_levels)) + 2
+        openings = max([self.radius, *self.requested_radii]) + 2 * FILL_RINGS
+        return max(outlier_reach(self.cell), openings, planes_reach(self.far_levels)) + RIM
 
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
@@ -215,7 +221,7 @@ def ground_raster(
     window, cell = GridWindow.enclosing(points.column, points.row).padded(margin), options.cell
     lowest, heights, low_outliers = minimum_grid(points, window, cell)
     objects, floor, opened = objects_of(
-        heights, cell, options.slope, options.radius, options.opening_radii
+        heights, cell, options.slope, options.radius, options.requested_radii
     )
     wanted = wanted or window
     kept = wanted.padded(ROUNDS * planes_reach(options.near_levels)).intersect(window)

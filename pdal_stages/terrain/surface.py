@@ -23,10 +23,12 @@ from .cells import HOLE
 from .openings import highest_around
 
 #: Weight of the coarser gradient per ground cell, for a lever of one block: it decides where all
-#: ground of a fit lies to one side or on a line.
+#: ground of a fit lies to one side or on a line. Not tuned, as the two below.
 _STIFFNESS = 0.02
 #: Weight of the coarser height, in ground cells.
 _HOLD = 0.1
+#: Weight of the blocks beside one, of 1, in its fit; of those at its corners the square.
+_BESIDE = 0.5
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class GroundRaster:
     """A minimum grid, and which of its cells are ground."""
 
     window: GridWindow  #: which cells
-    #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a pit
+    #: (h, w) heights of the lowest points, meters; HOLE where there is none, or a low outlier
     lowest: NDArray[np.float32]
     #: (h, w, 3) where ground is in its cell, from the middle, in cells; its height
     place: NDArray[np.float64]
@@ -67,9 +69,13 @@ class Planes(NamedTuple):
 
 
 def reach(levels: int) -> int:
-    """Return how far away ground changes the surface, in cells."""
-    # A block's parents lie up to 1.5 blocks away, level by level; the coarsest sees 3 x 3 of its
-    # blocks.
+    """Return how far away ground changes the surface, in cells.
+
+    Halos of tiles and margins of blocks follow from it: if it is too small, tiles no longer get the
+    bits of the whole cloud.
+    """
+    # Centers of a block's parents lie up to 1.5 of its sides away: 1.5 * (1 + 2 + ... + half of
+    # 2**levels) cells in all, and the coarsest block sees 1.5 * 2**levels: together less than this.
     return 3 * 2**levels
 
 
@@ -136,7 +142,7 @@ def _sum_around(moments, j, i, size, sums):
     for b in range(max(j - 1, 0), min(j + 2, moments.shape[0])):
         for a in range(max(i - 1, 0), min(i + 2, moments.shape[1])):
             if moments[b, a, 0] > 0:
-                weight = (1.0 - 0.5 * abs(b - j)) * (1.0 - 0.5 * abs(a - i))
+                weight = (1.0 if b == j else _BESIDE) * (1.0 if a == i else _BESIDE)
                 _add(sums, moments[b, a], (a - i) * size, (b - j) * size, weight)
 
 
