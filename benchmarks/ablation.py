@@ -325,7 +325,7 @@ ROWS: dict[str, dict[str, Row]] = {
         "wires need not rise": rule(towers, min_rise=-9.0),
         "one size": rule(towers, max_arm_m=10.0),
         "bodies of 3 cells": rule(towers, half_body=3),
-        "narrow at the top": rule(towers, top_m=1.5),
+        "narrow at the top": rule(towers, top_radius_m=1.5),
     },
 }
 

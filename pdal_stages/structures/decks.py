@@ -89,8 +89,8 @@ NORTH = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 ACROSS = 0.8
 
 
-class _Layers(NamedTuple):
-    """Vertical layers of a raster, in the order of their cells."""
+class _LowestLayers(NamedTuple):
+    """Vertical layers of a raster by their lowest points, in the order of their cells."""
 
     z: NDArray[np.float64]  #: (n,) height of the lowest point, meters
     start: NDArray[np.int64]  #: (height * width + 1,) the first layer of each cell
@@ -130,7 +130,7 @@ def _find_in_piece(column, row, z, ground, rules) -> NDArray[np.bool_]:
     first = np.flatnonzero(begins)
     lowest = order[first]
     start = np.searchsorted(cell[lowest], np.arange(window.width * window.height + 1))
-    layers = _Layers(z[lowest], start, window.height, window.width)
+    layers = _LowestLayers(z[lowest], start, window.height, window.width)
     solid = _find_solid(layers, rules)
     deck = _find_deck_layers(layers, solid, np.logical_or.reduceat(ground[order], first), rules)
     if not deck.any():

@@ -1,9 +1,9 @@
 """Detect towers: what stands upright where spans of wires end.
 
 An axis is a cell around which points stand in a body from near the ground up to the wires near it.
-It is a tower where the wires show it: towards it they rise from both sides, as a wire is highest
-at its ends. Sums are whole numbers and reaches are bounded, so neither the order of points nor the
-tile matters.
+It is a tower where the wires show it: towards it they rise from both sides, as a wire is highest at
+its ends, or from one side at the end of a line. Sums are whole numbers and reaches are bounded, so
+neither the order of points nor the tile matters.
 """
 
 from __future__ import annotations
@@ -24,39 +24,51 @@ CELL_M = 1.0
 class TowerRules(NamedTuple):
     """Thresholds of the tower detector, a named tuple because compiled kernels read it.
 
-    They were set on a power line of 14 points/m2 (AHN4).
+    They were set on a power line of 14 points/m2 (AHN4), the one survey with towers; what some are
+    worth there is in docs/results/ablation.md.
     """
 
     foot_m: float = 0.7  #: points lower above the ground are not marked
-    from_m: float = 2.0  #: points of a body are higher: bushes stand at its feet
+    body_from_m: float = 2.0  #: points of a body are higher: bushes stand at its feet
     min_wire_m: float = 14.0  #: height of the wires: lower ones hang on poles
     max_wire_m: float = 256.0  #: height of the wires: higher ones are noise
     wire_near: int = 10  #: cells from the axis to the nearest wires: half a cross-arm
     half_body: int = 4  #: cells from the axis to points of its body
+    lower_ratio: float = 0.5  #: a body has points below this part of the height of its wires
+    upper_ratio: float = 0.75  #: a body has points above this part of that height, or little below:
+    upper_slack_m: float = 1.0  #: they may be this much lower
+    top_slack_m: float = 1.0  #: and they are less than this above the wires
     wires_from_m: float = 2.0  #: the rise of wires is measured from this far from the axis
-    wires_to_m: float = 15.0  #: to this far
+    wires_to_m: float = 15.0  #: the rise of wires is measured up to this far from the axis
     piece_m: float = 4.0  #: longest piece of a wire between two of its points
+    max_piece_slope: float = 0.3  #: rise over run of a piece
+    max_piece_step_m: float = 0.1  #: that rise may be this much more: noise
+    #: of a piece, meters across the direction of the wires per meter along it
+    max_askew: float = 0.3
     min_rise: float = 0.015  #: rise over run of the wires towards the axis, both sides together
-    apart: int = 15  #: cells between towers
-    top_m: float = 3.0  #: half the width of what is marked at the top
-    spread: float = 0.12  #: it grows by this much per meter below
+    min_apart: int = 15  #: cells between towers, along either axis
+    top_radius_m: float = 3.0  #: a body's radius at the height of the wires
+    widening: float = 0.12  #: a body's radius grows by this much per meter below
     arm_m: float = 10.0  #: bodies are wider in proportion where arms are longer
+    arm_wires_m: float = 4.0  #: wires at most this far along the line show how long arms are
     max_arm_m: float = 20.0  #: from the axis to the outermost wire: towers of 380 kV
     arm_below_m: float = 1.5  #: arms are marked from this far below the lowest wire
-    arm_beside_m: float = 1.5  #: to this far beyond the outermost wire
-    arm_along_m: float = 2.5  #: and to this far along the wires
-    over_m: float = 8.0  #: marked above the wires: peaks that carry earth wires
+    arm_beside_m: float = 1.5  #: arms are marked to this far beyond the outermost wire
+    arm_along_m: float = 2.5  #: arms are marked to this far from the axis along the wires
+    peak_m: float = 8.0  #: points up to this far above the wires are marked: peaks with earth wires
+    #: more of `reach_m`: the middle of a body lies beside its cell; not tuned
+    reach_margin_m: float = 4.0
 
     @property
     def reach_m(self) -> float:
         """Distance in meters up to which wires and points decide whether a point is of a tower."""
-        wires = self.wires_to_m + self.piece_m + 4.0
-        return self.max_arm_m + self.arm_beside_m + self.apart + wires
+        wires = self.wires_to_m + self.piece_m + self.reach_margin_m
+        return self.max_arm_m + self.arm_beside_m + self.min_apart * CELL_M + wires
 
 
 RULES = TowerRules()
-#: Parts of a meter in which places are summed up, as whole numbers.
-PARTS = 1 << 16
+#: Parts of a meter in which places, and of 1 in which slopes, are summed up, as whole numbers.
+FINE_PARTS = 1 << 16
 #: Parts of a square meter in which products of lengths are summed up.
 SQUARE_PARTS = 1024
 
@@ -106,7 +118,8 @@ def find_towers(
     column, row = cell_numbers(xyz[:, 0], CELL_M), cell_numbers(xyz[:, 1], CELL_M)
     candidates = use & (wire | (height > rules.foot_m)) & _are_near(column, row, wires, rules)
     near = np.flatnonzero(candidates)
-    for points, inner in patches(column[near], row[near], int(rules.reach_m), int(rules.reach_m)):
+    reach = int(rules.reach_m / CELL_M)
+    for points, inner in patches(column[near], row[near], reach, reach):
         at = near[points]
         window = GridWindow.enclosing(column[at], row[at])
         left, bottom, w, h = window
@@ -190,24 +203,26 @@ def _find_body(cloud, j, i, high, rules):
     lower, upper, sums = False, False, np.zeros(3, np.int64)
     for p in _list_near(cloud, j, i, rules.half_body):
         height = cloud.height[p]
-        if cloud.wire[p] or height < rules.from_m:
+        if cloud.wire[p] or height < rules.body_from_m:
             continue
-        lower |= 2 * int(height) < high
-        upper |= 4 * int(height) >= 3 * high - 4 and height < high + 1.0
+        lower |= int(height) < rules.lower_ratio * high
+        reaches_up = int(height) >= rules.upper_ratio * high - rules.upper_slack_m
+        upper |= reaches_up and height < high + rules.top_slack_m
         if 0.5 * high <= height <= high:
             sums[0] += 1
-            sums[1] += int(np.rint((cloud.x[p] - (i + 0.5) * CELL_M) * PARTS))
-            sums[2] += int(np.rint((cloud.y[p] - (j + 0.5) * CELL_M) * PARTS))
+            sums[1] += int(np.rint((cloud.x[p] - (i + 0.5) * CELL_M) * FINE_PARTS))
+            sums[2] += int(np.rint((cloud.y[p] - (j + 0.5) * CELL_M) * FINE_PARTS))
     if not (lower and upper and sums[0] > 0):
         return False, 0.0, 0.0
-    return True, sums[1] / (sums[0] * PARTS), sums[2] / (sums[0] * PARTS)
+    return True, sums[1] / (sums[0] * FINE_PARTS), sums[2] / (sums[0] * FINE_PARTS)
 
 
 @device(_nrt=True)
 def _rise(cloud, axis, rules):
     """Return how wires rise towards an axis, from both sides together, and their direction there.
 
-    The direction is an angle. Pairs of points count as pieces of one wire: wires may lie far apart.
+    The direction is an angle. Every two points of wires near each other, and neither steep nor
+    askew, count as a piece of a wire. Where one side has no pieces the other counts twice.
     """
     pairs, n = np.empty((256, 5)), 0
     xx = xy = yy = 0
@@ -219,7 +234,8 @@ def _rise(cloud, axis, rules):
         for o in _list_near(cloud, cloud.row[p], cloud.column[p], int(rules.piece_m / CELL_M) + 1):
             dx, dy, dz = cloud.x[o] - cloud.x[p], cloud.y[o] - cloud.y[p], cloud.z[o] - cloud.z[p]
             run = np.sqrt(dx * dx + dy * dy)
-            if not cloud.wire[o] or run > rules.piece_m or abs(dz) > 0.3 * run + 0.1:
+            most = rules.max_piece_slope * run + rules.max_piece_step_m
+            if not cloud.wire[o] or run > rules.piece_m or abs(dz) > most:
                 continue
             xx += int(np.rint(dx * dx * SQUARE_PARTS))
             xy += int(np.rint(dx * dy * SQUARE_PARTS))
@@ -239,12 +255,12 @@ def _rise(cloud, axis, rules):
         side = int(along > 0.0)
         run = run if side else -run
         near = abs(along) >= rules.wires_from_m and abs(aside) <= rules.wire_near
-        if near and run >= max(0.5 * rules.piece_m, askew / 0.3):
-            total[side] -= int(np.rint(pairs[k, 4] / run * PARTS))
+        if near and run >= max(0.5 * rules.piece_m, askew / rules.max_askew):
+            total[side] -= int(np.rint(pairs[k, 4] / run * FINE_PARTS))
             count[side] += 1
     if count.min() == 0:  # the last one of a line
-        return 2.0 * total.sum() / max(count.sum(), 1) / PARTS, turn
-    return (total[0] / count[0] + total[1] / count[1]) / PARTS, turn
+        return 2.0 * total.sum() / max(count.sum(), 1) / FINE_PARTS, turn
+    return (total[0] / count[0] + total[1] / count[1]) / FINE_PARTS, turn
 
 
 def _select_axes(axes: NDArray[np.float64], rules: TowerRules) -> list[Axis]:
@@ -252,8 +268,8 @@ def _select_axes(axes: NDArray[np.float64], rules: TowerRules) -> list[Axis]:
     from scipy.spatial import cKDTree
 
     row, column, _, x, y, _ = axes.T
-    axes = axes[np.lexsort((column, row, np.minimum(x * x + y * y, 100.0)))]
-    near = cKDTree(axes[:, :2]).query_pairs(rules.apart, p=np.inf, output_type="ndarray")
+    axes = axes[np.lexsort((column, row, x * x + y * y))]
+    near = cKDTree(axes[:, :2]).query_pairs(rules.min_apart, p=np.inf, output_type="ndarray")
     kept = np.delete(axes, near.max(axis=1), axis=0)
     return [Axis(int(row), int(column), *place) for row, column, *place in kept.tolist()]
 
@@ -266,17 +282,17 @@ def _mark(cloud, axis, rules, marked):
     widest, low = 0.0, axis.high
     reach = int(rules.max_arm_m + rules.arm_beside_m) + 1
     near = _list_near(cloud, axis.row, axis.column, reach)
-    for known in range(2):  # how far arms reach is known after the wires
+    for known in range(2):  # wires come first: they show how far arms reach
         for p in near:
-            # In this order, whatever the raster's corner is.
+            # Subtracted in this order, rounding does not depend on the raster's corner.
             dx, dy = cloud.x[p] - x - axis.x, cloud.y[p] - y - axis.y
             height = cloud.height[p]
             along, aside = abs(dx * ux + dy * uy), abs(dy * ux - dx * uy)
             if cloud.wire[p] and not known:
-                if along <= 4.0 and aside <= rules.max_arm_m:
+                if along <= rules.arm_wires_m and aside <= rules.max_arm_m:
                     widest, low = max(widest, aside), min(low, height)
-            elif known and height <= axis.high + rules.over_m:
-                body = rules.top_m + rules.spread * max(axis.high - height, 0.0)
+            elif known and height <= axis.high + rules.peak_m:
+                body = rules.top_radius_m + rules.widening * max(axis.high - height, 0.0)
                 marked[p] |= np.sqrt(dx * dx + dy * dy) <= body * max(widest / rules.arm_m, 1.0)
                 on_arm = height >= low - rules.arm_below_m and along <= rules.arm_along_m
                 on_arm &= aside <= widest + rules.arm_beside_m and not cloud.wire[p]

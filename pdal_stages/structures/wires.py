@@ -34,9 +34,10 @@ class WireRules(NamedTuple):
 
     min_height_m: float = 4.0  #: above the ground: hedges and fences are lower
     max_thickness_m: float = 0.9  #: of a layer in a cell: a bundle of wires
-    #: layers about as high in the 5 x 5 cells around: 4 wires. Without it results are the same, but
+    #: layers about as high in the cells around: 4 wires. Without it results are the same, but
     #: the detector takes two thirds more time (docs/results/ablation.md)
     max_neighbors: int = 24
+    neighbor_cells: int = 2  #: cells to every side in which those layers lie: 5 x 5
     same_height_m: float = 2.0  #: layers up to this much higher or lower are neighbors
     half_m: float = 12.0  #: half the length of a line: a wire bends by decimeters over it
     piece_m: float = 2.0  #: length of a line's pieces: points of a wire are nearer to each other
@@ -68,10 +69,13 @@ class WireRules(NamedTuple):
 RULES = WireRules()
 #: Parts of a meter in which places are summed up, as whole numbers.
 PARTS = 1024
+#: Layers near one through which its line is searched, at most: 9 in each cell of a circle of 12 m.
+#: Further ones, in the northern rows, are not seen.
+MAX_NEAR = 4096
 
 
-class _Layers(NamedTuple):
-    """Vertical layers of a raster, in the order of their cells."""
+class _MeanLayers(NamedTuple):
+    """Vertical layers of a raster by their mean places, in the order of their cells."""
 
     place: NDArray[np.float64]  #: (n, 3) mean place: x and y from the cell's corner, z; meters
     cell: NDArray[np.int64]  #: (n,) number of its cell, row by row
@@ -96,7 +100,8 @@ def find_wires(
     if not len(high):
         return is_wire
     column, row = (cell_numbers(xyz[high, axis], CELL_M) for axis in (0, 1))
-    for points, inner in patches(column, row, int(rules.reach_m), int(rules.min_length_m)):
+    reach, link = (int(length / CELL_M) for length in (rules.reach_m, rules.min_length_m))
+    for points, inner in patches(column, row, reach, link):
         at = high[points]
         wires = _find_in_piece(xyz[at], column[points], row[points], rules)
         is_wire[at[inner]] = wires[inner]
@@ -118,7 +123,7 @@ def _find_in_piece(xyz, column, row, rules) -> NDArray[np.bool_]:
     sums = [np.bincount(layer, np.rint(axis * PARTS)) for axis in in_cell.T]
     place = np.column_stack(sums) / np.bincount(layer)[:, None] / PARTS
     h, w = window.shape
-    layers = _Layers(place, cells, np.searchsorted(cells, np.arange(h * w + 1)), h, w)
+    layers = _MeanLayers(place, cells, np.searchsorted(cells, np.arange(h * w + 1)), h, w)
     line = np.zeros((len(cells), 3))
     good = _find_lines(layers, _find_thin(layers, thick, rules), line, rules)
     first, second = _pair_on_lines(layers, good, line, rules)
@@ -135,12 +140,12 @@ def _find_in_piece(xyz, column, row, rules) -> NDArray[np.bool_]:
 def _find_thin(layers, thick, rules):
     """Return which layers (n,) are thin, with few others around."""
     place, cells, start, h, w = layers
-    thin = np.zeros(len(thick), np.bool_)
+    thin, reach = np.zeros(len(thick), np.bool_), rules.neighbor_cells
     for n in range(len(thick)):
         j, i = cells[n] // w, cells[n] % w
         others = 0
-        for b in range(max(j - 2, 0), min(j + 3, h)):
-            for a in range(max(i - 2, 0), min(i + 3, w)):
+        for b in range(max(j - reach, 0), min(j + reach + 1, h)):
+            for a in range(max(i - reach, 0), min(i + reach + 1, w)):
                 for m in range(start[b * w + a], start[b * w + a + 1]):
                     others += m != n and abs(place[m, 2] - place[n, 2]) <= rules.same_height_m
         thin[n] = thick[n] <= rules.max_thickness_m and others <= rules.max_neighbors
@@ -157,7 +162,7 @@ def _find_lines(layers, thin, line, rules):
     good = np.zeros(len(thin), np.bool_)
     length = rules.half_m
     reach, half = int(length / CELL_M) + 1, int(length / rules.piece_m)
-    near, slim = np.empty((4096, 3)), np.empty(4096, np.bool_)
+    near, slim = np.empty((MAX_NEAR, 3)), np.empty(MAX_NEAR, np.bool_)
     filled = np.zeros(2 * half, np.bool_)
     for n in range(len(thin)):
         if not thin[n]:
