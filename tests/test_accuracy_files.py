@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from test_training_scores import QUICK_WORDS, scene
 
 from pdal_stages.base.errors import StageError
 from pdal_stages.cli import main
-from pdal_stages.pipeline.accuracy_files import paired
+from pdal_stages.pipeline.accuracy_files import _refuse_other_points, paired
 from pdal_stages.reports.accuracy_page import Place, places
+from pdal_stages.stages.points import Points
 
 
 def place(name, x, n=50):
@@ -54,6 +56,31 @@ def test_each_file_has_its_line_and_each_place_its_map(tmp_path, write_las, capf
     assert np.isclose(report["overall_accuracy"], right / report["points"])
     text = page.read_text()
     assert text.count("<h2>Maps") == 2 and "Maps: far.laz" in text
+
+
+_DEGREES = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]]'
+)
+_FEET = 'LOCAL_CS["grid",UNIT["foot",0.3048]]'
+
+
+@pytest.mark.parametrize(
+    ("wkt", "moved", "refused"),
+    [
+        ("", 0.005, False),
+        ("", 0.02, True),
+        (_FEET, 0.02, False),  # 6 mm
+        (_FEET, 0.04, True),
+        (_DEGREES, 0.005, True),  # 500 m
+        (_DEGREES, 5e-8, False),
+    ],
+)
+def test_references_of_other_points_are_refused_in_meters(wkt, moved, refused):
+    x, zero = np.arange(3.0), np.zeros(3)
+    one, other = (Points({"X": x + d, "Y": zero, "Z": zero}, wkt) for d in (0.0, moved))
+    with pytest.raises(StageError, match="lie apart") if refused else nullcontext():
+        _refuse_other_points(one, other, "a.las", "b.las")
 
 
 @pytest.mark.pdal

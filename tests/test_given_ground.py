@@ -10,7 +10,9 @@ import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.classifier.model import load_model
 from pdal_stages.cli import main
+from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.expansion import settle_upstream
+from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.stages.registry import stage_from
 from pdal_stages.terrain.heights import filtered_ground
 from pdal_stages.terrain.smrf import FilterOptions
@@ -111,6 +113,14 @@ def test_classify_keeps_the_ground_that_is_given(edited, tmp_path, capsys):
     assert main(["classify", str(edited), str(found)]) == 0
     assert (np.asarray(laspy.read(found).classification)[given] != 2).sum() > 20  # the terrace
     assert "other heights" not in capsys.readouterr().err
+
+
+@pytest.mark.pdal
+def test_classes_to_keep_are_joined_by_the_ground():
+    overrides, _ = parse_overrides(["--filters.modelclassifier.keep=9,17"])
+    request = ClassifyRequest(overrides=tuple(overrides), bridges=True, given_ground=True)
+    (bridges,) = (stage for stage in request.stages if stage["type"] == "filters.bridges")
+    assert stage_from(bridges).keep.codes == (9, 17, 2)
 
 
 @pytest.mark.pdal

@@ -497,3 +497,18 @@ def test_real_clouds_lose_next_to_nothing_and_lose_their_noise(name, data_dir):
     high = at + np.column_stack([np.zeros((60, 2)), rng.uniform(60, 300, 60)])
     found = detached_noise(np.vstack([xyz, deep, high]))[len(xyz) :]
     assert (found[:60] == 7).mean() >= 0.9 and (found[60:] == 18).mean() >= 0.95
+
+
+@pytest.mark.pdal
+def test_counts_are_those_of_all_views(tmp_path, write_las):
+    xyz, _ = scene(side=60)
+    arrays = dict(zip("XYZ", xyz.T, strict=True)) | {"Classification": np.ones(len(xyz), np.uint8)}
+    path = write_las(tmp_path / "in.las", arrays, point_format=6)
+    split = {"type": "filters.splitter", "length": 30}
+    pipeline = ps.run_pipeline([str(path), split, {"type": "filters.detachednoise"}])
+    ((_, reports),) = pipeline.reports
+    assert len(reports) > 1
+    found = np.concatenate([view["Classification"] for view in pipeline.arrays])
+    expected = {"low": np.count_nonzero(found == 7), "high": np.count_nonzero(found == 18)}
+    named = {f"filters.detachednoise.{name}": n for name, n in expected.items() if n}
+    assert len(named) == 2 and pipeline.left_alone == named

@@ -13,7 +13,7 @@ import pytest
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.vector import Overlay, points_inside
-from pdal_stages.stages.base import WHOLE_CLOUD
+from pdal_stages.stages.base import WHOLE_CLOUD, StageContext
 from pdal_stages.stages.polygons import Polygons
 
 pyogrio, shapely, pyproj = (pytest.importorskip(name) for name in ("pyogrio", "shapely", "pyproj"))
@@ -226,3 +226,18 @@ def test_damaged_files_are_errors_of_ours(tmp_path):
     Path(path).write_bytes(b"no GeoPackage any more")
     with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read"):
         stage.run(points, WHOLE_CLOUD)
+
+
+def test_points_inside_are_counted_in_the_tile_alone(tmp_path):
+    arrays = cloud()
+    path = write(tmp_path / "lakes.gpkg", [LAKE, ISLET])
+    stage = Polygons({"polygons": [f"{path}=9"]})
+    own = arrays["X"] < 85045
+    tile = arrays | {"Outside": np.where(own, -1.0, 1.0)}
+    context = StageContext(outside="Outside", used_m=5.0)
+    points = stage.points(tile, context, wkt=pyproj.CRS(RD).to_wkt("WKT1_GDAL"))
+    codes = stage.run(points, context)["Classification"]
+    changed = codes != arrays["Classification"]
+    assert (changed & ~own).any()
+    assert points.report.figures["inside"] == np.count_nonzero(changed & own)
+    assert stage.counts.keys() <= points.report.figures.keys()

@@ -46,6 +46,8 @@ def test_one_spelling():
         [{**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": [7, "Withheld[1:1]"]}],
     )
     assert check(check([given])) == check([given])
+    bracket = {**HAG, "ignore": "7,Z[0:2)"}
+    assert check(check([bracket]))[0]["ignore"] == ["7", "Z[0:2)"]
     both = [{"type": "filters.smrf", "ignore": "Classification[7:7]"}, {"type": "filters.hag_nn"}]
     assert check(both)[0]["ignore"] == ["Classification[7:7]"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import struct
 
 import laspy
@@ -14,7 +15,8 @@ from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.units import Units, horizontal_part, units_of_wkt
 from pdal_stages.cli import main
-from pdal_stages.pipeline.spatial_reference import reference_of_file
+from pdal_stages.pipeline.expansion import check_dimensions
+from pdal_stages.pipeline.spatial_reference import fault_of_reference, reference_of_file
 from pdal_stages.stages.hag_minima import HagMinima
 from pdal_stages.synthetic import write_town
 
@@ -85,6 +87,31 @@ def test_degrees_beside_meters(tmp_path, inputs):
     for way in ways(tmp_path, inputs(METERS, DEGREES)):
         with pytest.raises(StageError, match=r"degrees.*in1\.las|in1\.las.*degrees"):
             way()
+
+
+@pytest.mark.parametrize(
+    ("reference", "fault"),
+    [
+        ("EPSG:4547", ""),  # meters of a Gauss-Kruger zone
+        ("EPSG:28992", ""),
+        ("EPSG:4326", "degrees"),
+        ("EPSG:4326+5773", "degrees"),
+        ("NAD27", "degrees"),
+        ("EPSG:4978", "geocentric"),
+        ("nonsense", ""),  # which PDAL refuses
+    ],
+)
+def test_a_reprojection_to_degrees_before_a_stage(reference, fault):
+    assert fault in fault_of_reference(reference)
+    assert bool(fault) == bool(fault_of_reference(reference))
+    points = {"type": "readers.faux", "count": 9, "mode": "grid", "bounds": "([1,9],[1,9],[1,9])"}
+    moved = {"type": "filters.reprojection", "in_srs": "EPSG:4326", "out_srs": reference}
+    expanded = ps.Pipeline([points, moved, {"type": "filters.hag_minima"}]).expanded
+    if not fault:
+        check_dimensions(expanded)
+        return
+    with pytest.raises(StageError, match=rf"{fault}.*to {re.escape(reference)}"):
+        check_dimensions(expanded)
 
 
 def test_references_of_two_kinds(tmp_path, inputs):

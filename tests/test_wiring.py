@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
-from pdal_stages.base.errors import PipelineError
+from pdal_stages.base.errors import DimensionError, PipelineError
 from pdal_stages.cli import main
+from pdal_stages.pipeline.expansion import check_dimensions
 from pdal_stages.pipeline.run import Pipeline
+from pdal_stages.stages import preprocessing
 
 FAUX = {"type": "readers.faux", "count": 300, "mode": "ramp", "bounds": "([0,60],[0,60],[0,9])"}
 HAG = {"type": "filters.hag_minima"}
@@ -85,3 +88,19 @@ def test_a_pipeline_without_a_reader_at_its_start(tmp_path, capsys, monkeypatch,
         assert main([words[0], "job.json", *words[1:]]) == 1
         assert "reader" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.las"))
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("ground", preprocessing.GROUND_OF_PDAL)
+def test_ground_of_pdal_is_no_height(ground):
+    """Points that have none still get one, and a model that reads heights is refused at once."""
+    city = str(Path(__file__).parent / "data" / "city.laz")
+    hag = Pipeline([city, {"type": ground}, HAG]).expanded
+    assert not hag.ours[0].context.created_before and not hag.ours[0].stage.upstream
+    model = {"type": "filters.modelclassifier", "model": "standard"}
+    expanded = Pipeline([city, {"type": ground}, model]).expanded
+    with pytest.raises(DimensionError, match="no stage before creates it"):
+        check_dimensions(expanded)
+    after = Pipeline([city, {"type": ground}, {"type": "filters.hag_nn"}, model]).expanded
+    check_dimensions(after)
+    assert [stage["type"] for stage in after.ours[0].stage.upstream] == [ground, "filters.hag_nn"]

@@ -14,6 +14,7 @@ from ..base.errors import DimensionError, StageError, suggest
 from ..base.files import check_outputs
 from ..base.progress import Progress
 from ..base.report import Report
+from ..base.units import Units, units_of_wkt
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from ..stages.registry import stage_from
@@ -86,8 +87,10 @@ def compare_files(
     return report.messages
 
 
-#: Points of two files that are farther apart are not the same; formats round coordinates.
+#: Points of two files that are farther apart along an axis are not the same; formats round
+#: coordinates. In meters, and of degrees as many as that is along a meridian.
 _FAR_APART_M = 0.01
+_METERS_PER_DEGREE = 111_000.0
 #: Dimension that keeps the files' own classes while a model assigns new ones.
 _TRUTH = "TrueClass"
 
@@ -164,8 +167,16 @@ def _refuse_other_points(judged: Points, true: Points, source: str, reference: s
     """Refuse a reference that holds other points, or the same in another order."""
     difference = f"{judged.count:,} points in {source}, {true.count:,} in {reference}"
     if judged.count == true.count:
-        axes = [axis for axis in ("X", "Y", "Z") if axis in judged.arrays and axis in true.arrays]
-        away = [abs(judged.arrays[axis] - true.arrays[axis]) > _FAR_APART_M for axis in axes]
+        try:
+            units = units_of_wkt(judged.wkt)
+        except StageError:  # degrees; their heights are in meters
+            units = Units(_METERS_PER_DEGREE, 1.0)
+        meters = {"X": units.horizontal, "Y": units.horizontal, "Z": units.vertical}
+        axes = [axis for axis in meters if axis in judged.arrays and axis in true.arrays]
+        away = [
+            abs(judged.arrays[axis] - true.arrays[axis]) * meters[axis] > _FAR_APART_M
+            for axis in axes
+        ]
         number = max(map(np.count_nonzero, away), default=0)
         if not number:
             return

@@ -14,6 +14,7 @@ from ..base.las_repair import extra_dimensions
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..stages import preprocessing
+from ..stages.options import split_selection
 from ..stages.points import SELECTED
 from ..stages.registry import stage_from, stage_types
 from .inputs_outputs import is_las, writes_las
@@ -137,7 +138,7 @@ class ClassifyRequest:
         shared: dict[str, Any] = {
             name: settled[name] for name in ("ignore", "keep") if name in settled
         }
-        kept = shared.get("keep", OVERLAP)
+        kept = split_selection(shared.get("keep", OVERLAP))
         finders = {**shared}
         if keep_ground:
             finders["keep"] = [*(kept if isinstance(kept, list) else [kept]), GROUND]
@@ -158,7 +159,7 @@ class ClassifyRequest:
         """The dimensions that the stages create, except classes: name -> PDAL type."""
         created: dict[str, str] = {}
         for stage in self.stages:
-            if stage["type"] in preprocessing.OF_PDAL:
+            if stage["type"] in preprocessing.HEIGHTS_OF_PDAL:
                 created["HeightAboveGround"] = "double"
             elif stage["type"] in stage_types():
                 created |= stage_from(overridden(stage, self.overrides)).creates()

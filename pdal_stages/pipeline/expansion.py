@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import itertools
-import re
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +26,7 @@ from .inputs_outputs import is_reader, readers_files
 from .json_source import PipelineSource
 from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
 from .runtime import BY_LABEL, TRAMPOLINE, ExpandedStage, python_filter
+from .spatial_reference import fault_of_reference
 
 #: Stages after which several views are what the user asked for.
 SPLITS = {
@@ -119,6 +119,7 @@ def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
 def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) -> bool:
     """Return whether points may reach a stage in several views, and nobody wants them apart.
 
+    The plugin, which sees PDAL's stages instead of JSON, decides by `viewsOf` of ``stage.cpp``.
     `several`: there are several input files. A stage that makes one thing of all points never wants
     them apart; filters.crop splits, too, where it has several areas.
     """
@@ -174,14 +175,20 @@ def settle_upstream(
     """
     # Noise is marked in `Classification`, too: it is no preprocessing.
     wanted = set(stage.reads()) - {"Classification"}
-    makers = [preprocessing.entry(plain) for plain, creates in before if wanted & set(creates)]
+    ground = preprocessing.GROUND_OF_PDAL if "HeightAboveGround" in wanted else ()
+    makers = [
+        preprocessing.entry(plain)
+        for plain, creates in before
+        if wanted & set(creates) or plain.get("type") in ground
+    ]
     created_before = any(set(creates) & set(stage.creates()) for _, creates in before)
     return stage.after(makers), created_before
 
 
 def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
-    """Return the dimensions of a PDAL stage that ours may read."""
-    return {"HeightAboveGround": "double"} if stage.get("type") in preprocessing.OF_PDAL else {}
+    """Return the dimensions that a PDAL stage creates and ours may read: name -> PDAL type."""
+    makes = stage.get("type") in preprocessing.HEIGHTS_OF_PDAL
+    return {"HeightAboveGround": "double"} if makes else {}
 
 
 def _place_upstream(expanded: Expanded) -> None:
@@ -209,10 +216,6 @@ _CREATED = ("HeightAbove", "Ground", "Slope", "Reference")
 _CREATES_ANY = {
     f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")
 }
-_DEGREES = re.compile(
-    r"^\s*EPSG:\s*4\d{3}\s*$|longlat|latlong|^\s*(OGC:)?CRS:?84|^\s*(GEOGCS|GEOGCRS|GEODCRS)",
-    re.IGNORECASE,
-)
 
 
 def check_dimensions(expanded: Expanded) -> None:
@@ -222,9 +225,9 @@ def check_dimensions(expanded: Expanded) -> None:
         before = list(enumerate(expanded.stages[: ours.index]))
         # Scripts only get the reader's reference
         moved = [s.get("out_srs", "") for _, s in before if s["type"] == "filters.reprojection"]
-        if moved and _DEGREES.search(str(moved[-1])):
+        if moved and (fault := fault_of_reference(str(moved[-1]))):
             raise PipelineError(
-                "the points are in degrees here; neighborhoods and grids need meters",
+                fault,
                 where=ours.stage.place,
                 found=f"filters.reprojection to {moved[-1]}",
                 cure="Put the reprojection after the stages of pdal_stages, or reproject to a "

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -90,13 +91,16 @@ class Pipeline:
 
     @property
     def left_alone(self) -> dict[str, int]:
-        """Counts of points of the last run (:attr:`Stage.counts`) above 0, by ``type.name``."""
-        return {
-            f"{ours.stage.type}.{name}": number
-            for ours in self.expanded.ours
-            for name in ours.stage.counts
-            if ours.reports and (number := ours.reports[-1].figures.get(name, 0))
-        }
+        """Counts of points of the last run (:attr:`Stage.counts`) above 0, by ``type.name``.
+
+        They are sums over views, and over stages of one type.
+        """
+        counts = Counter[str]()
+        for ours in self.expanded.ours:
+            for name in ours.stage.counts:
+                numbers = [report.figures.get(name, 0) for report in ours.reports]
+                counts[f"{ours.stage.type}.{name}"] += sum(numbers)
+        return dict(+counts)
 
     @property
     def messages(self) -> list[str]:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from ..base.errors import PipelineError, StageError
@@ -70,6 +71,23 @@ def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str 
     root = parse_wkt(wkt)
     height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
     return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt), wkt)
+
+
+@cache
+def fault_of_reference(name: str) -> str:
+    """Return why coordinates in a reference, as PDAL takes its name, suit no stage; else empty.
+
+    PDAL is asked for a single point, and reports a name that it does not know itself.
+    """
+    box = "([1, 2], [1, 2], [1, 2])"
+    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": box}
+    with suppress(PipelineError):
+        run = pdal_env.execute([{**point, "override_srs": name}], arrays=False)
+        try:
+            units_of_wkt(wkt_of(reader_metadata(run.metadata)))
+        except StageError as error:
+            return error.what
+    return ""
 
 
 def plane_unit(stages: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any]) -> float | None:

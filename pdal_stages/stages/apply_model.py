@@ -27,7 +27,7 @@ from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
 from .base import WHOLE_CLOUD, Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
 from .points import Points, class_counts
-from .preprocessing import OF_PDAL, as_json, same, with_given_ground
+from .preprocessing import GROUND_OF_PDAL, HEIGHTS_OF_PDAL, as_json, same, with_given_ground
 from .registry import stage_type
 
 #: Dimension of the height above ground.
@@ -177,7 +177,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
         The model needs them beside the heights, which PDAL's stages measured from class 2.
         """
-        by_pdal = all(stage["type"] in OF_PDAL for stage in self.upstream)
+        of_pdal = GROUND_OF_PDAL + HEIGHTS_OF_PDAL
+        by_pdal = all(stage["type"] in of_pdal for stage in self.upstream)
         if not self.upstream or not by_pdal or len(self.preparation) != 1:
             return []
         created = self._of_ground.creates().keys() - {HEIGHT}

@@ -6,7 +6,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from .options import (
 from .points import Points
 from .where_expression import Expression
 
+_Placed = TypeVar("_Placed", bound="Stage")
 #: What `where` means to stages of heights.
 HEIGHTS_OUTSIDE = (
     "Points outside do not form the ground; they receive a height above it, unless they have one "
@@ -173,7 +174,7 @@ class Stage(ABC):
             raise AttributeError(f"a stage cannot be changed after it is made: '{name}' is set")
         super().__setattr__(name, value)
 
-    def after(self, makers: Iterable[Mapping[str, Any]]) -> Self:
+    def after(self: _Placed, makers: Iterable[Mapping[str, Any]]) -> _Placed:
         """Return this stage placed behind the stages of a pipeline that create what it reads."""
         placed = copy.copy(self)
         placed.__dict__["upstream"] = tuple(makers)

@@ -250,8 +250,7 @@ class Option:
         return list(chosen.codes)
 
     def _parse_selection(self, value: Any) -> Selection:
-        items = value.split(",") if isinstance(value, str) else value
-        return Selection.parse(self._parse_list(items), self.name)
+        return Selection.parse(self._parse_list(split_selection(value)), self.name)
 
     def _parse_mapping(self, value: Any) -> dict:
         parsed = value
@@ -309,6 +308,14 @@ def keep_option(points: str = "Points that are neighbors but keep their class") 
 def split_list(text: str) -> list[str]:
     """Split at commas outside parentheses: ``c1,kopt(10,50)`` is two tokens."""
     return [part.strip() for part in re.split(r",(?![^(]*\))", text) if part.strip()]
+
+
+def split_selection(value: Any) -> Any:
+    """Split the text of a selection at all commas, as ranges hold none; return others as they are.
+
+    ``9,Z[1:2)`` are two, though a bracket follows the comma.
+    """
+    return value.split(",") if isinstance(value, str) else value
 
 
 def parse_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ class Polygons(ClassStage):
         "Set the class of points inside the polygons of any OGR file, such as water inside lakes"
     )
     where_help = "Points outside keep their class"
+    counts = {"inside": "points inside polygons (polygons)"}
     polygons: list = option(
         "list",
         None,
@@ -51,6 +52,7 @@ class Polygons(ClassStage):
         box = float(x.min()), float(y.min()), float(x.max()), float(y.max())
         codes = points.class_codes.copy()
         counts, notes = {}, []
+        changed = np.zeros(points.count, bool)
         for overlay in self.overlays:
             may = np.flatnonzero(change & np.isin(codes, overlay.over) if overlay.over else change)
             inside, polygons, note = with_vector(
@@ -58,12 +60,14 @@ class Polygons(ClassStage):
             )
             rows = may[inside]
             codes[rows] = overlay.code
+            changed[rows] = True
             name = f"{overlay.file}|layername={overlay.layer}" if overlay.layer else overlay.file
             counts[f"{name}={overlay.code}"] = {"polygons": polygons, "points": len(rows)}
             notes += [note] if note else []
             if not polygons:
                 points.report.warnings.append(f"{NO_POLYGON_NEAR} {name}")
         points.report.figures["polygons"] = counts
+        points.tally("inside", changed)
         points.report.figures["classes"] = class_counts(codes[change])
         points.report.notes += notes
         return {"Classification": points.with_codes(codes)}

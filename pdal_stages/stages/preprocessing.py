@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ..base.errors import ModelError, StageError
 from ..base.las import number_type
 from .base import WHOLE_CLOUD
-from .options import Option, split_list
+from .options import Option, split_selection
 from .registry import PDAL_OWN, stage_type, stage_types
 
 #: The preprocessing of the dimensions that a model is trained on by default.
@@ -28,11 +28,11 @@ PREPARATION: tuple[dict[str, Any], ...] = (
 )
 #: The stage that finds ground, or takes what is given.
 GROUND_FILTER = "filters.hag_morphological"
-#: PDAL's stages that heights come from; for ours, :meth:`Stage.creates` tells.
-OF_PDAL = tuple(
-    f"filters.{name}" for name in ("smrf", "pmf", "csf", "hag_nn", "hag_delaunay", "hag_dem")
-)
-#: PDAL's stages that measure from points of class 2; PDAL 2.2 crashes where there are none.
+#: PDAL's stages that classify ground, from which others of PDAL measure heights.
+GROUND_OF_PDAL = ("filters.smrf", "filters.pmf", "filters.csf")
+#: PDAL's stages that create HeightAboveGround; for ours, :meth:`Stage.creates` tells.
+HEIGHTS_OF_PDAL = ("filters.hag_nn", "filters.hag_delaunay", "filters.hag_dem")
+#: PDAL's stages that measure from points of class 2; PDAL before 2.9 crashes where there are none.
 NEEDS_GROUND = ("filters.hag_nn", "filters.hag_delaunay")
 #: PDAL's stage that a model must carry before those.
 MAKES_GROUND = "filters.smrf"
@@ -146,7 +146,7 @@ def _value(option: Option, value: Any) -> Any:
     """Return an option's value in the spelling of JSON."""
     parsed = option.parse(value)
     if option.kind == "selection":
-        items = split_list(value) if isinstance(value, str) else value
+        items = split_selection(value)
         return [str(item).strip() for item in (items if isinstance(items, list) else [items])]
     if option.kind == "numbers":
         return [_number(number) for number in parsed]
