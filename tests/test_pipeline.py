@@ -13,7 +13,7 @@ from processes import printed
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import DimensionError, OptionError
-from pdal_stages.pipeline.expansion import merge_filters
+from pdal_stages.pipeline.expansion import fuse_scripts
 from pdal_stages.terrain.minima import hag_minima
 
 pytestmark = pytest.mark.pdal
@@ -118,7 +118,7 @@ def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     stages = [str(cloud), *ours, {"type": "filters.wires"}]
     alone = [stages[0], *({**stage, "tag": f"t{n}"} for n, stage in enumerate(stages[1:]))]
     pipelines = [ps.Pipeline(each) for each in (stages, alone)]
-    plain, tagged = (merge_filters(pipeline.expanded.stages) for pipeline in pipelines)
+    plain, tagged = (fuse_scripts(pipeline.expanded.stages) for pipeline in pipelines)
     assert tagged == pipelines[1].expanded.stages
     several = [[one["stage"] for one in stage["pdalargs"]["stages"]] for stage in plain[1:]]
     types = [stage["type"] for stage in stages[1:]]

@@ -516,3 +516,10 @@ def test_what_is_missing_is_told(tmp_path, monkeypatch):
     with pytest.raises(ps.StageError, match="does not compile"):
         install.install(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_no_exception_leaves_an_answer():
+    module = {"pdalargs": {}}
+    assert calls.answer(module, {}, {})
+    (leaf,) = module["out_metadata"]["children"]
+    assert leaf["name"] == "pdal_stages_error" and "KeyError" in leaf["value"]

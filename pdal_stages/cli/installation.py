@@ -14,7 +14,8 @@ from typing import Any
 from ..base.errors import DependencyError, PipelineError, suggest
 from .parser import Parser
 
-#: Version of the JSON of ``commands``, for its readers.
+#: Version of the JSON of ``commands``: readers, such as the plugin for QGIS, refuse others, so it
+#: rises when a field gets another name or meaning.
 _FORMAT = 1
 _TYPES = {int: "integer", float: "number"}
 

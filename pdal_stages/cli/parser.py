@@ -12,8 +12,8 @@ from typing import Any, NoReturn
 from ..base.errors import StageError, suggest
 from ..base.version import __version__
 
-#: Modules and their commands. Only the module of the requested command is imported; all for
-#: ``commands``.
+#: Modules and their commands. Only the module of the requested command is imported. ``commands`` is
+#: left out on purpose: like a word that is not a command, it imports all, as it describes all.
 COMMANDS = {
     "classify": ("classify",),
     "models": ("models", "train", "adapt", "accuracy", "model"),

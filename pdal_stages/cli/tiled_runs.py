@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 
 #: Kinds of reports by the suffix of the file.
 _REPORTS = {".html": HTML, ".htm": HTML, ".json": JSON}
-_MOST_FAILURES = 20  #: are printed; reports have all
-_MOST_TILES = 50  #: of a dry run are printed
+#: Failures that are printed, a screenful; reports hold all of them.
+_MOST_FAILURES = 20
+#: Tiles of a dry run that are printed.
+_MOST_TILES = 50
 
 
 def run_files(options: argparse.Namespace) -> list[Output]:
@@ -57,7 +59,10 @@ def add_tile_sizes(
     command: argparse.ArgumentParser,
     what: str = "Points that do not fit in memory are read in tiles, which give the same model.",
 ) -> Callable:
-    """Add the flags of ``train``, whose only output is a model; return what adds more."""
+    """Add the flags that all runs in tiles share; return what adds more to their group.
+
+    They are all that ``train`` has, as its only output is a model.
+    """
     add = command.add_argument_group("large areas", what).add_argument
     side = "Side of the tiles in the cloud's unit (default: auto)"
     add("--tile", type=_tile_side, metavar="SIZE", help=side)

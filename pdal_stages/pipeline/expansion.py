@@ -125,7 +125,8 @@ def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) 
     """
     kinds = [stage["type"] for stage in stages[:number]]
     split = not SPLITS.isdisjoint(kinds)
-    if stage_type(stages[number]["type"]).instead_of_tiles and (split or "filters.crop" in kinds):
+    gathers = stage_type(stages[number]["type"]).needs_all_points()
+    if gathers and (split or "filters.crop" in kinds):
         return kinds[-1] != "filters.merge"
     joined = "inputs" not in stages[number] and {*kinds[-1:]} <= {"filters.merge", *stage_types()}
     return several and not split and not joined
@@ -309,7 +310,7 @@ def expand_stage(
     return expanded
 
 
-def merge_filters(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def fuse_scripts(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return an expanded pipeline with one filter for stages of ours that follow one another.
 
     For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. What

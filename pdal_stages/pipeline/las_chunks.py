@@ -13,7 +13,7 @@ from ..base.las import POINTWISE, laszip_record, named_las, read_header
 from ..base.las_repair import corrected
 from . import pdal as pdal_env
 
-#: Points read at a time.
+#: Points read at a time: 30 to 70 MB as LAS stores them.
 PART = 1_000_000
 _LASPY = {"ReturnNumber": "return_number", "NumberOfReturns": "number_of_returns"}
 

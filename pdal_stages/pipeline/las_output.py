@@ -107,7 +107,11 @@ def finish(output: Path, sources: Iterable[str], unit: float | None = None) -> N
 
 
 def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage]) -> None:
-    """Refuse class codes and numbers of extra dimensions that a later LAS writer cannot hold."""
+    """Refuse class codes and numbers of extra dimensions that a later LAS writer cannot hold.
+
+    Codes that only a run shows are refused then: the last stage that changes classes gets the limit
+    in its context (`code_limit`).
+    """
     last = [each for each in ours if "Classification" in each.stage.creates()][-1:]
     for each in ours:
         stage, extra = each.stage, len(each.stage.creates())

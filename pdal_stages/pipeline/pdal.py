@@ -1,6 +1,8 @@
 """Call PDAL: run pipelines, ask for versions and drivers, and hide differences between versions.
 
-No other module of the package calls PDAL.
+No other module runs PDAL or asks it anything. But :mod:`.python_pdal` makes objects of
+python-pdal's classes, ``plugin/install.py`` looks for PDAL's library and headers, and
+``plugin/stage.cpp`` runs inside PDAL.
 """
 
 from __future__ import annotations
@@ -88,7 +90,7 @@ def _run_program(*arguments: str, **options: Any) -> subprocess.CompletedProcess
 
 def ask_program(*arguments: str) -> str:
     """Return what `pdal` prints for some arguments."""
-    done = _run_program(*arguments, timeout=120)
+    done = _run_program(*arguments, timeout=120)  # so that one that hangs does not hold ours
     if not done.returncode:
         return done.stdout
     output = (done.stderr or done.stdout).strip()[-500:]
@@ -167,7 +169,7 @@ def execute(
         If python-pdal or filters.python is missing.
     """
     for path in readers_files(stages, las=True):
-        check_readable(path)  # newer PDAL crashes of a LAZ file that is cut short
+        check_readable(path)  # newer PDAL crashes on a LAZ file that is cut short
     with _one_run, readable(stages) as copies:
         return _execute(copies, arrays, loglevel)
 
@@ -397,8 +399,10 @@ def deferred_interrupts() -> Iterator[None]:
 
 # ---- what differs between versions ---------------------------------------------------------------
 
-#: Options of readers.copc that choose points, and those that only make it faster.
+#: Options of readers.copc that choose points: without it they cannot be granted.
 _COPC_OPTIONS = ("bounds", "polygon", "ogr", "resolution", "origin")
+#: Its others that readers.las of that PDAL lacks. They concern
+#: transfers (`requests`, `keep_alive`, `header`, `query`) and the reading of odd records.
 _COPC_TUNING = ("requests", "keep_alive", "header", "query", "vlr", "fix_dims", "srs_vlr_order")
 
 
@@ -448,6 +452,7 @@ def las_writer_defaults() -> tuple[int, int]:
     described = ask_program("--options", "writers.las")
     minor = re.search(r"minor_version \[(\d+)\]", described)
     format_id = re.search(r"dataformat_id \[(\d+)\]", described)
+    # Newer PDAL's defaults, should it print none.
     return int(minor.group(1)) if minor else 4, int(format_id.group(1)) if format_id else 7
 
 
@@ -468,14 +473,15 @@ def compresses_las_14() -> bool:
 
 @cache
 def splits_class_flags() -> bool:
-    """Return whether readers split the flags of LAS 1.0-1.3 from the class (PDAL 2.2 does not)."""
+    """Return whether readers split the flags of LAS 1.0-1.3 from the class (from PDAL 2.6 on)."""
     return "Withheld" in {dimension["name"] for dimension in bindings().dimensions}
 
 
 def flags_inside_classification(dimensions: Any, metadata: Any) -> bool:
-    """Return whether the flag bits of LAS 1.0-1.3 sit inside `Classification`, as in PDAL 2.2.
+    """Return whether the flag bits of LAS 1.0-1.3 sit inside `Classification`.
 
-    Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
+    That is so before PDAL 2.6. Newer versions have a dimension for each flag; LAS 1.4 formats
+    have `ClassFlags`.
     """
     flags = ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")
     return max(_point_formats(metadata), default=6) <= 5 and not any(f in dimensions for f in flags)

@@ -22,7 +22,7 @@ from ..base.report import Report
 from ..stages.registry import stage_types
 from . import las_output, runtime
 from . import pdal as pdal_env
-from .expansion import Expanded, check_dimensions, expand, merge_filters, stage_files
+from .expansion import Expanded, check_dimensions, expand, fuse_scripts, stage_files
 from .inputs_outputs import (
     ept_address,
     is_reader,
@@ -192,7 +192,7 @@ class Pipeline:
         alone = len(writers) == 1 and writers[0] is plain[-1]
         try:
             result, final_names = execute_whole(
-                merge_filters(stages),
+                fuse_scripts(stages),
                 [output.path for output in writers_outputs(plain)],
                 readers_files(plain, las=True),
                 self._add_missing_reports,

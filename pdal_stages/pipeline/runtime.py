@@ -4,7 +4,7 @@ The script that PDAL executes is a few lines that call :func:`run_stage`; everyt
 here, in the installed package, where compiled code can be cached.
 
 No exception may reach ``filters.python``: it releases the exception, its type and its traceback
-twice, and Python dies of it then or minutes later. A stage that fails therefore returns normally
+twice, so Python crashes, at once or minutes later. A stage that fails therefore returns normally
 and hands over one array under a name no dimension has, its message; PDAL refuses that with an error
 that holds the name.
 """

@@ -150,7 +150,7 @@ def check_one_reference(references: Mapping[str, Reference]) -> list[str]:
 def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:
     """Refuse a pipeline whose LAS readers read different references; return messages.
 
-    Not where a stage moves points.
+    A pipeline with a stage that moves points (:data:`MOVING`) is not checked.
     """
     if any(stage["type"] in MOVING for stage in stages):
         return []

@@ -122,7 +122,7 @@ class WorkerProcesses(AbstractContextManager):
         for pool in [*self._idle, *self._busy.values()]:
             for process in list((pool._processes or {}).values()):
                 process.kill()
-                process.join(10.0)
+                process.join(10.0)  # killed, it ends at once, unless the system waits for a disk
             _stop_sending(pool)
             pool.shutdown(cancel_futures=True)
 

@@ -1,9 +1,9 @@
 """The Python side of ``stage.cpp``, which calls it through ``filters.python`` in two steps.
 
-`prepare` is called before any point is read: it checks the options and returns the dimensions they
-create. `run` processes one point view. Answers are metadata of the script, a list of named texts; a
-failure is named ``pdal_stages_error``, which the plugin throws as a PDAL error. No exception leaves
-this module.
+In the step ``prepare``, before any point is read, :func:`answer` checks the options and returns
+the dimensions they create. In the step ``run`` it processes one point view. Answers are metadata of
+the script, a list of named texts; a failure is named ``pdal_stages_error``, which the plugin throws
+as a PDAL error. No exception leaves :func:`answer`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     ins, outs : dict
         PDAL's dimensions, and the ones to write back.
     """
-    question = module["pdalargs"]
-    where = place(question["stage"], question.get("tag"))
-    _end_on_interrupt()
-    # PDAL's module object stays alive; the register need not grow.
-    sys.modules.pop(question["label"], None)
+    where = "pdal_stages"
     try:
+        question = module["pdalargs"]
+        where = place(question["stage"], question.get("tag"))
+        _end_on_interrupt()
+        # PDAL's module object stays alive; the register need not grow.
+        sys.modules.pop(question["label"], None)
         stage, context = _make_stage(question)
         if question["step"] == "prepare":
             leaves = [

@@ -29,21 +29,23 @@ def header() -> str:
         lines = [f"    {{ {', '.join(fields)} }}," for fields in _fields(kind)]
         options += [f"const Option {name}[] = {{", *lines, "};"]
         texts = (kind.type, digest(kind), kind.summary, f"pdal-stages options {kind.type}")
-        gathers = str(bool(kind.instead_of_tiles)).lower()
+        gathers = str(kind.needs_all_points()).lower()
         shown = ", ".join(map(json.dumps, texts))
         stages.append(f"    {{ {shown}, {name}, sizeof({name}) / sizeof(Option), {gathers} }},")
     version = f"constexpr const char *VERSION = {json.dumps(__version__)};"
     names = ", ".join(map(json.dumps, sorted({"filters.merge", *SPLITS})))
-    one_view = (
-        "// Stages after which there is one view, or several are what the user asked for.\nconst "
-        f"std::set<std::string> ONE_VIEW {{ {names} }};"
+    not_gathered = (
+        "// Stages after which views stay as they are: one, or as many as the user wants.\n"
+        f"const std::set<std::string> NOT_GATHERED_AFTER {{ {names} }};"
     )
-    return "\n".join([version, one_view, *options, "const Stage STAGES[] = {", *stages, "};", ""])
+    return "\n".join(
+        [version, not_gathered, *options, "const Stage STAGES[] = {", *stages, "};", ""]
+    )
 
 
 def digest(kind: type[Stage]) -> str:
     """Return a digest of what PDAL sees of a stage: names, types and defaults of options."""
-    gathers = bool(kind.instead_of_tiles)
+    gathers = kind.needs_all_points()
     held = f"{kind.type} {gathers} {[fields[:-1] for fields in _fields(kind)]}"
     return hashlib.sha256(held.encode()).hexdigest()[:16]
 

@@ -70,6 +70,9 @@ def install(folder: Path | None = None) -> list[Path]:
     with tempfile.TemporaryDirectory(prefix=".pdal_stages_", dir=target) as work:
         library = Path(work, "library")
         Path(work, "declarations.hpp").write_text(declarations.header())
+        # The stages are copies of one library, loaded beside one another: hidden and symbolic, each
+        # binds to symbols of its own. It computes nothing, so -O1 compiles sooner and loses
+        # nothing; -w is for warnings of PDAL's headers, -s leaves symbols for debuggers out.
         link = ["-shared", f"-L{installed.library}", "-lpdalcpp", f"-Wl,-rpath,{installed.library}"]
         link += [] if sys.platform == "darwin" else ["-Wl,-Bsymbolic", "-s"]
         flags = ["-std=c++17", "-O1", "-fPIC", "-fvisibility=hidden", "-w"]

@@ -168,11 +168,12 @@ std::string newLabel(const std::string& type)
     return label;
 }
 
-// How many views reach a stage's successor, unless something gathers them: one for each reader.
+// How many views reach a stage's successor, unless something gathers them: one for each reader. The package decides by
+// `_may_be_apart` (pipeline/expansion.py) from the pipeline's JSON.
 size_t viewsOf(Stage& stage)
 {
     const std::string name = stage.getName();
-    if (startsWith(name, "readers.") || declared::ONE_VIEW.count(name))
+    if (startsWith(name, "readers.") || declared::NOT_GATHERED_AFTER.count(name))
         return 1;
     for (const declared::Stage& ours : declared::STAGES)
         if (name == ours.type)
@@ -279,7 +280,7 @@ private:
 
     const declared::Stage& m_declared;
     std::string m_label;
-    std::deque<Bound> m_bound;
+    std::deque<Bound> m_bound; // PDAL's parser keeps addresses of its elements, which a vector would move
     Options m_held;
     std::string m_request;
     BasePointTable *m_table = nullptr;

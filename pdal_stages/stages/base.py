@@ -111,6 +111,7 @@ class Stage(ABC):
     #: without points is no error.
     needs_points: ClassVar[str] = ""
     #: For a stage that needs all points at once: the cure that is shown where it is run in tiles.
+    #: Where that depends on options, `check` sets it; :meth:`needs_all_points` is then False.
     instead_of_tiles: str = ""
     #: For a stage that a model file may carry in its preprocessing: the options that the file may
     #: set. Model files come from strangers, so never an option that holds a path.
@@ -188,6 +189,11 @@ class Stage(ABC):
         where = options["where"]
         options["where"] = replace(where, help=f"{where.help}. {cls.where_help}")
         return tuple(reversed(options.values()))
+
+    @classmethod
+    def needs_all_points(cls) -> bool:
+        """Return whether it makes one thing of all points, so that views are merged before it."""
+        return bool(cls.instead_of_tiles)
 
     @classmethod
     def describe_choices(cls) -> str:

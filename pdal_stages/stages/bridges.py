@@ -11,7 +11,7 @@ from .base import ClassStage, StageContext
 from .options import Selection, code_option, keep_option
 from .points import Points, class_counts
 
-#: Leaves beside a deck, as high as it is.
+#: Class codes of vegetation: leaves beside a deck are as high as the deck, and keep their class.
 _VEGETATION = (3, 4, 5)
 
 

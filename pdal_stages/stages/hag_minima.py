@@ -45,8 +45,9 @@ class HagMinima(Stage):
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
-        # The bilinear patch reaches one and a half cells, whole cells are needed, and an
-        # empty cell is filled from the nearest ones with points.
+        # The centers of the four cells around a point are up to 1 cell away. One that is empty is
+        # filled from cells within 1.5 cells of its nearest filled one, each of which must be known
+        # whole: 4 cells where a cell beside it is filled. Otherwise `reach_of` asks for more.
         return 4.0 * self.cell
 
     def reach_of(self, points: Points, context: StageContext, box: Sequence[float]) -> float:

@@ -32,10 +32,10 @@ _PART = 256
 
 
 class HagMorphological(FarReaching):
-    """Measure heights above the ground that a progressive morphological filter finds."""
+    """Measure heights above the ground that a simple morphological filter (SMRF) finds."""
 
     type = "filters.hag_morphological"
-    summary = "Height above ground found by a progressive morphological filter"
+    summary = "Height above ground found by a simple morphological filter (SMRF)"
     source = (
         "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote "
         "Sensing 77, 21-30"

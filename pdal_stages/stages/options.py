@@ -229,6 +229,7 @@ class Option:
         return [self._parse_number(item) for item in self._parse_list(value)]
 
     def _parse_bands(self, value: Any) -> tuple[float, float] | None:
+        # Nothing grows to 1000 m: such a height is in another unit.
         heights = self._parse_numbers(value)
         if not heights:
             return None

@@ -215,7 +215,7 @@ class Points:
         return codes & np.uint8(LEGACY_LIMIT) if self.legacy_flags else codes
 
     def flag(self, name: str) -> NDArray:
-        """Return a flag of each point (n,), 0 or 1; in PDAL 2.2 it is a bit of a dimension."""
+        """Return a flag of each point (n,), 0 or 1; before PDAL 2.6 it is a bit of a dimension."""
         if name in self.arrays:
             return self.arrays[name]
         bit = _FLAGS.index(name)
@@ -268,8 +268,9 @@ class Points:
             flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
             if flags.any():
                 limit = limit or (
-                    f"class codes above {LEGACY_LIMIT} do not fit these points: read from LAS "
-                    "1.0-1.3, some carry synthetic, key-point or withheld flags in the same byte",
+                    f"class codes above {LEGACY_LIMIT} do not fit: the points were read from LAS "
+                    "1.0-1.3, and some have the synthetic, key-point or withheld flag in the byte "
+                    "of the class",
                     "Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
                 )
         if limit and (largest := codes.max(initial=0)) > LEGACY_LIMIT:

@@ -39,7 +39,8 @@ MAKES_GROUND = "filters.smrf"
 _COUNT = Option("integer", None, "", 1, 1000, name="count")
 _EXTRAPOLATION = Option("boolean", None, "", name="allow_extrapolation")
 #: PDAL's stages that a model may carry, and their options. They read no file, move no point and
-#: leave none out; each writes `Classification` or `HeightAboveGround` alone.
+#: leave none out; each writes `Classification` or `HeightAboveGround` alone. The bounds let all
+#: sensible values pass, but not grids and searches that would take a machine's memory or days.
 PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
     "filters.smrf": (
         Option("number", None, "", 0.2, 100, name="cell"),

@@ -36,7 +36,7 @@ from .base import Stage, StageContext, files_read
 from .checked_points import SURE, CheckedChoice, CheckedPoints
 from .options import UNWANTED, Selection, declared_option, option
 from .points import Points
-from .preprocessing import check
+from .preprocessing import check as check_preprocessing
 
 #: The part of a model's description that fits in a pipeline's metadata.
 _SHOWN = ("strategy", "classes", "accuracy", "parameters")
@@ -122,7 +122,7 @@ class TrainModel(Stage, settings=TrainingOptions):
     def check_upstream(self) -> str | None:
         """Return a warning about the stages upstream; None where they fit."""
         try:
-            check(self.upstream)
+            check_preprocessing(self.upstream)
         except ModelError as error:
             error.cure = (
                 f"Write a pipeline with the same stages, {', '.join(self._upstream_types)}, before "
@@ -235,7 +235,7 @@ class TrainModel(Stage, settings=TrainingOptions):
     def finish(self, model: Model, report: Report) -> None:
         """Write the model and report its scores and limits."""
         by_hand = self.check_upstream() is not None
-        preprocessing = [] if by_hand else check(self.upstream)
+        preprocessing = [] if by_hand else check_preprocessing(self.upstream)
         if self.base is None:
             model.record_preprocessing(preprocessing)
         else:

@@ -100,7 +100,7 @@ class Expression:
         except SyntaxError as error:
             if "nested" in error.msg:
                 raise self._error("it is nested too deeply", 0) from None
-            place = self._places[(error.offset or 0) - 1]  # 0: it ends too early
+            place = self._places[(error.offset or 0) - 1]  # 0 says that the text ends too early
             raise self._error("it is not a condition of this form", place) from None
         except (MemoryError, RecursionError):
             raise self._error("it is nested too deeply", 0) from None

@@ -1,4 +1,4 @@
-"""Height above filtered ground: a progressive morphological filter with identical results in tiles.
+"""Height above filtered ground: a simple morphological filter with identical results in tiles.
 
 After SMRF [P13]: the minimum grid is opened with growing windows; a cell that an opening lowers by
 more than `slope` times the window's radius is an object; a provisional surface is fitted through
@@ -76,7 +76,7 @@ def filtered_ground(
     figures: dict[str, Any] | None = None,
     **options: Any,
 ) -> dict[str, NDArray]:
-    """Compute heights above the ground that a progressive morphological filter finds.
+    """Compute heights above the ground that a simple morphological filter finds.
 
     Parameters
     ----------

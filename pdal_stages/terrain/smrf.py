@@ -1,4 +1,4 @@
-"""The progressive morphological filter [P13]: ground and objects of a minimum grid.
+"""The simple morphological filter [P13]: ground and objects of a minimum grid.
 
 Every step that looks far away is done here, on a raster; see :mod:`.heights`. In tiles it is done
 once for each block of a grid of blocks, from the lowest points of cells, and tiles join the blocks.
