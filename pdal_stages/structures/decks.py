@@ -52,7 +52,7 @@ class DeckRules(NamedTuple):
     max_width: int = 40  #: cells: a motorway has 30 m
     max_length: int = 250  #: cells along either axis; tiles read farther than that around
     min_cells: int = 20  #: fewer tell no direction
-    min_drop_m: float = 2.0  #: to something lower straight ahead; not tuned
+    min_drop_m: float = 2.0  #: to what lies lower straight ahead; not tuned
     min_wall_slope: float = 1.25  #: rise over run of that drop: a bank of 45 degrees is not one
     #: cells from a place without points to others in all four quadrants: else the survey ends there
     max_water: int = 60

@@ -2,8 +2,8 @@
 
 1. A cell's points above the ground are parted into vertical layers. Thin layers with few others
    beside them may be of a wire.
-2. A straight line through such a layer is filled by others for `half_m` to both sides, and the air
-   around it is empty.
+2. Most pieces of a straight line through such a layer, of `half_m` to both sides, hold others, and
+   hardly any layers are close around it.
 3. Connected lines are wires if they are long.
 
 Sums are whole numbers and reaches are bounded, so neither the order of points nor the tile matters.

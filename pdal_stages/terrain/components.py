@@ -26,7 +26,7 @@ def number_sets(first, second, number):
 
     Sets are numbered in the order of their first members.
 
-    By hand: scipy.sparse.csgraph takes 0.4 s to be imported.
+    By hand: importing scipy.sparse.csgraph takes 0.2 s of CPU time.
     """
     parent = np.arange(len(number))
     for k in range(len(first)):
