@@ -30,6 +30,7 @@ class WireRules(NamedTuple):
     """Thresholds of the wire detector, a named tuple because compiled kernels read it.
 
     They were set on a power line of 14 points/m2 (AHN4) and on roof edges of surveys without one.
+    What some are worth is in docs/results/ablation.md.
     """
 
     min_height_m: float = 4.0  #: above the ground: hedges and fences are lower
