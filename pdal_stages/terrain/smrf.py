@@ -33,9 +33,11 @@ FAR = 32.0
 #: Largest radius of the filter's window, and largest width of a requested opening, in cells: beyond
 #: it memory and halo of a tile become too large.
 _MOST_CELLS = 300
-#: Cells added to the reach of one step, and of several: more than the one by which points blend the
-#: cells around them. If they are too small, tiles no longer get the bits of the whole cloud.
-RIM, WIDE_RIM = 2, 4
+#: Cells added to the reach of one step: more than the one by which points blend the cells around
+#: them. If it is too small, tiles no longer get the bits of the whole cloud.
+RIM = 2
+#: Cells added to the reach of surfaces, likewise; not tuned.
+WIDE_RIM = 4
 #: How often ground that openings took from ridges and dams is regained from the surface through the
 #: rest. Without it the mean error of the ISPRS samples is 0.7 points higher, with one round 0.2
 #: (docs/results/ablation.md).
