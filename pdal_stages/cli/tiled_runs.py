@@ -115,7 +115,7 @@ def print_classes(
     """
     for code, points in sorted((int(code), points) for code, points in classes.items()):
         print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
-    for name, points in left_alone.items():
+    for name, points in sorted(left_alone.items()):
         print(f"  {describe_count(name):32s} {points:>12,}")
 
 

@@ -17,7 +17,7 @@ class DetachedNoise(ClassStage):
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
     algorithm_version = 2
-    counts = {"low": "low noise", "high": "high noise"}
+    counts = {"low": "marked as low noise", "high": "marked as high noise"}
     reads_around = frozenset()  # classes alone, by `ignore`
     cluster: int = option(
         "integer",
