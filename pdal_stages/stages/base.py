@@ -55,7 +55,8 @@ class StageContext:
     #: In a tile: how many meters outside it the results of this stage are still used, by later
     #: stages.
     used_m: float = 0.0
-    #: In a tile: what the first round computed for a stage that reaches far (:class:`FarReaching`).
+    #: In a tile: the blocks that an earlier round left for a stage that reaches far
+    #: (:class:`FarReaching`).
     blocks: Any = None
 
     def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_] | None:
@@ -364,7 +365,7 @@ def inside_block(block: tuple[int, int]) -> str:
 
 
 class FarReaching(Stage):
-    """A stage that looks too far for the surroundings of a tile: a first round serves it.
+    """A stage that looks too far for the surroundings of a tile: a round before serves it.
 
     The points of each tile are reduced to what matters far away (:meth:`reduce_points`), blocks of
     a grid are computed from that (:meth:`compute_block`), and a tile joins the parts of the blocks

@@ -175,7 +175,7 @@ class HeadResult(NamedTuple):
     results: list[PieceResults]
     halo_needed_m: float = 0.0
     messages: Sequence[str] = ()  #: warnings and notes
-    left_alone: Mapping[str, int] = {}  #: of the tile's own points, see :mod:`.jobs`
+    left_alone: Mapping[str, int] = {}  #: counts of its own points, by ``type.name``
     reduced: Sequence[dict[str, NDArray]] = ()  #: what blocks need of its own points
 
 
