@@ -114,10 +114,45 @@ def test_degenerate_clouds_and_points_left_out():
     assert not found(xyz, codes != 14).any()
 
 
+def edge(kind, density, seed=0):
+    """A house 70 m long: a terrace in front of its upper floor, a cornice under a steep roof, or a balcony on its wall."""
+    rng = np.random.default_rng(seed)
+    n = int(140 * 80 * density)
+    x, y = rng.uniform(0, 140, n), rng.uniform(0, 80, n)
+    inside, z = (x > 30) & (x < 100), np.zeros(n)
+    if kind == "terrace":
+        z = np.where(inside & (y > 30) & (y < 50), 20.0, z)
+        z = np.where((x > 33) & (x < 97) & (y > 33) & (y < 47), 24.0, z)
+    elif kind == "cornice":
+        house = inside & (y > 30) & (y < 50)
+        z = np.where(
+            house, np.where((y < 31.2) | (y > 48.8), 12.0, 13.5 + 1.2 * (10 - np.abs(y - 40))), z
+        )
+    else:
+        z = np.where(
+            inside & (y > 30) & (y < 50), 20.0, np.where(inside & (y > 28.6) & (y <= 30), 6.0, z)
+        )
+        high = rng.uniform(0, 20, int(70 * 2 * density))  # its wall, hit from aside
+        wall = np.column_stack(
+            [rng.uniform(30, 100, len(high)), rng.normal(29.95, 0.03, len(high)), high]
+        )
+        xyz = np.column_stack([x, y, z + rng.normal(0, 0.05, n)])
+        return np.round(np.vstack([xyz, wall]), 3)
+    return np.round(np.column_stack([x, y, z + rng.normal(0, 0.05, n)]), 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "density"), [("terrace", 1.0), ("cornice", 1.0), ("balcony", 2.0)]
+)
+def test_what_hides_the_ground_is_no_wire(kind, density):
+    xyz = edge(kind, density)
+    assert found(xyz).sum() <= 0.001 * len(xyz)
+
+
 def test_a_street_of_poles_in_the_town():
     town = ps.synthetic.make_town(150.0, 6.0, 4, progress=False)
     wire = find_wires(town.xyz, town.height_above_ground.astype(float), town.classification != 7)
-    assert f1(wire, town.classification == 14) > 0.75
+    assert f1(wire, town.classification == 14) > 0.85
     assert (wire & ~np.isin(town.classification, (14, 15))).sum() < 0.0005 * len(wire)
 
 
@@ -135,7 +170,7 @@ def test_the_stage_gives_wires_their_class():
     wire = found(xyz) & (before != 12)
     assert np.array_equal(after, np.where(wire, 14, before))
     assert points.report.figures["wires"] == wire.sum()
-    assert stage.halo_m() == wires.RULES.reach_m < 75 and max(stage.written_classes()) == 14
+    assert stage.halo_m() == wires.RULES.reach_m < 90 and max(stage.written_classes()) == 14
 
 
 @pytest.mark.parametrize("name", ["highest voltage", "medium voltage in woods"])
