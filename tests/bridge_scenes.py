@@ -55,7 +55,7 @@ def scan(scene: Scene, density: float = 16.0, seed: int = 0, angle: float = 20.0
     """Points (n, 3) and true classes of a scene."""
     rng = np.random.default_rng(seed)
     c, s = np.cos(scene.turn), np.sin(scene.turn)
-    found, codes = [], []
+    results, codes = [], []
     half_l, half_w = scene.length / 2, scene.width / 2
     for strip in (-1.0, 1.0):
         n = int(density / 2 * scene.length * scene.width)
@@ -114,11 +114,11 @@ def scan(scene: Scene, density: float = 16.0, seed: int = 0, angle: float = 20.0
             z[hit], code[hit] = level[hit], LEAF
         seen = np.isfinite(z)
         q = at(np.where(seen, z, 0.0))[seen]
-        found.append(
+        results.append(
             np.column_stack([q[:, 0] * c - q[:, 1] * s, q[:, 0] * s + q[:, 1] * c, z[seen]])
         )
         codes.append(code[seen])
-    xyz, code = np.concatenate(found), np.concatenate(codes)
+    xyz, code = np.concatenate(results), np.concatenate(codes)
     xyz += rng.normal(0, 0.02, xyz.shape) + np.array([85_000.0, 447_000.0, 0.0])
     return np.round(xyz, 3), code.astype(np.uint8)
 

@@ -35,9 +35,9 @@ def town(tmp_path_factory, write_las):
         ("bare", np.zeros(len(east))),
     ):
         (folder / name).mkdir()
-        for number, mine in enumerate((east, ~east)):
-            points = dict(zip("XYZ", MADE().xyz[mine].T, strict=True))
-            points["Classification"] = codes[mine].astype(np.uint8)
+        for number, inside in enumerate((east, ~east)):
+            points = dict(zip("XYZ", MADE().xyz[inside].T, strict=True))
+            points["Classification"] = codes[inside].astype(np.uint8)
             write_las(folder / name / f"t{number}.laz", points, point_format=6)
     return folder
 
@@ -58,35 +58,38 @@ def model(town):
 
 
 def test_is_a_model_that_says_what_it_is_of(model, town, tmp_path, capsys):
-    made = ps.load_model(model)
-    assert made.codes.tolist() == [2, 5, 6] and len(made.passes) == 2
+    loaded = ps.load_model(model)
+    assert loaded.codes.tolist() == [2, 5, 6] and len(loaded.passes) == 2
     standard = ps.load_model("standard")
-    assert made.voxel == standard.voxel and made.info["preparation"] == standard.info["preparation"]
     assert (
-        made.info["teacher"]["name"] == "standard"
-        and made.info["teacher"]["sure"] == adapting.LEAST_RELIABILITY
+        loaded.voxel == standard.voxel
+        and loaded.info["preparation"] == standard.info["preparation"]
     )
-    assert "what standard is sure of (0.7 and more)" in str(made)
-    assert "not scored" in str(made) and "overall accuracy" not in str(made)
+    assert (
+        loaded.info["teacher"]["name"] == "standard"
+        and loaded.info["teacher"]["sure"] == adapting.LEAST_RELIABILITY
+    )
+    assert "what standard is sure of (0.7 and more)" in str(loaded)
+    assert "not scored" in str(loaded) and "overall accuracy" not in str(loaded)
     source, target = town / "bare" / "t0.laz", tmp_path / "o.laz"
-    code, said = run(capsys, "classify", source, target, "--model", model, "--keep-sure", "0.9")
+    code, output = run(capsys, "classify", source, target, "--model", model, "--keep-sure", "0.9")
     assert (
         code == 1
-        and "it was never scored" in said
-        and "Its labels are another model's answers" in said
+        and "it was never scored" in output
+        and "Its labels are another model's answers" in output
     )
     assert run(capsys, "classify", source, target, "--model", model)[0] == 0
     truth = MADE().classification[MADE().xyz[:, 0] > 500_033.0]
-    found = np.asarray(laspy.read(target).classification)
+    predicted = np.asarray(laspy.read(target).classification)
     known = np.isin(truth, (2, 5, 6))
-    assert (found == truth)[known].mean() > 0.9
+    assert (predicted == truth)[known].mean() > 0.9
 
 
 def test_tiles_and_classes_that_are_there_change_nothing(model, town, tmp_path, capsys):
     other, tiles = tmp_path / "o.model", ("--tile", "40", "--workers", "0")
     assert run(capsys, "adapt", town / "labeled", "--model", other, *tiles)[0] == 0
     assert other.read_bytes() == model.read_bytes()
-    assert [one.name for one in tmp_path.iterdir()] == ["o.model"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["o.model"]
 
 
 def test_only_what_is_sure_is_learned(tmp_path, write_las):
@@ -104,14 +107,14 @@ def test_a_class_that_is_not_there(town, tmp_path, write_las, capsys):
     write_las(
         tmp_path / "wood.laz", dict(zip("XYZ", MADE().xyz[wood].T, strict=True)), point_format=6
     )
-    code, said = run(capsys, "adapt", tmp_path / "wood.laz", "--model", tmp_path / "o.model")
-    assert code == 0 and "too few points of a class" in said and "class 6" in said
+    code, output = run(capsys, "adapt", tmp_path / "wood.laz", "--model", tmp_path / "o.model")
+    assert code == 0 and "too few points of a class" in output and "class 6" in output
     assert ps.load_model(tmp_path / "o.model").codes.tolist() == [2, 5]
     flat = np.random.default_rng(0).uniform(0, 60, (3, 9000)) * [[1], [1], [0.001]]
     write_las(tmp_path / "flat.laz", dict(zip("XYZ", flat, strict=True)), point_format=6)
-    code, said = run(capsys, "adapt", tmp_path / "flat.laz", "--model", tmp_path / "p.model")
-    assert code == 1 and "fewer than two of its classes" in said and "of class 2" in said
-    assert {one.name for one in tmp_path.iterdir()} == {"wood.laz", "flat.laz", "o.model"}
+    code, output = run(capsys, "adapt", tmp_path / "flat.laz", "--model", tmp_path / "p.model")
+    assert code == 1 and "fewer than two of its classes" in output and "of class 2" in output
+    assert {entry.name for entry in tmp_path.iterdir()} == {"wood.laz", "flat.laz", "o.model"}
 
 
 @pytest.mark.parametrize(
@@ -134,18 +137,18 @@ def test_what_is_wrong_is_said_and_nothing_is_left(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cut.laz").write_bytes((town / "bare" / "t0.laz").read_bytes()[:9000])
     before = (town / "bare" / "t0.laz").read_bytes()
-    code, told = run(capsys, "adapt", *(word.format(town=town) for word in words))
-    assert code != 0 and said in told
+    code, reported = run(capsys, "adapt", *(word.format(town=town) for word in words))
+    assert code != 0 and said in reported
     assert (town / "bare" / "t0.laz").read_bytes() == before
-    assert [one.name for one in tmp_path.iterdir()] == ["cut.laz"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["cut.laz"]
 
 
 def test_of_many_files_some_are_looked_at(town):
     files = [str(town / "bare" / f"t{number % 2}.laz") for number in range(9)]
     assert spread(files) == (files, [])
     points = sum(len(laspy.read(file)) for file in files)
-    chosen, told = spread(files, points // 3)
-    assert chosen == files[1::3] and "3 of 9 files" in told[0]
+    chosen, reported = spread(files, points // 3)
+    assert chosen == files[1::3] and "3 of 9 files" in reported[0]
     chosen, _ = spread(files[:2], 10)
     assert len(chosen) == 1
     assert spread(["a.ply"], 10) == (["a.ply"], [])

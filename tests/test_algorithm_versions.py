@@ -43,7 +43,7 @@ KINDS = sorted({name for name in stage_types() if stage_type(name).in_models} | 
 
 def results(kind: str) -> dict[str, list[float]]:
     """Return the means of each dimension that a stage makes of the clips, over parts of their points by x + y."""
-    stage, found = stage_type(kind)(OPTIONS.get(kind, stage_type(kind).example)), {}
+    stage, result = stage_type(kind)(OPTIONS.get(kind, stage_type(kind).example)), {}
     for clip in CLIPS:
         las = laspy.read(DATA / f"{clip}.laz")
         xyz = np.asarray(las.xyz)
@@ -51,8 +51,8 @@ def results(kind: str) -> dict[str, list[float]]:
             middle = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
             near = np.abs(xyz - middle)[:, :2].max(axis=1) < MIDDLE
             xyz, las = xyz[near], las[near]
-        made = {name: np.zeros(len(xyz)) for name in stage.creates()}
-        columns = {**dict(zip("XYZ", xyz.T, strict=True)), **made}
+        output = {name: np.zeros(len(xyz)) for name in stage.creates()}
+        columns = {**dict(zip("XYZ", xyz.T, strict=True)), **output}
         if stage.reads():  # of classes and heights, for stages that are not the first
             columns["Classification"] = np.asarray(las.classification)
             columns["HeightAboveGround"] = xyz[:, 2] - xyz[:, 2].min()
@@ -64,24 +64,24 @@ def results(kind: str) -> dict[str, list[float]]:
         parts = np.array_split(np.argsort(xyz[:, 0] + xyz[:, 1], kind="stable"), PARTS)
         for name in out:
             means = [round(float(np.mean(out[name][part])), 5) for part in parts]
-            found[f"{clip} {name}"] = means
+            result[f"{clip} {name}"] = means
         if kind == "filters.multiscalefeatures":
             break
-    return found
+    return result
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_results_change_with_the_version_only(kind):
     version = str(stage_type(kind).algorithm_version)
     known = json.loads(STORED.read_text()).get(kind, {})
-    found = results(kind)
+    result = results(kind)
     cure = f"raise algorithm_version of {kind} and run: python tests/test_algorithm_versions.py"
     assert version in known, cure
-    assert found.keys() == known[version].keys(), cure
+    assert result.keys() == known[version].keys(), cure
     changed = [
         name
         for name, values in known[version].items()
-        if not np.allclose(values, found[name], rtol=TOLERANCE, atol=TOLERANCE)
+        if not np.allclose(values, result[name], rtol=TOLERANCE, atol=TOLERANCE)
     ]
     assert not changed, f"changed: {changed[:5]}. {cure}"
 

@@ -63,9 +63,9 @@ clouds = st.builds(
 def test_farthest_points_equal_the_reference(p, data):
     count = data.draw(st.integers(1, len(p)))
     start = data.draw(st.integers(0, len(p) - 1))
-    found = farthest_point_sampling(p, count, start)
-    assert np.array_equal(found, slow_farthest(p, count, start))
-    assert len(set(found.tolist())) == count
+    sampled = farthest_point_sampling(p, count, start)
+    assert np.array_equal(sampled, slow_farthest(p, count, start))
+    assert len(set(sampled.tolist())) == count
 
 
 @given(clouds, st.floats(0.01, 30.0), st.integers(1, 20), st.integers(0, 2**32))

@@ -29,11 +29,11 @@ def test_a_level_equals_a_computation_by_hand():
     """One level, one layer each, one ball: every number checked with loops."""
     from pdal_stages.alsnet.configuration import Configuration, Level
 
-    one = Configuration("one", 16, (Level(2, 5.0, 3, (4,), (3,)),), head=(2,), dropout=0.0)
-    net = random_net(("Z",), 2, one)
+    single = Configuration("one", 16, (Level(2, 5.0, 3, (4,), (3,)),), head=(2,), dropout=0.0)
+    net = random_net(("Z",), 2, single)
     xyz = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 1.0], [0.0, 2.0, 0.5], [3.0, 3.0, 0.0]])
     values = xyz[:, 2:].astype(np.float32)
-    pyramid = build_pyramid(xyz, values, one)
+    pyramid = build_pyramid(xyz, values, single)
     (step,) = pyramid.steps
 
     def layer(name, row):
@@ -114,21 +114,21 @@ def test_a_tile_with_its_halo_gets_the_labels_of_the_whole():
     whole = model.predict(xyz, dimensions, probabilities=True)
     assert model.halo_m == pytest.approx((3.0 + 0.5**0.5) * 3.0)
     low = xyz.min(axis=0)[:2] + 20.0
-    own = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 12.0)).all(axis=1)
+    ours = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 12.0)).all(axis=1)
     near = ((xyz[:, :2] >= low - model.halo_m) & (xyz[:, :2] < low + 12.0 + model.halo_m)).all(
         axis=1
     )
     tile = model.predict(
-        xyz[near], {k: v[near] for k, v in dimensions.items()}, own[near], probabilities=True
+        xyz[near], {k: v[near] for k, v in dimensions.items()}, ours[near], probabilities=True
     )
-    assert np.array_equal(tile.probabilities[own[near]], whole.probabilities[own])
+    assert np.array_equal(tile.probabilities[ours[near]], whole.probabilities[ours])
 
 
 def test_small_and_empty_clouds():
     model = model_of(random_net(("Z",)))
     assert len(model.predict(np.zeros((0, 3)), {}).classification) == 0
-    one = model.predict(np.array([[5.0, 5.0, 5.0]]), {})
-    assert one.report.figures["classified"] == 1
+    single = model.predict(np.array([[5.0, 5.0, 5.0]]), {})
+    assert single.report.figures["classified"] == 1
     same = model.predict(np.ones((700, 3)), {})  # more than a batch at one place
     assert same.report.figures["batches_per_point"]["least"] >= 1
 
@@ -152,8 +152,8 @@ def test_saved_and_loaded_gives_the_same_labels(tmp_path):
     again.save(tmp_path / "b.model")
     assert (tmp_path / "a.model").read_bytes() == (tmp_path / "b.model").read_bytes()
     assert isinstance(again.algorithm, AlsNet) and again.halo_m == model.halo_m
-    one, other = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
-    assert np.array_equal(one.probabilities, other.probabilities)
+    first, other = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
+    assert np.array_equal(first.probabilities, other.probabilities)
     assert (
         "alsnet" in str(again)
         and again.manifest()["passes"][0]["parameters"]["configuration"]["name"] == "test"

@@ -61,13 +61,16 @@ def test_modelclassifier_applies_a_network(cloud, model, tmp_path, pdal_module):
     )
     las = laspy.read(out)
     read = np.round(np.column_stack([las.x, las.y, las.z]), 6)  # as stages see coordinates
-    found = load_model(model).predict(
+    prediction = load_model(model).predict(
         read, {"Intensity": np.asarray(las.intensity)}, margin=True, variance=True
     )
-    assert np.array_equal(np.asarray(las.classification), found.classification)
-    assert np.array_equal(np.asarray(las["Margin"]), found.margin)
-    assert np.array_equal(np.asarray(las["Variance"]), found.variance) and found.variance.max() > 0
-    assert len(np.unique(found.classification)) > 1
+    assert np.array_equal(np.asarray(las.classification), prediction.classification)
+    assert np.array_equal(np.asarray(las["Margin"]), prediction.margin)
+    assert (
+        np.array_equal(np.asarray(las["Variance"]), prediction.variance)
+        and prediction.variance.max() > 0
+    )
+    assert len(np.unique(prediction.classification)) > 1
 
 
 @pytest.mark.pdal
@@ -118,7 +121,7 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     }
     path = write_las(tmp_path / "in.las", arrays, point_format=7)
     reader = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
-    made, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
+    output, out = str(tmp_path / "a.model"), str(tmp_path / "out.las")
     network = {
         "configuration": TINY.to_dict(),
         "epochs": 16,
@@ -128,36 +131,36 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     network["checkpoint"] = str(tmp_path / "a.checkpoint")
     writer = {
         "type": WRITER,
-        "filename": made,
+        "filename": output,
         "algorithm": "alsnet",
         "alsnet": network,
         "threads": 1,
     }
     ps.run_pipeline([reader, {**writer, "dimensions": "Red,EchoWidth"}])
-    assert load_model(made).required_dimensions == ("Red", "EchoWidth")
-    ps.run_pipeline([reader, {"type": "filters.modelclassifier", "model": made}, out])
+    assert load_model(output).required_dimensions == ("Red", "EchoWidth")
+    ps.run_pipeline([reader, {"type": "filters.modelclassifier", "model": output}, out])
     assert (np.asarray(laspy.read(out).classification) == labels).mean() > 0.95
     assert (
-        len(load_model(made).info["training"]["curve"]) == 16
+        len(load_model(output).info["training"]["curve"]) == 16
         and (tmp_path / "a.checkpoint").exists()
     )
     del arrays["EchoWidth"]
     bare = str(write_las(tmp_path / "bare.las", arrays, point_format=7))
     with pytest.raises(DimensionError, match="EchoWidth"):
-        ps.run_pipeline([bare, {"type": "filters.modelclassifier", "model": made}])
+        ps.run_pipeline([bare, {"type": "filters.modelclassifier", "model": output}])
 
 
 def test_stage_options(model, tmp_path):
     classifier, writer = stage_type("filters.modelclassifier"), stage_type(WRITER)
-    made = classifier({"model": str(model)})
-    assert made.halo_m() == load_model(model).halo_m
-    given = {
+    stage = classifier({"model": str(model)})
+    assert stage.halo_m() == load_model(model).halo_m
+    known = {
         "filename": str(tmp_path / "m"),
         "algorithm": "alsnet",
         "alsnet": {"coordinates": "XYZ"},
     }
-    assert writer(given).reads() == ["Classification", "HeightAboveGround"]
+    assert writer(known).reads() == ["Classification", "HeightAboveGround"]
     with pytest.raises(OptionError, match="epochs"):
-        writer({**given, "alsnet": {"epochs": -1}})
+        writer({**known, "alsnet": {"epochs": -1}})
     with pytest.raises(OptionError, match="algorithm"):
-        writer({**given, "algorithm": "resnet"})
+        writer({**known, "algorithm": "resnet"})

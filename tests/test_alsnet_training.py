@@ -87,11 +87,14 @@ def test_ground_held_out_is_whole_blocks_with_all_classes():
 
 def test_no_batch_holds_points_of_two_clouds():
     clouds = [scene(n, 12.0)[0] for n in (500, 700, 0, 300)]  # all in one place
-    joined, of = join_clouds(clouds, 3.0), np.repeat(np.arange(4), [len(one) for one in clouds])
+    joined, part = (
+        join_clouds(clouds, 3.0),
+        np.repeat(np.arange(4), [len(entry) for entry in clouds]),
+    )
     batches = Batches(joined, 100, 3.0)
-    assert all(len(set(of[batches.members(k)])) == 1 for k in range(len(batches)))
+    assert all(len(set(part[batches.members(k)])) == 1 for k in range(len(batches)))
     for k in (0, 1, 3):
-        away = joined[of == k] - clouds[k]
+        away = joined[part == k] - clouds[k]
         assert (
             np.allclose(away, away[0], atol=1e-9)
             and abs(away[0, 0] / 3.0 - round(away[0, 0] / 3.0)) < 1e-9
@@ -146,8 +149,8 @@ def test_torch_and_numpy_agree():
     inputs = np.column_stack([xyz[:, 2], values["Intensity"] / 100.0]).astype(np.float32)
     pyramid = build_pyramid(xyz, inputs, TINY)
     network = Network(TINY, 2, 4).load(net.weights)
-    found = apply_on_device("cpu", net.weights, TINY, 2, 4)(pyramid)
-    np.testing.assert_allclose(found, net.network(pyramid), atol=2e-6)
+    result = apply_on_device("cpu", net.weights, TINY, 2, 4)(pyramid)
+    np.testing.assert_allclose(result, net.network(pyramid), atol=2e-6)
     again = network.dump()
     assert list(again) == list(net.weights)
     assert all(np.array_equal(again[name], net.weights[name]) for name in again)
@@ -168,9 +171,9 @@ def test_a_device_for_applying(device):
         with pytest.raises(DependencyError, match="no CUDA device"):
             list(net.predict(request))
         return
-    ((_, found, _),) = net.predict(request)
+    ((_, prediction, _),) = net.predict(request)
     ((_, expected, _),) = net.predict(PredictRequest(xyz, values))
-    assert np.array_equal(found, expected)
+    assert np.array_equal(prediction, expected)
 
 
 @needs_torch
@@ -185,8 +188,8 @@ def test_a_tiny_network_overfits_a_tiny_scene():
         learning_rate=0.01,
         augment=False,
     )
-    found = model.predict(xyz, {})
-    assert np.mean(found.classification == labels) > 0.97
+    prediction = model.predict(xyz, {})
+    assert np.mean(prediction.classification == labels) > 0.97
     curve = model.info["training"]["curve"]
     assert len(curve) == 25 and curve[-1]["loss"] < 0.3 * curve[0]["loss"]
 

@@ -24,7 +24,7 @@ def reference(xyz, shares, rows, context):
         if votes:
             what = np.eye(shares.shape[1])[shares.argmax(axis=1)] * WHOLE
         near = (np.abs(cell[rows][:, None] - cell[None]) <= 1).all(axis=2)
-        means = [what[one].sum(axis=0) / (one.sum() * WHOLE) for one in near]
+        means = [what[entry].sum(axis=0) / (entry.sum() * WHOLE) for entry in near]
         columns.append(np.array(means).reshape(shares[rows].shape))
     return np.hstack(columns).astype(np.float32)
 

@@ -178,11 +178,11 @@ def test_growing_does_not_depend_on_threads_and_counts_weights():
     weight = np.ones(300, np.int64)
     weight[:50], weight[290:] = 3, 0
     setting = {"seed": 4, "min_samples_leaf": 2, "max_samples": 0.5}
-    one, other = (
+    first, other = (
         grow_forest(x, y, weight, 7, growth(threads=threads, **setting)) for threads in (1, 3)
     )
-    for name, array in one[0].arrays().items():
+    for name, array in first[0].arrays().items():
         assert np.array_equal(array, other[0].arrays()[name])
-    assert np.array_equal(one[1], other[1]) and one[1].sum() == pytest.approx(1)
-    assert one[0].leaf_counts.sum() == 7 * round(0.5 * weight.sum())
-    assert (one[0].predict_proba(x).argmax(axis=1) == y).mean() > 0.8
+    assert np.array_equal(first[1], other[1]) and first[1].sum() == pytest.approx(1)
+    assert first[0].leaf_counts.sum() == 7 * round(0.5 * weight.sum())
+    assert (first[0].predict_proba(x).argmax(axis=1) == y).mean() > 0.8

@@ -28,8 +28,8 @@ def test_blocks_are_whole_and_the_gap_is_kept(seed, folds, block, gap):
     fold = block_folds(xy, label, folds, block)
     assert set(fold.tolist()) == set(range(folds))
     cell = np.floor(xy / block).astype(int)
-    for one in np.unique(cell, axis=0):
-        assert len(set(fold[(cell == one).all(axis=1)].tolist())) == 1
+    for entry in np.unique(cell, axis=0):
+        assert len(set(fold[(cell == entry).all(axis=1)].tolist())) == 1
     p = random.permutation(400)
     assert np.array_equal(
         fold[p], block_folds(xy[p], label[p], folds, block)
@@ -57,21 +57,21 @@ def test_every_fold_gets_its_share_of_every_class():
 
 def test_folds_are_blocks_or_whole_surveys():
     random = np.random.default_rng(0)
-    xy, label, one = (
+    xy, label, first = (
         random.random((900, 2)) * (90, 70),
         random.integers(0, 2, 900),
         np.ones(900, int),
     )
-    folds = Folds.of_ground(xy, label, one, ("x", "y"), 4)
+    folds = Folds.of_ground(xy, label, first, ("x", "y"), 4)
     assert folds.count == 4 and not folds.surveys
     far = (
         random.random((500, 3)) * 1000 - 500
     )  # ground without samples belongs to some fold as well
     assert set(folds.points(far).tolist()) == {0, 1, 2, 3}
-    folds = Folds.of_ground(xy, label, one, ("x", "y", "z", "x"), 5)
+    folds = Folds.of_ground(xy, label, first, ("x", "y", "z", "x"), 5)
     assert folds.count == 3 and sorted(folds.surveys.values()) == [0, 1, 2]
     assert (folds.points(far, "y") == folds.surveys["y"]).all()
-    small = Folds.of_ground(xy / 20, label, one, ("x",), 5)  # where blocks of 25 m are too few
+    small = Folds.of_ground(xy / 20, label, first, ("x",), 5)  # where blocks of 25 m are too few
     assert small.side < 5 and small.count == 5
     with pytest.raises(OptionError, match="too small"):
         Folds.of_ground(np.ones((9, 2)), np.ones(9, int), np.ones(9, int), ("x",), 5)

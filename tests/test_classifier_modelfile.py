@@ -121,9 +121,9 @@ def refuse(path, text=".", seconds=10.0, megabytes=100):
 
 
 def test_round_trip_equals_sklearn(tmp_path):
-    made, reference, x = forest()
+    output, reference, x = forest()
     path = tmp_path / "m.model"
-    model_file.write(path, manifest(), [made.arrays()])
+    model_file.write(path, manifest(), [output.arrays()])
     read, (arrays,) = model_file.read(path, rules)
     assert {k: v for k, v in read.items() if k not in ("format", "version", "arrays")} == manifest()
     again = Forest.from_arrays(arrays, FEATURES, 3)

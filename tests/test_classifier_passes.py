@@ -51,8 +51,8 @@ def small_bands(monkeypatch):
 
 def same(a, b, rows=slice(None), other=slice(None)):
     for name in ("classification", "reliability", "margin", "probabilities"):
-        one, two = getattr(a, name), getattr(b, name)
-        assert np.array_equal(one[rows], two[other]), name
+        first, two = getattr(a, name), getattr(b, name)
+        assert np.array_equal(first[rows], two[other]), name
 
 
 def everything(model, xyz, dimensions, where=None, **more):
@@ -61,8 +61,8 @@ def everything(model, xyz, dimensions, where=None, **more):
 
 def test_a_second_pass_sees_more_than_the_first(two, other):
     xyz, label, dimensions = other
-    one = (learned(1).predict(xyz, dimensions).classification == label).mean()
-    assert 1 - (two.predict(xyz, dimensions).classification == label).mean() < 0.5 * (1 - one)
+    single = (learned(1).predict(xyz, dimensions).classification == label).mean()
+    assert 1 - (two.predict(xyz, dimensions).classification == label).mean() < 0.5 * (1 - single)
     inner = max(two.passes[0].plan.halo_m + 8.0, two.passes[1].plan.halo_m)
     assert two.halo_m == inner + two.voxel
     assert two.required_dimensions == ("HeightAboveGround",)
@@ -131,7 +131,7 @@ def test_the_file_holds_all_passes(three, other, tmp_path):
     assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()
     same(everything(three, xyz, dimensions), everything(again, xyz, dimensions))
     assert again.halo_m == three.halo_m and str(again) == str(three)
-    assert [one["context"] for one in again.manifest()["passes"]] == [
+    assert [entry["context"] for entry in again.manifest()["passes"]] == [
         [],
         ["own", "columnvotes2"],
         ["own", "columnvotes2"],
@@ -169,7 +169,7 @@ def test_hostile_passes_are_refused(two, tmp_path, edit):
     manifest = json.loads(json.dumps(two.manifest()))
     edit(manifest)
     with pytest.raises(ModelError):
-        model_file.write(tmp_path / "m", manifest, [one.arrays() for one in two.passes])
+        model_file.write(tmp_path / "m", manifest, [entry.arrays() for entry in two.passes])
         load_model(tmp_path / "m")
 
 

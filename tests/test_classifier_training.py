@@ -64,9 +64,9 @@ def accuracy(prediction, label):
 
 def same(a: Prediction, b: Prediction):
     for name in ("classification", "reliability", "margin", "probabilities"):
-        one, two = getattr(a, name), getattr(b, name)
-        assert (one is None) == (two is None)
-        assert one is None or np.array_equal(one, two), name
+        first, two = getattr(a, name), getattr(b, name)
+        assert (first is None) == (two is None)
+        assert first is None or np.array_equal(first, two), name
 
 
 # ---- what comes out ------------------------------------------------------------------------------------
@@ -162,8 +162,8 @@ def test_a_missing_dimension_names_itself_and_its_maker(trained, other):
 def test_counts_scores_and_importances(trained):
     classes = {entry["code"]: entry for entry in trained.info["classes"]}
     assert [entry["samples"] + entry["duplicates"] for entry in classes.values()] == [150] * 3
-    found = trained.info["accuracy"]["cross_validation"]["chosen"]
-    assert 0.8 < found["overall_accuracy"] <= 1 and set(found["f1"]) == {"2", "5", "6"}
+    score = trained.info["accuracy"]["cross_validation"]["chosen"]
+    assert 0.8 < score["overall_accuracy"] <= 1 and set(score["f1"]) == {"2", "5", "6"}
     for by in ("column", "feature", "group", "neighborhood"):
         assert sum(trained.importances(by).values()) == pytest.approx(1)
     assert set(trained.importances("neighborhood")) == {"c1", "s2", "kopt(5,20)", "(dimension)"}

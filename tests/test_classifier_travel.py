@@ -63,16 +63,16 @@ def copies(xyz, *wanted, seed=0):
 def test_a_copy_has_its_density_in_any_order_and_tile(seed, wanted):
     random = np.random.default_rng(seed)
     xyz = random.random((30_000, 3)) * (50, 40, 9) + (6e5, 6e6, 0)
-    (one,) = copies(xyz, wanted, 14.0, 1e5, seed=seed)  # none that would hardly be sparser
-    assert len(one) / 2000 == pytest.approx(wanted, rel=0.15)
+    (single,) = copies(xyz, wanted, 14.0, 1e5, seed=seed)  # none that would hardly be sparser
+    assert len(single) / 2000 == pytest.approx(wanted, rel=0.15)
     (other,) = copies(xyz[random.permutation(len(xyz))], wanted, seed=seed)
-    assert np.array_equal(np.unique(one.xyz, axis=0), np.unique(other.xyz, axis=0))
+    assert np.array_equal(np.unique(single.xyz, axis=0), np.unique(other.xyz, axis=0))
     assert not copies(xyz[:0], 1.0) and len(copies(xyz, wanted, seed=seed + 1)[0].xyz) > 0
 
 
 def test_copies_are_trained_on_as_clouds_of_the_same_survey():
-    one = clouds(1)
-    model = learned(one, thin=[0.3, 0.1, 50.0], passes=2, context=["own"])
+    single = clouds(1)
+    model = learned(single, thin=[0.3, 0.1, 50.0], passes=2, context=["own"])
     names = [(c["name"], c["points"]) for c in model.info["training"]["clouds"]]
     assert [name for name, _ in names] == [
         "0.laz",
@@ -89,8 +89,8 @@ def test_a_cloud_of_another_density_is_told():
     xyz, _, dimensions = scene(5, 3000)
     report = model.predict(xyz, dimensions).report
     assert not report.warnings and report.figures["density"] == pytest.approx(3000 / 3600, rel=0.3)
-    some = slice(None, None, 9)
-    report = model.predict(xyz[some], {k: v[some] for k, v in dimensions.items()}).report
+    subset = slice(None, None, 9)
+    report = model.predict(xyz[subset], {k: v[subset] for k, v in dimensions.items()}).report
     assert "points/m2, the model was trained on" in report.warnings[0]
     many = np.vstack([xyz + shift for shift in np.linspace(0, 0.1, 4)])
     assert model.predict(many, {"HeightAboveGround": many[:, 2]}).report.warnings
@@ -128,9 +128,9 @@ def test_surveys_weigh_alike():
     assert np.array_equal(np.bincount(even.label, even.weight), [60, 60, 60])
     alike = draw_samples(inputs, 3, 60, 0)
     assert np.bincount(alike.cloud, alike.weight)[0] > 150
-    one = draw_samples(inputs, 3, 60, 0, ["a", "a"])  # tiles of one survey are one
+    single = draw_samples(inputs, 3, 60, 0, ["a", "a"])  # tiles of one survey are one
     for name in ("cloud", "row", "label", "weight"):
-        assert np.array_equal(getattr(one, name), getattr(alike, name))
+        assert np.array_equal(getattr(single, name), getattr(alike, name))
     swapped = learned(pair[::-1])
     assert np.array_equal(
         swapped.passes[0].forest.threshold, learned(pair).passes[0].forest.threshold
@@ -164,7 +164,7 @@ def test_noise_is_not_even_a_neighbor(tmp_path):
     whole = clean.predict(xyz, dimensions, probabilities=True, margin=True)
     current = np.full(len(noisy), 9)
     p = random.permutation(len(noisy))
-    found = clean.predict(
+    prediction = clean.predict(
         noisy[p],
         {"HeightAboveGround": noisy[p, 2]},
         current=current,
@@ -174,9 +174,13 @@ def test_noise_is_not_even_a_neighbor(tmp_path):
     )
     at = np.argsort(p)[: len(xyz)]
     for name in ("classification", "reliability", "margin", "probabilities"):
-        assert np.array_equal(getattr(found, name)[at], getattr(whole, name)), name
-    assert (found.classification[gone[p]] == 9).all() and not found.reliability[gone[p]].any()
-    assert found.report.figures["ignored"] == 500 and found.report.figures["points"] == len(noisy)
+        assert np.array_equal(getattr(prediction, name)[at], getattr(whole, name)), name
+    assert (prediction.classification[gone[p]] == 9).all() and not prediction.reliability[
+        gone[p]
+    ].any()
+    assert prediction.report.figures["ignored"] == 500 and prediction.report.figures[
+        "points"
+    ] == len(noisy)
     where = noisy[:, 0] < 30
     part = clean.predict(noisy, more, where, ignore=gone, current=current)
     assert np.array_equal(

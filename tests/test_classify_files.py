@@ -67,8 +67,8 @@ def test_an_output_for_each_input(folder, classify, tmp_path, given, output, wor
     assert files_in(tmp_path / "out") == names
     assert all(name in out for name in names)
     for name in names:
-        made = np.asarray(laspy.read(tmp_path / "out" / name).classification)
-        assert len(made) == 500 and set(np.unique(made)) == {2, 6}
+        written = np.asarray(laspy.read(tmp_path / "out" / name).classification)
+        assert len(written) == 500 and set(np.unique(written)) == {2, 6}
 
 
 def test_several_inputs_are_not_merged_into_one(folder, classify, tmp_path):
@@ -120,24 +120,24 @@ def test_inputs_of_one_name_lie_in_their_folders(folder, classify, tmp_path):
     for place, name in (("2023", "t0"), ("2024/north", "t1")):
         content = (folder / f"in/{name}.laz").read_bytes()
         (tmp_path / "in" / place / f"{name}.laz").write_bytes(content)
-    given, out = str(tmp_path / "in/**/*.laz"), tmp_path / "out"
-    code, _, err = classify(given, f"{out}/", "--resume")
+    known, out = str(tmp_path / "in/**/*.laz"), tmp_path / "out"
+    code, _, err = classify(known, f"{out}/", "--resume")
     assert code == 0 and files_in(out) == ["t0.laz", "t1.laz"], err
     (tmp_path / "in/2024/t0.laz").write_bytes((folder / "in/t2.laz").read_bytes())
     for number in range(2):  # another name: one of them comes twice now, and all go into folders
-        code, said, err = classify(given, f"{out}/", "--resume")
+        code, output, err = classify(known, f"{out}/", "--resume")
         assert code == 0, err
-        assert said.count(".laz: 500 points") == (3, 0)[number]
+        assert output.count(".laz: 500 points") == (3, 0)[number]
     inside = ["2023/t0.laz", "2024/north/t1.laz", "2024/t0.laz"]
-    for name, of in zip(inside, ("t0", "t1", "t2"), strict=True):
-        source = laspy.read(folder / f"in/{of}.laz")
+    for name, part in zip(inside, ("t0", "t1", "t2"), strict=True):
+        source = laspy.read(folder / f"in/{part}.laz")
         assert np.array_equal(laspy.read(out / name).xyz, source.xyz)
-    code, _, err = classify(given, f"{tmp_path}/c_#.laz")
+    code, _, err = classify(known, f"{tmp_path}/c_#.laz")
     assert code == 1 and "two inputs have the same name" in err and "folder" in err
-    code, _, err = classify(given, f"{tmp_path}/in")
+    code, _, err = classify(known, f"{tmp_path}/in")
     assert code == 1 and "one of the inputs" in err
-    code, said, err = classify(folder / "in", folder / "in" / "t0.laz", tmp_path / "other")
-    assert code == 0 and "3 files written" in said, err  # one that is named twice is read once
+    code, output, err = classify(folder / "in", folder / "in" / "t0.laz", tmp_path / "other")
+    assert code == 0 and "3 files written" in output, err  # one that is named twice is read once
 
 
 def test_a_suffix_that_pdal_does_not_know(folder, classify, tmp_path):
@@ -152,12 +152,12 @@ def test_metadata_of_many(folder, classify, tmp_path):
     words = (folder / "in", tmp_path / "bad.laz", tmp_path / "out")
     code, out, err = classify(*words, "--metadata", tmp_path / "m.json")
     assert code == 1 and "bad.laz" in err and "3 files written, 1 failed" in out, err
-    found = json.loads((tmp_path / "m.json").read_text())
-    names = [Path(one["input"]).name for one in found["outputs"]]
+    data = json.loads((tmp_path / "m.json").read_text())
+    names = [Path(entry["input"]).name for entry in data["outputs"]]
     assert names == ["t0.laz", "t1.laz", "t2.laz", "bad.laz"]
-    for one in found["outputs"][:3]:
-        assert one["written"] == 500 and sum(one["classes"].values()) == 500
-    assert found["outputs"][3]["state"] == "failed" and "bad.laz" in found["failures"][0]["what"]
+    for entry in data["outputs"][:3]:
+        assert entry["written"] == 500 and sum(entry["classes"].values()) == 500
+    assert data["outputs"][3]["state"] == "failed" and "bad.laz" in data["failures"][0]["what"]
 
 
 def test_an_interrupt_says_what_is_finished(folder, tmp_path, write_las):
@@ -188,8 +188,8 @@ def test_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path):
     rows = laspy.read(folder / "in" / "t0.laz").xyz
     for number in range(2):
         np.savetxt(tmp_path / f"t{number}.txt", rows, delimiter=",", header="X,Y,Z", comments="")
-    for given, words in (("*.txt", []), ("t0.txt", ["--resume"])):
-        code, _, err = classify(tmp_path / given, tmp_path / "o.txt", *words)
+    for known, words in (("*.txt", []), ("t0.txt", ["--resume"])):
+        code, _, err = classify(tmp_path / known, tmp_path / "o.txt", *words)
         assert code == 1 and "t0.txt" in err and "pdal translate" in err
         assert not files_in(tmp_path, "o*")
     assert classify(tmp_path / "t0.txt", tmp_path / "o.txt")[0] == 0
@@ -224,9 +224,9 @@ def test_a_where_that_chooses_nothing_is_said_once(folder, classify, tmp_path, w
     """The second chooses nothing in some tiles alone."""
     words = ("--tile", "10", "--where", where)
     code, _, err = classify(folder / "in" / "t1.laz", tmp_path / "o.laz", *words)
-    told = [line for line in err.splitlines() if "'where' matches no points" in line]
-    assert code == 0 and len(told) == said, err
-    assert all(where in line and "PdalStages" not in line for line in told)
+    reported = [line for line in err.splitlines() if "'where' matches no points" in line]
+    assert code == 0 and len(reported) == said, err
+    assert all(where in line and "PdalStages" not in line for line in reported)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from pdal_stages.structures.decks import DeckRules, find_decks
 from pdal_stages.terrain import filtered_ground
 
 
-def found(xyz, use=None, ground=None):
+def detect(xyz, use=None, ground=None):
     xyz = np.asarray(xyz, float)
     use = np.ones(len(xyz), bool) if use is None else use
     if ground is None:
@@ -43,7 +43,7 @@ def f1(deck, true, known):
 @pytest.mark.parametrize("name", ["viaduct", "viaduct of two decks", "river", "overpass"])
 def test_decks_of_scenes_are_found(name):
     xyz, codes = seen(name, 6.0)
-    deck = found(xyz)
+    deck = detect(xyz)
     assert f1(deck, codes == DECK, codes != OTHER) > 0.85
     assert (deck & ~np.isin(codes, (DECK, OTHER))).mean() < 0.002
 
@@ -52,7 +52,7 @@ def test_decks_of_scenes_are_found(name):
 def test_without_a_deck_nothing_is_found(name):
     scene = SCENES[name]()
     scene.slabs = [slab for slab in scene.slabs if slab.code != DECK]
-    assert not found(scan(scene, 4.0)[0]).any()
+    assert not detect(scan(scene, 4.0)[0]).any()
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_roofs_and_ramps_are_no_decks(roof):
     def terrain(s, t):
         return 0.1 * np.sin(s / 9), np.full(len(s), 2)
 
-    assert not found(scan(Scene(terrain, [roof], [], 0.2, 360.0, 120.0), 6.0)[0]).any()
+    assert not detect(scan(Scene(terrain, [roof], [], 0.2, 360.0, 120.0), 6.0)[0]).any()
 
 
 def test_what_lies_beyond_the_survey_is_no_drop():
@@ -76,7 +76,7 @@ def test_what_lies_beyond_the_survey_is_no_drop():
     strip = np.column_stack([rng.uniform(0, 200, 40_000), rng.uniform(0, 12, 40_000)])
     height = 3.0 * np.clip(1.5 - abs(strip[:, 1] - 6.0) / 4.0, 0.0, 1.0)
     xyz = np.column_stack([strip, height + rng.normal(0, 0.02, 40_000)])
-    assert not found(xyz, ground=np.ones(len(xyz), bool)).any()
+    assert not detect(xyz, ground=np.ones(len(xyz), bool)).any()
 
 
 # ---- properties -----------------------------------------------------------------------------------------
@@ -89,21 +89,21 @@ def test_order_and_shifts_by_whole_cells_change_nothing(seed, cells):
     # Of binary fractions, so that shifts are exact.
     xyz = np.round(xyz - (85_000, 447_000, 0), 3) * 1024 // 1 / 1024
     ground = np.random.default_rng(seed).random(len(xyz)) < 0.9
-    deck = found(xyz, ground=ground)
+    deck = detect(xyz, ground=ground)
     order = np.random.default_rng(seed).permutation(len(xyz))
     assert deck.any()
-    assert np.array_equal(found(xyz[order], ground=ground[order]), deck[order])
-    assert np.array_equal(found(xyz + np.array([*cells, 0]), ground=ground), deck)
+    assert np.array_equal(detect(xyz[order], ground=ground[order]), deck[order])
+    assert np.array_equal(detect(xyz + np.array([*cells, 0]), ground=ground), deck)
 
 
 def test_squares_of_a_large_cloud_give_what_the_whole_gives(monkeypatch):
     xyz = np.vstack([seen("viaduct of two decks")[0], seen("river")[0] + (700, 300, 0)])
     ground = filtered_ground(xyz, threads=1)["Ground"] > 0
-    whole = found(xyz, ground=ground)
+    whole = detect(xyz, ground=ground)
     assert whole.sum() > 10_000
     monkeypatch.setattr("pdal_stages.terrain.pieces.LARGEST_RASTER", 100)
     monkeypatch.setattr("pdal_stages.terrain.pieces.SQUARE_SIDE", 128)
-    assert np.array_equal(found(xyz, ground=ground), whole)
+    assert np.array_equal(detect(xyz, ground=ground), whole)
 
 
 def test_points_within_the_reach_are_enough():
@@ -114,18 +114,18 @@ def test_points_within_the_reach_are_enough():
     for low in (-140, 0):
         outside = np.abs(xyz[:, 0] - 85_000 - low - 20) - 20
         near = outside < rules.reach_m
-        some = find_decks(*xyz[near].T.copy(), np.ones(near.sum(), bool), ground[near], rules)
+        subset = find_decks(*xyz[near].T.copy(), np.ones(near.sum(), bool), ground[near], rules)
         assert near.sum() < len(xyz)
-        assert np.array_equal(some[outside[near] < 0], whole[outside < 0])
+        assert np.array_equal(subset[outside[near] < 0], whole[outside < 0])
 
 
 def test_degenerate_clouds_and_points_left_out():
     clouds = [np.zeros((n, 3)) for n in (0, 1, 50)]
     clouds.append(np.random.default_rng(0).normal(0, 50, (500, 3)))
     clouds.append(np.vstack([clouds[-1], [[1e7, 1e7, 0.0]]]))
-    assert not any(found(xyz, ground=np.ones(len(xyz), bool)).any() for xyz in clouds)
+    assert not any(detect(xyz, ground=np.ones(len(xyz), bool)).any() for xyz in clouds)
     xyz, codes = seen("overpass")
-    assert not found(xyz, codes != DECK).any()
+    assert not detect(xyz, codes != DECK).any()
 
 
 # ---- the stage, PDAL ------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def test_degenerate_clouds_and_points_left_out():
 def test_bridges_leave_ground_and_buildings():
     xyz, _ = seen("overpass")
     ground = filtered_ground(xyz, threads=1)["Ground"]
-    deck = np.flatnonzero(found(xyz, ground=ground > 0))
+    deck = np.flatnonzero(detect(xyz, ground=ground > 0))
     given_codes = np.full(len(xyz), 2, np.uint8)
     given_codes[deck[:5]] = 6, 5, 12, 18, 1
     arrays = dict(zip("XYZ", xyz.T.copy(), strict=True))
@@ -162,9 +162,9 @@ def test_classify_finds_decks_where_asked(tmp_path, capsys):
     source, out = write(tmp_path / "in.las", xyz), tmp_path / "out.las"
     assert main(["classify", source, str(out), "--no-progress", "--bridges"]) == 0
     assert "bridge decks (bridges)" in capsys.readouterr().out
-    made = laspy.read(out)
-    assert f1(np.asarray(made.classification) == 17, codes == DECK, codes != OTHER) > 0.85
-    assert set(made.point_format.extra_dimension_names) == {"HeightAboveGround", "Reliability"}
+    written = laspy.read(out)
+    assert f1(np.asarray(written.classification) == 17, codes == DECK, codes != OTHER) > 0.85
+    assert set(written.point_format.extra_dimension_names) == {"HeightAboveGround", "Reliability"}
     assert main(["classify", source, str(out), "--no-progress"]) == 0
     assert not np.any(np.asarray(laspy.read(out).classification) == 17)
 
@@ -192,13 +192,13 @@ def test_in_tiles_as_in_one_piece_through_pdal(tmp_path):
 
 @pytest.mark.parametrize("name", ["seville/plazanueva.laz", "rural/lidarhd_bank.laz"])
 def test_real_clouds_without_bridges_have_none(name, data_dir):
-    assert not found(laspy.read(data_dir / name).xyz).any()
+    assert not detect(laspy.read(data_dir / name).xyz).any()
 
 
 def test_a_real_bridge_is_found_and_no_ground_with_it(data_dir):
     """Labels of LiDAR HD: 10,542 points of a deck, 105,034 of ground."""
     las = laspy.read(data_dir / "bridge/pont.laz")
     codes = np.asarray(las.classification)
-    deck = found(las.xyz, ~np.isin(codes, (65, 66))) & ~np.isin(codes, (3, 4, 5))
+    deck = detect(las.xyz, ~np.isin(codes, (65, 66))) & ~np.isin(codes, (3, 4, 5))
     assert f1(deck, codes == 17, np.ones(len(codes), bool)) > 0.9
     assert (deck & (codes == 2)).sum() <= 0.003 * (codes == 2).sum()

@@ -123,10 +123,10 @@ def test_stages_that_pdal_leaves_out(tmp_path, monkeypatch):
     for stop in (False, True):
         if stop:  # as if it had not been called
             monkeypatch.setattr(runtime, "_run_interruptible", lambda *_: None)
-        made = ps.run_pipeline(
+        job = ps.run_pipeline(
             [*none, {"type": "filters.hag_minima"}, {"type": "filters.multiscalefeatures"}]
         )
-        assert made.reports[0][1][0].figures["points"] == 0
+        assert job.reports[0][1][0].figures["points"] == 0
         with pytest.raises(ps.StageError, match=r"writers\.classifiermodel.*no points to train on"):
             ps.run_pipeline([*none, {"type": "filters.hag_minima"}, train])
         with pytest.raises(ps.StageError, match="no points to compare"):

@@ -274,8 +274,8 @@ def test_ropt_is_the_oracle_s(cloud):
         for i, q in enumerate(queries):
             r, entropies = oracle_ropt(xyz, q, radii, least)
             assert table[M.N, i] == len(oracle.sphere(xyz, q, table[M.RADIUS, i]))
-            mine = entropies[list(radii).index(table[M.RADIUS, i])]
-            assert table[M.RADIUS, i] == r or abs(mine - min(entropies)) < 2e-9, f"query {i}"
+            inside = entropies[list(radii).index(table[M.RADIUS, i])]
+            assert table[M.RADIUS, i] == r or abs(inside - min(entropies)) < 2e-9, f"query {i}"
 
 
 def dimensionality(members):
@@ -296,8 +296,10 @@ def test_rdim_has_the_lowest_entropy_of_dimensionality():
         for i, q in enumerate(queries):
             spheres = [oracle.sphere(xyz, q, radius) for radius in radii]
             entropies = [
-                dimensionality(one) if len(one) >= 10 and np.ptp(one, axis=0).max() > 0 else np.inf
-                for one in spheres
+                dimensionality(entry)
+                if len(entry) >= 10 and np.ptp(entry, axis=0).max() > 0
+                else np.inf
+                for entry in spheres
             ]
             chosen = list(radii).index(table[M.RADIUS, i])
             if np.isinf(entropies).all():
@@ -372,10 +374,10 @@ def test_copt_is_the_oracle_s():
 
 def test_a_different_seed_changes_shapes_only():
     xyz = CLOUDS["utm"][:400]
-    one = compute_features(xyz, None, "k7,kopt", "all", seed=4)
-    other = compute_features(xyz, None, "k7,kopt", "all", seed=5, bins=one.bins)
-    shape = np.array([name[:2] in oracle.METRICS for name in one.names])
-    same = (one.values == other.values).all(axis=0)
+    single = compute_features(xyz, None, "k7,kopt", "all", seed=4)
+    other = compute_features(xyz, None, "k7,kopt", "all", seed=5, bins=single.bins)
+    shape = np.array([name[:2] in oracle.METRICS for name in single.names])
+    same = (single.values == other.values).all(axis=0)
     assert same[~shape].all() and not same[shape].all()
 
 
@@ -384,8 +386,8 @@ def test_a_different_seed_changes_shapes_only():
 def test_real_clouds(data_dir, file):
     import laspy
 
-    found = data_dir / file if (data_dir / file).is_dir() else (data_dir / file).parent
-    path = min(p for p in sorted(found.rglob("*.la[sz]")) if file.split("/")[-1] in str(p))
+    result = data_dir / file if (data_dir / file).is_dir() else (data_dir / file).parent
+    path = min(p for p in sorted(result.rglob("*.la[sz]")) if file.split("/")[-1] in str(p))
     with laspy.open(path) as reader:
         cloud = reader.read()
     xyz = np.c_[cloud.x, cloud.y, cloud.z]

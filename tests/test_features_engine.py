@@ -258,11 +258,11 @@ def test_report(cloud):
 
 
 def test_dimensions(cloud):
-    own = np.arange(len(cloud), dtype=np.float64)
+    ours = np.arange(len(cloud), dtype=np.float64)
     plan = FeaturePlan.parse("c1", "Density", ["Z", "HeightAboveGround"])
     engine = FeatureEngine(cloud, plan)
-    for _, rows, values, *_ in engine.run(dimensions={"HeightAboveGround": own}).computed():
-        assert np.array_equal(values[:, 2], own[rows].astype(np.float32))
+    for _, rows, values, *_ in engine.run(dimensions={"HeightAboveGround": ours}).computed():
+        assert np.array_equal(values[:, 2], ours[rows].astype(np.float32))
         assert np.array_equal(values[:, 1], cloud[rows, 2].astype(np.float32))
     picked = np.array([7, 3, 9])
     dimensions = {"HeightAboveGround": [70.0, 30.0, 90.0], "Z": [1, 2, 3]}
@@ -273,20 +273,20 @@ def test_dimensions(cloud):
 
     def of(rows):
         seen.append(rows)
-        return {"HeightAboveGround": own[rows]}
+        return {"HeightAboveGround": ours[rows]}
 
     for queries in (None, np.array([7, 3, 9]), np.arange(0, len(cloud), 2)):
         run = engine.run(queries, dimensions=of)  # called block by block
-        found = [(block.rows, block.values) for block in run.computed()]
+        result = [(block.rows, block.values) for block in run.computed()]
         assert all(
-            np.array_equal(values[:, 2], own[rows].astype(np.float32)) for rows, values in found
+            np.array_equal(values[:, 2], ours[rows].astype(np.float32)) for rows, values in result
         )
-        assert sum(map(len, seen)) == sum(len(rows) for rows, _ in found)
+        assert sum(map(len, seen)) == sum(len(rows) for rows, _ in result)
         seen.clear()
     table = compute_features(
-        cloud, neighborhoods="c1", feature_set="Density", dimensions={"Intensity": own}
+        cloud, neighborhoods="c1", feature_set="Density", dimensions={"Intensity": ours}
     )
-    assert table.names == ("Density_c1", "Intensity") and np.array_equal(table["Intensity"], own)
+    assert table.names == ("Density_c1", "Intensity") and np.array_equal(table["Intensity"], ours)
 
 
 def test_a_missing_dimension_is_asked_for(cloud):
@@ -338,10 +338,10 @@ def test_wrong_queries(cloud, queries, message):
 @pytest.mark.parametrize("far", [1e9, 2.5e9, 1e12])
 def test_strays_far_apart_change_nothing(cloud, far):
     strays = np.vstack([cloud[:500], [[far, far, 0.0], [-far, 5.0, 0.0]]])
-    one, other = (
+    first, other = (
         compute_features(xyz, range(500), "c1,k5", "covariance") for xyz in (cloud[:500], strays)
     )
-    assert np.array_equal(one.values, other.values)
+    assert np.array_equal(first.values, other.values)
 
 
 def test_wrong_options(cloud):
@@ -411,16 +411,16 @@ def test_cached_code_follows_device_functions(tmp_path):
     (tmp_path / "outer.py").write_text(
         "from inner import value\nfrom pdal_stages.base.jit import njit\n@njit\ndef f():\n    return value()\n"
     )
-    found = []
+    results = []
     for number in (1, 1, 2):
         (tmp_path / "inner.py").write_text(
             f"from pdal_stages.base.jit import device\n@device\ndef value():\n    return {number}\n"
         )
         code = "from outer import f, value; print(f(), value(), sum(f.dispatcher.stats.cache_hits.values()))"
-        found.append(
+        results.append(
             run_python(code, PYTHONPATH=str(tmp_path), PYTHONDONTWRITEBYTECODE="1").split()
         )
-    assert found == [["1", "1", "0"], ["1", "1", "1"], ["2", "2", "0"]]
+    assert results == [["1", "1", "0"], ["1", "1", "1"], ["2", "2", "0"]]
 
 
 @pytest.mark.slow

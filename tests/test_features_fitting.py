@@ -55,9 +55,9 @@ def test_a_thinned_copy_gives_its_samples_too():
     """The same points in two densities: the order of the clouds still does not matter."""
     thin = CLOUDS[0][::3]
     plan = FeaturePlan.parse("s2", "shapes")
-    one, other = fit_clouds([CLOUDS[0], thin], plan), fit_clouds([thin, CLOUDS[0]], plan)
-    assert one == other
-    assert one[0] != fit_clouds([CLOUDS[0]], plan)[0]
+    first, other = fit_clouds([CLOUDS[0], thin], plan), fit_clouds([thin, CLOUDS[0]], plan)
+    assert first == other
+    assert first[0] != fit_clouds([CLOUDS[0]], plan)[0]
 
 
 def test_training_stores_what_all_clouds_give():

@@ -30,11 +30,11 @@ def slow(name, xyz, dimensions):
         dimensions["NumberOfReturns"].astype(int),
     )
     flag = total > 1 if name.startswith("MultipleReturn") else (number > 0) & (number < total)
-    one = return_features.parse(name)
-    if not one.axes:
+    single = return_features.parse(name)
+    if not single.axes:
         return flag.astype(float)
-    cell = np.floor(xyz[:, : one.axes] / one.side).astype(int)
-    return np.array([flag[(abs(cell - mine) <= 1).all(axis=1)].mean() for mine in cell])
+    cell = np.floor(xyz[:, : single.axes] / single.side).astype(int)
+    return np.array([flag[(abs(cell - inside) <= 1).all(axis=1)].mean() for inside in cell])
 
 
 @pytest.mark.parametrize(

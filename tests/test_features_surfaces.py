@@ -64,11 +64,11 @@ def test_rigid_motions(seed, axes, shift):
     """Surfaces know neither north nor up."""
     rng = np.random.default_rng(seed)
     xyz = np.round(rng.uniform(0, 6, (int(rng.integers(12, 80)), 3)) * 1024) / 1024
-    one = compute_features(xyz, None, "k4,k12", "surfaces", threads=1).values
+    single = compute_features(xyz, None, "k4,k12", "surfaces", threads=1).values
     other = compute_features(
         xyz[:, axes] * [1, -1, 1] + shift, None, "k4,k12", "surfaces", threads=1
     ).values
-    np.testing.assert_allclose(one, other, rtol=1e-4, atol=3e-4)
+    np.testing.assert_allclose(single, other, rtol=1e-4, atol=3e-4)
 
 
 @settings(max_examples=100, deadline=None)
@@ -186,6 +186,8 @@ def test_a_model_reads_them(tmp_path):
     assert "SurfaceVariationStd_k20" in again.passes[0].plan.names
     first = again.passes[0]
     assert {column.group for column in first.columns([2, 6])} == {"covariance", "surfaces"}
-    found = again.predict(xyz, {})
-    assert np.array_equal(found.classification, model.predict(xyz[::-1], {}).classification[::-1])
-    assert (found.classification == label).mean() > 0.9
+    prediction = again.predict(xyz, {})
+    assert np.array_equal(
+        prediction.classification, model.predict(xyz[::-1], {}).classification[::-1]
+    )
+    assert (prediction.classification == label).mean() > 0.9

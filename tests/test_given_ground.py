@@ -34,36 +34,38 @@ def edited(tmp_path):
     part = (x < x.min() + 30) & (y < y.min() + 30)
     las.points = las.points[part]
     codes, x = codes[part], x[part]
-    given = (codes == 2) & ((x < x.min() + 10) | (x > x.min() + 14))
-    given[np.flatnonzero(codes == 6)[:40]] = True
-    las.classification = np.where(given, 2, 1).astype(np.uint8)
+    known = (codes == 2) & ((x < x.min() + 10) | (x > x.min() + 14))
+    known[np.flatnonzero(codes == 6)[:40]] = True
+    las.classification = np.where(known, 2, 1).astype(np.uint8)
     las.write(tmp_path / "edited.laz")
     return tmp_path / "edited.laz"
 
 
 def far_from(xyz, given):
     """Which points (n,) have a height above given ground beyond the tolerance."""
-    found = filtered_ground(xyz, ground=given, slope_too=True)
-    slope = np.tan(np.radians(found["Slope"]))
-    return np.abs(found["HeightAboveGround"]) > OPTIONS.threshold + OPTIONS.scalar * slope + 0.05
+    result = filtered_ground(xyz, ground=given, slope_too=True)
+    slope = np.tan(np.radians(result["Slope"]))
+    return np.abs(result["HeightAboveGround"]) > OPTIONS.threshold + OPTIONS.scalar * slope + 0.05
 
 
 @pytest.mark.parametrize("name", ["city", "canals", "riverbank", "woods"])
 def test_the_surface_is_that_of_the_ground_that_is_given(name):
     xyz, codes = clip(name)
     ground, figures = codes == 2, {}
-    given = filtered_ground(xyz, ground=ground, openings=(5, 17), figures=figures)
-    found = filtered_ground(xyz, openings=(5, 17))
-    height = np.abs(given["HeightAboveGround"][ground])
-    assert np.percentile(height, 99) < 0.25 and given["Ground"][ground].all()
-    assert np.percentile(height, 99) < np.percentile(np.abs(found["HeightAboveGround"][ground]), 99)
-    assert not given["Ground"][far_from(xyz, ground) & ~ground].any()
+    known = filtered_ground(xyz, ground=ground, openings=(5, 17), figures=figures)
+    result = filtered_ground(xyz, openings=(5, 17))
+    height = np.abs(known["HeightAboveGround"][ground])
+    assert np.percentile(height, 99) < 0.25 and known["Ground"][ground].all()
+    assert np.percentile(height, 99) < np.percentile(
+        np.abs(result["HeightAboveGround"][ground]), 99
+    )
+    assert not known["Ground"][far_from(xyz, ground) & ~ground].any()
     for opening in (
         "HeightAboveOpening_5",
         "HeightAboveOpening_17",
     ):  # of all points, ground or not
-        assert np.array_equal(given[opening], found[opening])
-    assert figures["ground_points"] == np.count_nonzero(given["Ground"]) and "pits" not in figures
+        assert np.array_equal(known[opening], result[opening])
+    assert figures["ground_points"] == np.count_nonzero(known["Ground"]) and "pits" not in figures
 
 
 def test_points_as_far_as_its_reach_decide():
@@ -101,17 +103,17 @@ def classified(path, out, *words):
 
 @pytest.mark.pdal
 def test_classify_keeps_the_ground_that_is_given(edited, tmp_path, capsys):
-    given = np.asarray(laspy.read(edited).classification) == 2
+    known = np.asarray(laspy.read(edited).classification) == 2
     xyz, codes, las = classified(edited, tmp_path / "out.laz", "--wires")
-    assert (codes[given] == 2).all()
-    assert not (codes[far_from(xyz, given) & ~given] == 2).any()
-    assert (codes[~given] == 2).sum() > 500  # the strip that was not marked
+    assert (codes[known] == 2).all()
+    assert not (codes[far_from(xyz, known) & ~known] == 2).any()
+    assert (codes[~known] == 2).sum() > 500  # the strip that was not marked
     assert {5, 6} <= set(codes.tolist())
-    heights = filtered_ground(xyz, ground=given)["HeightAboveGround"]
+    heights = filtered_ground(xyz, ground=known)["HeightAboveGround"]
     assert np.allclose(las["HeightAboveGround"], heights, atol=1 / 32)
-    found = tmp_path / "found.laz"
-    assert main(["classify", str(edited), str(found)]) == 0
-    assert (np.asarray(laspy.read(found).classification)[given] != 2).sum() > 20  # the terrace
+    result = tmp_path / "found.laz"
+    assert main(["classify", str(edited), str(result)]) == 0
+    assert (np.asarray(laspy.read(result).classification)[known] != 2).sum() > 20  # the terrace
     assert "other heights" not in capsys.readouterr().err
 
 
@@ -149,8 +151,10 @@ def test_the_shipped_model_after_heights_of_pdal(edited, tmp_path, ground, heigh
     out = tmp_path / "out.laz"
     apply = {"type": "filters.modelclassifier", "model": "standard"}
     done = ps.run_pipeline([str(edited), *ground, {"type": heights}, apply, str(out)])
-    said = " ".join(done.messages)
-    assert "trained on other heights" in said and "from points of class 2 Ground, Height" in said
+    message = " ".join(done.messages)
+    assert (
+        "trained on other heights" in message and "from points of class 2 Ground, Height" in message
+    )
     assert {2, 5, 6} <= set(np.asarray(laspy.read(out).classification).tolist())
 
 
@@ -179,9 +183,9 @@ def test_given_ground_in_a_pipeline_and_in_a_model(edited, tmp_path):
     ps.run_pipeline([str(tmp_path / "labeled.laz"), keep, heights, write])
     model = load_model(tmp_path / "m.model")
     assert model.info["preparation"] == [heights]
-    given = np.asarray(laspy.read(edited).classification) == 2
+    known = np.asarray(laspy.read(edited).classification) == 2
     assert main(["classify", str(edited), str(tmp_path / "o.laz"), "--model", str(tmp_path / "m.model")]) == 0  # fmt: skip
-    assert (np.asarray(laspy.read(tmp_path / "o.laz").classification)[given] == 2).all()
+    assert (np.asarray(laspy.read(tmp_path / "o.laz").classification)[known] == 2).all()
     with pytest.raises(StageError, match="HeightAboveGround"):
         load_model(tmp_path / "m.model").predict(np.asarray(las.xyz))  # without classes
     (warning,) = load_model(tmp_path / "m.model").outdated or [None]

@@ -224,21 +224,21 @@ def test_benches_of_a_quarry_stay_ground():
 def test_ground_is_found_in_a_town_on_a_slope():
     x, y, z, height = town()
     figures = {}
-    found = filtered_ground(x, y, z, openings=(5, 17), slope_too=True, figures=figures)
-    error = np.abs(found["HeightAboveGround"] - height)
+    result = filtered_ground(x, y, z, openings=(5, 17), slope_too=True, figures=figures)
+    error = np.abs(result["HeightAboveGround"] - height)
     assert np.percentile(error[height == 0], 99) < 0.5
     assert np.median(error[height > 2]) < 0.5
-    assert found["Ground"][height == 0].mean() > 0.97
-    assert found["Ground"][height > 2].mean() < 0.02
-    assert not found["Ground"][height < 0].any()
-    assert np.median(found["Slope"]) == pytest.approx(np.degrees(np.arctan(0.2)), abs=3)
+    assert result["Ground"][height == 0].mean() > 0.97
+    assert result["Ground"][height > 2].mean() < 0.02
+    assert not result["Ground"][height < 0].any()
+    assert np.median(result["Slope"]) == pytest.approx(np.degrees(np.arctan(0.2)), abs=3)
     assert figures["pits"] > 0 and figures["without_terrain"] == 0
-    assert figures["ground_points"] == found["Ground"].sum()
+    assert figures["ground_points"] == result["Ground"].sum()
     roofs = height == 7
     assert (
-        np.median(found["HeightAboveOpening_5"][roofs])
+        np.median(result["HeightAboveOpening_5"][roofs])
         < 1
-        < np.median(found["HeightAboveOpening_17"][roofs])
+        < np.median(result["HeightAboveOpening_17"][roofs])
     )
 
 
@@ -248,13 +248,13 @@ def test_order_and_shifts_by_whole_cells_change_nothing(seed, n, cells):
     rng = np.random.default_rng(seed)
     # Quarter meters are exact in binary, so a shift by whole blocks of the pyramid is exact too.
     x, y, z = rng.integers(0, 160, (3, n)) / 4.0
-    found = filtered_ground(x, y, z, **SMALL)
+    result = filtered_ground(x, y, z, **SMALL)
     order = rng.permutation(n)
     same(
         filtered_ground(x[order], y[order], z[order], **SMALL),
-        {k: v[order] for k, v in found.items()},
+        {k: v[order] for k, v in result.items()},
     )
-    same(filtered_ground(x + 32 * cells, y - 32 * cells, z, **SMALL), found)
+    same(filtered_ground(x + 32 * cells, y - 32 * cells, z, **SMALL), result)
 
 
 def test_a_tile_with_its_halo_gives_the_same_bits():
@@ -290,9 +290,9 @@ def test_one_stray_point_costs_little_memory():
     x, y, z, _ = town(1, side=60)
     whole = filtered_ground(x, y, z, **SMALL)
     for far in (1e5, -1e7, 1e9):
-        found = filtered_ground(np.append(x, far), np.append(y, -far), np.append(z, 5.0), **SMALL)
-        same({k: v[:-1] for k, v in found.items()}, whole)
-        assert found["HeightAboveGround"][-1] == pytest.approx(0, abs=1e-9)
+        result = filtered_ground(np.append(x, far), np.append(y, -far), np.append(z, 5.0), **SMALL)
+        same({k: v[:-1] for k, v in result.items()}, whole)
+        assert result["HeightAboveGround"][-1] == pytest.approx(0, abs=1e-9)
 
 
 def test_ignored_points_change_nothing_but_get_heights():
@@ -300,12 +300,12 @@ def test_ignored_points_change_nothing_but_get_heights():
     rng = np.random.default_rng(1)
     extra = rng.uniform(0, 60, (2, 50))
     figures = {}
-    found = filtered_ground(
+    result = filtered_ground(
         np.append(x, extra[0]), np.append(y, extra[1]), np.append(z, np.full(50, -300.0)),
         mask=np.arange(len(x) + 50) < len(x), figures=figures, **SMALL,
     )  # fmt: skip
-    same({k: v[: len(x)] for k, v in found.items()}, filtered_ground(x, y, z, **SMALL))
-    assert (found["HeightAboveGround"][len(x) :] < -350).all()
+    same({k: v[: len(x)] for k, v in result.items()}, filtered_ground(x, y, z, **SMALL))
+    assert (result["HeightAboveGround"][len(x) :] < -350).all()
     assert figures["unused_points"] == 50
 
 
@@ -319,9 +319,9 @@ def test_ignored_points_change_nothing_but_get_heights():
     ],
 )
 def test_degenerate_clouds(x, y, z):
-    found = filtered_ground(x, y, z, **SMALL)
-    assert np.allclose(found["HeightAboveGround"], 0, atol=1e-6)
-    assert found["Ground"].all()
+    result = filtered_ground(x, y, z, **SMALL)
+    assert np.allclose(result["HeightAboveGround"], 0, atol=1e-6)
+    assert result["Ground"].all()
 
 
 def test_nothing_not_finite_and_nothing_usable():
@@ -330,9 +330,9 @@ def test_nothing_not_finite_and_nothing_usable():
         "HeightAboveGround": ("d", 0), "Ground": ("B", 0), "Slope": ("d", 0),
         "HeightAboveOpening_5": ("f", 0), "HeightAboveOpening_9": ("f", 0),
     }  # fmt: skip
-    found = filtered_ground([1.0, np.nan, 2.0], [1.0, 1.0, np.inf], [3.0, 4.0, 5.0])
-    assert found["HeightAboveGround"][0] == 0 and np.isnan(found["HeightAboveGround"][1:]).all()
-    assert found["Ground"].tolist() == [1, 0, 0]
+    result = filtered_ground([1.0, np.nan, 2.0], [1.0, 1.0, np.inf], [3.0, 4.0, 5.0])
+    assert result["HeightAboveGround"][0] == 0 and np.isnan(result["HeightAboveGround"][1:]).all()
+    assert result["Ground"].tolist() == [1, 0, 0]
     figures = {}
     none = filtered_ground([1.0, 2.0], [1.0, 2.0], [3.0, 9.0], mask=[False, False], figures=figures)
     assert none["HeightAboveGround"].tolist() == [0, 0] and figures["without_terrain"] == 2
@@ -362,10 +362,10 @@ def test_ground_of_real_clouds(data_dir, name):
 
     las = laspy.read(data_dir / "isprs_filter" / f"{name}.laz")
     true = np.asarray(las.classification) == 2
-    found = filtered_ground(las.x, las.y, las.z)
-    wrong = (found["Ground"] == 1) != true
+    result = filtered_ground(las.x, las.y, las.z)
+    wrong = (result["Ground"] == 1) != true
     assert wrong.mean() < 0.04
-    assert np.abs(found["HeightAboveGround"][true]).mean() < 0.1
+    assert np.abs(result["HeightAboveGround"][true]).mean() < 0.1
 
 
 # ---- the stage -------------------------------------------------------------------------------------------

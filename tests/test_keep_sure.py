@@ -35,16 +35,16 @@ def test_limits_are_the_lowest_that_hold(seed, n, accuracy):
     known.add(given_[half:], true[half:], reliability[half:])
     bins = np.minimum(np.floor(reliability * BINS), BINS - 1)
     for code, limit in known.limits(accuracy).classes.items():
-        mine = given_ == code
+        inside = given_ == code
         shares = {}
         for k in range(BINS):
-            kept = mine & (bins >= k)
+            kept = inside & (bins >= k)
             if kept.any():
                 shares[k] = float((true[kept] == code).mean())
         good = [k for k, share in shares.items() if share >= accuracy - 1e-12]
         if good:
             assert limit.reliability == min(good) / BINS
-            assert np.isclose(limit.kept, (mine & (bins >= min(good))).sum() / mine.sum())
+            assert np.isclose(limit.kept, (inside & (bins >= min(good))).sum() / inside.sum())
             assert np.isclose(limit.accuracy, shares[min(good)])
         else:
             assert (
@@ -84,12 +84,12 @@ def test_the_shipped_model_says_what_it_costs():
     assert "50.0 % of the most reliable were right" in line
     # Of corrections on top of a base: what is known of the base, and of new classes alone what they say: here as many
     # points of 14 as of the base's classes.
-    own = {
+    ours = {
         "about": "",
         "classes": {"6": known.to_dict()["classes"]["6"], "14": known.to_dict()["classes"]["6"]},
     }
     standard = calibrate_on_base({}, {}, find("standard"))
-    joined = calibrate_on_base(own, {}, find("standard"))
+    joined = calibrate_on_base(ours, {}, find("standard"))
     assert joined["about"] == standard["about"] and standard["about"].startswith("its base (")
     assert {code: joined["classes"][code] for code in standard["classes"]} == standard["classes"]
     both = Calibration.from_dict(joined)
@@ -97,7 +97,7 @@ def test_the_shipped_model_says_what_it_costs():
         np.isclose(both.points([14]), both.points([2, 5, 6]), rtol=1e-3)
         and both.points([2, 5, 6]) > 1e6
     )
-    assert calibrate_on_base(own, {}, "nowhere.model") == own
+    assert calibrate_on_base(ours, {}, "nowhere.model") == ours
     sure = ClassifyRequest(
         classifier_options={"keep_sure": 0.98}
     ).cost  # buildings stay with 98 %, too
@@ -127,16 +127,16 @@ def test_a_model_knows_from_cross_validation_how_sure_it_must_be():
     )
     limits = known.limits(0.9)
     other, truth = blocks(1)
-    found = model.predict(other, {"HeightAboveGround": other[:, 2]},
+    prediction = model.predict(other, {"HeightAboveGround": other[:, 2]},
                           limits=limits, rejected_code=1)  # fmt: skip
     plain = model.predict(other, {"HeightAboveGround": other[:, 2]})
-    kept = found.classification != 1
-    assert 0 < len(found.unsure) == np.count_nonzero(~kept) < len(other)
-    assert np.array_equal(found.classification[kept], plain.classification[kept])
+    kept = prediction.classification != 1
+    assert 0 < len(prediction.unsure) == np.count_nonzero(~kept) < len(other)
+    assert np.array_equal(prediction.classification[kept], plain.classification[kept])
     for code in (2, 6):
-        mine = kept & (found.classification == code)
+        inside = kept & (prediction.classification == code)
         all_ = plain.classification == code
-        assert (truth[mine] == code).mean() > 0.87 > (truth[all_] == code).mean() - 0.02
+        assert (truth[inside] == code).mean() > 0.87 > (truth[all_] == code).mean() - 0.02
         assert (plain.reliability[all_ & ~kept] < limits.classes[code].reliability).all()
 
 

@@ -44,9 +44,9 @@ def rough(seed, shape=(44, 50), holes=0.2):
 @pytest.mark.parametrize("seed", range(2))
 def test_outliers_equal_the_slow_reference(seed):
     raster = rough(seed, holes=0.2 if seed % 2 else 0.7)
-    found = find_low_outliers(raster, 1.0)
-    assert np.array_equal(found, slow_outliers(raster))
-    assert found.any()
+    outliers = find_low_outliers(raster, 1.0)
+    assert np.array_equal(outliers, slow_outliers(raster))
+    assert outliers.any()
 
 
 @settings(max_examples=5, deadline=None)
@@ -106,11 +106,11 @@ def test_terrain_stands_clusters_of_noise():
     centers = np.column_stack([rng.uniform(2, 58, (20, 2)), rng.uniform(-30, -3, 20)])
     noise = [center + rng.normal(0, 0.4, (rng.integers(2, 31), 3)) for center in centers]
     both = np.vstack([xyz, *noise])
-    clean, found = filtered_ground(xyz), filtered_ground(both)
-    moved = np.abs(found["HeightAboveGround"][: len(xyz)] - clean["HeightAboveGround"])
+    clean, result = filtered_ground(xyz), filtered_ground(both)
+    moved = np.abs(result["HeightAboveGround"][: len(xyz)] - clean["HeightAboveGround"])
     assert moved.max() < 0.2
-    assert found["Ground"][: len(xyz)].mean() > 0.99
-    assert not found["Ground"][len(xyz) :].any()
+    assert result["Ground"][: len(xyz)].mean() > 0.99
+    assert not result["Ground"][len(xyz) :].any()
 
 
 @pytest.mark.parametrize("name", ["montpellier/train_77055_627755.laz", "rural/lidarhd_bank.laz"])
@@ -129,8 +129,8 @@ def test_real_ground_stands_noise(data_dir, name):
         spread += [at[0], at[1], top - rng.uniform(2, 25) - spread[:, 2].max()]
         noise.append(spread)
         put += size
-    clean, found = filtered_ground(xyz), filtered_ground(np.vstack([xyz, *noise]))
-    lost = clean["Ground"][ground] > found["Ground"][: len(xyz)][ground]
-    moved = np.abs(found["HeightAboveGround"][: len(xyz)] - clean["HeightAboveGround"]) > 0.3
+    clean, result = filtered_ground(xyz), filtered_ground(np.vstack([xyz, *noise]))
+    lost = clean["Ground"][ground] > result["Ground"][: len(xyz)][ground]
+    moved = np.abs(result["HeightAboveGround"][: len(xyz)] - clean["HeightAboveGround"]) > 0.3
     assert lost.mean() < 0.005
     assert moved.mean() < 0.02

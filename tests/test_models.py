@@ -26,8 +26,8 @@ def test_every_shipped_model_loads_says_its_preparation_and_is_small(tmp_path):
             shutil.copy(path, tmp_path)
         )  # held against the schema, as those beside the code are not
         assert path.stat().st_size < 5e6
-        made = {name for stage in model.info["preparation"] for name in _creates(stage)}
-        assert set(model.required_dimensions) <= made
+        output = {name for stage in model.info["preparation"] for name in _creates(stage)}
+        assert set(model.required_dimensions) <= output
         assert not {"Intensity", "Red", "Green", "Blue"} & set(model.required_dimensions)
 
 
@@ -52,9 +52,9 @@ def test_heights_are_made_as_in_training_beside_return_numbers():
         for name in ("ReturnNumber", "NumberOfReturns")
     }
     model = load_model(shipped()[STANDARD])
-    found = model.predict(xyz, returns).classification
-    made = made_of_coordinates(model.info["preparation"], xyz)
-    assert np.array_equal(found, model.predict(xyz, {**made, **returns}).classification)
+    predicted = model.predict(xyz, returns).classification
+    output = made_of_coordinates(model.info["preparation"], xyz)
+    assert np.array_equal(predicted, model.predict(xyz, {**output, **returns}).classification)
     assert not np.array_equal(
         model.predict(xyz).reliability, model.predict(xyz, returns).reliability
     )
@@ -70,13 +70,13 @@ def test_a_raw_tile_is_classified_without_a_model_named(ready_town, tmp_path, ca
     points, truth = (Pipeline([str(path)]) for path in (out, ready_town))
     points.execute()
     truth.execute()
-    found, known = points.arrays[0], truth.arrays[0]
+    result, known = points.arrays[0], truth.arrays[0]
     groups = {2: 2, 3: 0, 4: 5, 5: 5, 6: 6}
     wanted = np.array([groups.get(code, 0) for code in range(256)])[known["Classification"]]
-    given = found["Classification"]
-    assert set(np.unique(given).tolist()) <= {2, 5, 6, 18}
+    inputs = result["Classification"]
+    assert set(np.unique(inputs).tolist()) <= {2, 5, 6, 18}
     assert (
-        np.mean(given[wanted > 0] == wanted[wanted > 0]) > 0.8
+        np.mean(inputs[wanted > 0] == wanted[wanted > 0]) > 0.8
     )  # it has never seen a generated town
 
 

@@ -80,11 +80,11 @@ def test_refuses(spec, word):
 
 
 def test_suffix_and_reach():
-    found = {
+    result = {
         n.token: (n.suffix, n.reach, n.adaptive)
         for n in parse_neighborhoods("c2.5,s1,k50,kopt,ropt,copt")
     }
-    assert found == {
+    assert result == {
         "c2.5": ("c2_5", 2.5, False),
         "s1": ("s1", 1.0, False),
         "k50": ("k50", None, False),
@@ -108,8 +108,8 @@ def test_presets_bring_dimensions():
 
 @given(st.floats(0.001, 99999.0), st.sampled_from("cs"))
 def test_any_radius_survives_its_token(radius, kind):
-    (one,) = parse_neighborhoods(f"{kind}{radius:.9f}")
-    (again,) = parse_neighborhoods(one.token)
-    assert one == again
-    assert abs(one.parameters[0] - radius) <= 5.1e-7
-    assert one.suffix.replace("_", "").isalnum()
+    (single,) = parse_neighborhoods(f"{kind}{radius:.9f}")
+    (again,) = parse_neighborhoods(single.token)
+    assert single == again
+    assert abs(single.parameters[0] - radius) <= 5.1e-7
+    assert single.suffix.replace("_", "").isalnum()

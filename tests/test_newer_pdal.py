@@ -19,8 +19,8 @@ HAG = {"type": "filters.hag_minima"}
 def needs(*version: int) -> None:
     """Skip below a version of PDAL."""
     if pdal_env.version() < version:
-        wanted, found = (".".join(map(str, v)) for v in (version, pdal_env.version()))
-        pytest.skip(f"needs PDAL {wanted}, found {found}")
+        wanted, result = (".".join(map(str, v)) for v in (version, pdal_env.version()))
+        pytest.skip(f"needs PDAL {wanted}, found {result}")
 
 
 def scene(n=2000, seed=3):

@@ -206,14 +206,14 @@ def slow_noise(xyz, most=60, gap=2.5, depth=1.0):
         codes[k] = 18
         for u, v, dz, _ in others:
             far = np.hypot(u, v)
-            on = [
+            target = [
                 (u * p + v * q) / far
                 for p, q, rise, _ in others
                 if abs(u * q - v * p) / far <= 1 and abs(rise - (u * p + v * q) / far**2 * dz) <= 2
             ]
-            places = {int((part + RULES.far) / 3) for part in on}
+            places = {int((part + RULES.far) / 3) for part in target}
             few = RULES.strung_share * sum(other[3] for other in others)
-            if len(places) >= RULES.strung and len(on) > few:
+            if len(places) >= RULES.strung and len(target) > few:
                 del codes[k]
                 break
     low = np.full((h, w), np.inf)
@@ -255,8 +255,8 @@ def slow_linked(raster, side):
     z, number = raster[tuple(cells.T)], np.full(raster.shape, -1)
     away = np.linalg.norm(cells[:, None] - cells[None], axis=2)
     step = np.abs(z[:, None] - z[None]) <= (0.35 + 0.15 * side * away).astype(np.float32)
-    one, other = np.nonzero((away <= 3) & step)
-    pairs = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(z),) * 2)
+    first, other = np.nonzero((away <= 3) & step)
+    pairs = coo_matrix((np.ones(len(first)), (first, other)), shape=(len(z),) * 2)
     number[tuple(cells.T)] = connected_components(pairs)[1]
     return number
 
@@ -275,9 +275,9 @@ def slow_company(base, supported, at, z, plane, side):
 @pytest.mark.parametrize(("seed", "density"), [(0, 6.0), (1, 0.4), (3, 70.0)])
 def test_the_kernels_equal_the_slow_reference(seed, density):
     xyz, _ = scene(seed, 60 if density < 1 else 30, density)
-    found = detached_noise(xyz)
-    assert np.array_equal(found, slow_noise(xyz))
-    assert found.any()
+    noise_codes = detached_noise(xyz)
+    assert np.array_equal(noise_codes, slow_noise(xyz))
+    assert noise_codes.any()
 
 
 @pytest.mark.parametrize(
@@ -293,9 +293,9 @@ def test_clusters_below_thin_clouds(density, clusters, size, extent, depth):
     balls *= rng.random((clusters, size, 1)) ** (1 / 3)
     balls += [[[20, 15 * k + 15, -depth - extent / 2]] for k in range(clusters)]
     xyz = np.vstack([np.column_stack([x, y, z]), *balls])
-    found = detached_noise(xyz)
-    assert np.array_equal(found == 7, np.arange(len(xyz)) >= len(x))
-    assert np.array_equal(found, slow_noise(xyz))
+    noise_codes = detached_noise(xyz)
+    assert np.array_equal(noise_codes == 7, np.arange(len(xyz)) >= len(x))
+    assert np.array_equal(noise_codes, slow_noise(xyz))
 
 
 # ---- what must hold -------------------------------------------------------------------------------------
@@ -304,9 +304,9 @@ def test_clusters_below_thin_clouds(density, clusters, size, extent, depth):
 @pytest.mark.parametrize("seed", range(2))
 def test_noise_is_found_and_nothing_else(seed):
     xyz, truth = scene(seed)
-    found = detached_noise(xyz)
-    assert (found[truth == 0] == 0).all()  # wires, courtyards and trees too
-    assert (found == truth)[truth > 0].mean() > 0.95
+    noise_codes = detached_noise(xyz)
+    assert (noise_codes[truth == 0] == 0).all()  # wires, courtyards and trees too
+    assert (noise_codes == truth)[truth > 0].mean() > 0.95
 
 
 @settings(max_examples=6, deadline=None)
@@ -318,23 +318,23 @@ def test_noise_is_found_and_nothing_else(seed):
 def test_order_and_shifts_by_whole_blocks_change_nothing(seed, steps, density):
     xyz, _ = scene(seed, 60, density)
     xyz = np.round(xyz * 8) / 8  # so that a shift rounds nothing
-    found = detached_noise(xyz)
+    noise_codes = detached_noise(xyz)
     order = np.random.default_rng(seed).permutation(len(xyz))
-    assert np.array_equal(detached_noise(xyz[order]), found[order])
+    assert np.array_equal(detached_noise(xyz[order]), noise_codes[order])
     shift = np.array(steps) * SIDE * np.array([32, 32, 1])
-    assert np.array_equal(detached_noise(xyz + shift), found)
+    assert np.array_equal(detached_noise(xyz + shift), noise_codes)
 
 
 @pytest.mark.parametrize("density", [0.5, 3.0])
 def test_a_tile_with_its_surroundings_gets_what_the_whole_gets(density):
     xyz, _ = scene(5, 420, density)
-    found = detached_noise(xyz)
+    noise_codes = detached_noise(xyz)
     for x0, y0 in ((0, 0), (201.3, 177.7), (333, 40)):
         beyond = np.max([[x0, y0] - xyz[:, :2], xyz[:, :2] - [x0 + 60, y0 + 60]], axis=(0, 2))
         inside, near = beyond < 0, beyond < noise.REACH
         assert near.sum() < len(xyz)
         part = detached_noise(xyz[near])
-        assert np.array_equal(part[inside[near]], found[inside])
+        assert np.array_equal(part[inside[near]], noise_codes[inside])
 
 
 def test_degenerate_clouds_hold_no_noise():
@@ -364,8 +364,8 @@ def test_wires_stay_however_thin_the_cloud(spacing, wires, density):
     apart = np.repeat(6.0 * np.arange(wires), len(along) // wires)
     along += rng.uniform(-0.7, 0.7, len(along)) * spacing
     wire = np.column_stack([along, 40 + 0.5 * along + apart, 30 + 0.001 * (along - 75) ** 2])
-    found = detached_noise(np.vstack([ground, wire]))
-    assert (found[len(ground) :] > 0).mean() <= 0.05
+    noise_codes = detached_noise(np.vstack([ground, wire]))
+    assert (noise_codes[len(ground) :] > 0).mean() <= 0.05
 
 
 @pytest.mark.parametrize(
@@ -440,15 +440,17 @@ def test_in_tiles_as_in_one_piece_and_in_feet(tmp_path, write_las):
     whole.execute()
     stages[2] = {"type": "writers.las", "filename": str(tmp_path / "tiled.las"), "forward": "all"}
     ps.run_tiled(stages, tile=60, workers=0)
-    one, two = (laspy.read(tmp_path / f"{name}.las") for name in ("whole", "tiled"))
-    assert np.array_equal(one.classification, two.classification)
-    assert (np.asarray(one.classification) == np.where(truth == 0, 1, truth)).mean() > 0.999
-    told = whole.metadata["metadata"]["filters.detachednoise"]
-    assert told["low"] == (np.asarray(one.classification) == 7).sum()
+    first, two = (laspy.read(tmp_path / f"{name}.las") for name in ("whole", "tiled"))
+    assert np.array_equal(first.classification, two.classification)
+    assert (np.asarray(first.classification) == np.where(truth == 0, 1, truth)).mean() > 0.999
+    report = whole.metadata["metadata"]["filters.detachednoise"]
+    assert report["low"] == (np.asarray(first.classification) == 7).sum()
     feet = DetachedNoise({"horizontal_unit": "foot", "vertical_unit": "foot"})
     measured = feet.points(arrays_of(xyz / 0.3048, np.ones(len(xyz))))
     assert (
-        np.mean(feet.run(measured, WHOLE_CLOUD)["Classification"] == np.asarray(one.classification))
+        np.mean(
+            feet.run(measured, WHOLE_CLOUD)["Classification"] == np.asarray(first.classification)
+        )
         > 0.9999
     )
 
@@ -463,8 +465,8 @@ def test_classify_marks_noise_first_unless_told_not_to(tmp_path, capsys, write_l
     assert main(["classify", str(source), str(out), "--metadata", str(tmp_path / "m.json")]) == 0
     codes = np.asarray(laspy.read(out).classification)
     assert (codes == truth)[truth > 0].mean() > 0.9
-    said = capsys.readouterr().out
-    assert "  7 Low point (noise)" in said and " 18 High noise" in said
+    output = capsys.readouterr().out
+    assert "  7 Low point (noise)" in output and " 18 High noise" in output
     assert "filters.detachednoise" in json.dumps(json.loads((tmp_path / "m.json").read_text()))
     assert main(["classify", str(source), str(out), "--no-noise"]) == 0
     assert not np.isin(laspy.read(out).classification, (7, 18)).any()
@@ -486,17 +488,17 @@ def test_real_clouds_lose_next_to_nothing_and_lose_their_noise(name, data_dir):
     path = data_dir / name
     las = laspy.read(path)
     xyz, codes = np.column_stack([las.x, las.y, las.z]), np.asarray(las.classification)
-    found = detached_noise(xyz)
+    noise_codes = detached_noise(xyz)
     good = np.isin(codes, (2, 3, 4, 5, 6, 9, 12, 14, 15, 17))
-    assert (found[good] > 0).mean() <= 0.0002
-    assert not (codes == 14).any() or (found[codes == 14] > 0).mean() <= 0.005
+    assert (noise_codes[good] > 0).mean() <= 0.0002
+    assert not (codes == 14).any() or (noise_codes[codes == 14] > 0).mean() <= 0.005
     rng = np.random.default_rng(0)
     ground = xyz[codes == 2]
     at = ground[rng.integers(len(ground), size=60)]
     deep = at - np.column_stack([np.zeros((60, 2)), rng.uniform(5, 30, 60)])
     high = at + np.column_stack([np.zeros((60, 2)), rng.uniform(60, 300, 60)])
-    found = detached_noise(np.vstack([xyz, deep, high]))[len(xyz) :]
-    assert (found[:60] == 7).mean() >= 0.9 and (found[60:] == 18).mean() >= 0.95
+    codes = detached_noise(np.vstack([xyz, deep, high]))[len(xyz) :]
+    assert (codes[:60] == 7).mean() >= 0.9 and (codes[60:] == 18).mean() >= 0.95
 
 
 @pytest.mark.pdal
@@ -508,7 +510,7 @@ def test_counts_are_those_of_all_views(tmp_path, write_las):
     pipeline = ps.run_pipeline([str(path), split, {"type": "filters.detachednoise"}])
     ((_, reports),) = pipeline.reports
     assert len(reports) > 1
-    found = np.concatenate([view["Classification"] for view in pipeline.arrays])
-    expected = {"low": np.count_nonzero(found == 7), "high": np.count_nonzero(found == 18)}
+    codes = np.concatenate([view["Classification"] for view in pipeline.arrays])
+    expected = {"low": np.count_nonzero(codes == 7), "high": np.count_nonzero(codes == 18)}
     named = {f"filters.detachednoise.{name}": n for name, n in expected.items() if n}
     assert len(named) == 2 and pipeline.left_alone == named

@@ -83,15 +83,15 @@ def test_old_and_new_files_together(tmp_path, run_job, write_las, wiring):
     readers = [new, old] if wiring == "plain" else [tmp_path / "*_*.las"]
     code, _, err = run_job([*readers, heights, out])
     assert code == 0, err
-    made, parts = laspy.read(tmp_path / "o.las"), [laspy.read(new), laspy.read(old)]
-    if made.x[0] != parts[0].x[0]:  # PDAL may take a pattern's files as the folder lists them
+    written, parts = laspy.read(tmp_path / "o.las"), [laspy.read(new), laspy.read(old)]
+    if written.x[0] != parts[0].x[0]:  # PDAL may take a pattern's files as the folder lists them
         parts.reverse()
     for name in ("x", "y", "classification"):
         assert np.array_equal(
-            made[name], np.concatenate([np.asarray(part[name]) for part in parts])
+            written[name], np.concatenate([np.asarray(part[name]) for part in parts])
         ), name
-    assert np.array_equal(all_flags(made), np.hstack([all_flags(part) for part in parts]))
-    assert not list(made.point_format.extra_dimension_names)
+    assert np.array_equal(all_flags(written), np.hstack([all_flags(part) for part in parts]))
+    assert not list(written.point_format.extra_dimension_names)
 
 
 def test_training_on_old_and_new_files(tmp_path, run, write_las):
@@ -121,14 +121,14 @@ def test_training_on_old_and_new_files(tmp_path, run, write_las):
 
 def test_pdals_own_pipelines_write_what_pdal_writes(tmp_path, capsys, write_las, pdal_program):
     source = write_las(tmp_path / "in.las", flagged(), point_format=1)
-    made = []
+    outputs = []
     for number, words in enumerate(([pdal_program], [sys.executable, "-m", "pdal_stages.cli"])):
         out = tmp_path / f"{number}.txt"
         stages = [str(source), {"type": "writers.text", "filename": str(out)}]
         (tmp_path / "job.json").write_text(json.dumps(stages))
         subprocess.run([*words, "pipeline", str(tmp_path / "job.json")], check=True)
-        made.append(out.read_bytes())
-    assert made[0] == made[1]
+        outputs.append(out.read_bytes())
+    assert outputs[0] == outputs[1]
 
 
 def test_where_sees_classes_without_flags(write_las, tmp_path, model):
@@ -170,9 +170,9 @@ def test_all_extra_dimensions_of_a_new_file(tmp_path, run_job, write_las, tiles)
     ]
     code, _, err = run_job(stages, *(["--tile", 20, "--workers", 0] if tiles else []))
     assert code == 0, err
-    made = laspy.read(tmp_path / "o.las")
+    written = laspy.read(tmp_path / "o.las")
     names = [
-        name for name in made.point_format.extra_dimension_names if name != "ClassFlags"
+        name for name in written.point_format.extra_dimension_names if name != "ClassFlags"
     ]  # of old PDAL
     assert names == [
         "Red",
@@ -183,8 +183,8 @@ def test_all_extra_dimensions_of_a_new_file(tmp_path, run_job, write_las, tiles)
         "Reference",
         "HeightAboveGround",
     ]
-    assert np.array_equal(made.Amplitude, arrays["Amplitude"])
-    assert np.array_equal(all_flags(laspy.read(source)), all_flags(made))
+    assert np.array_equal(written.Amplitude, arrays["Amplitude"])
+    assert np.array_equal(all_flags(laspy.read(source)), all_flags(written))
 
 
 def test_kept_codes_that_do_not_fit_are_refused(tmp_path, run, write_las, model):
@@ -215,10 +215,10 @@ def test_noise_and_withheld_points_are_not_there(tmp_path, run, write_las, model
     out = {}
     for name, arrays in (("clean", clean), ("bad", bad)):
         source = write_las(tmp_path / f"{name}.las", arrays, point_format=point_format)
-        code, said, err = run("classify", source, tmp_path / "o.las", "--model", model)
+        code, output, err = run("classify", source, tmp_path / "o.las", "--model", model)
         assert code == 0, err
         out[name] = laspy.read(tmp_path / "o.las")
-    assert "noise and withheld points, not classified (ignore)" in said and "120" in said
+    assert "noise and withheld points, not classified (ignore)" in output and "120" in output
     for name in ("classification", "Reliability", "HeightAboveGround"):
         assert np.array_equal(np.asarray(out["bad"][name])[:n], np.asarray(out["clean"][name])), (
             name
@@ -234,13 +234,13 @@ def test_overlap_is_a_neighbor_and_keeps_its_class(tmp_path, run, write_las, mod
     source = write_las(tmp_path / "in.las", arrays, point_format=1)
     reliability = {}
     for words in ((), ("--filters.modelclassifier.keep=",)):
-        code, said, err = run("classify", source, tmp_path / "o.las", "--model", model, *words)
+        code, output, err = run("classify", source, tmp_path / "o.las", "--model", model, *words)
         assert code == 0, err
         out = laspy.read(tmp_path / "o.las")
         assert np.array_equal(
             np.asarray(out.classification) == 12, (arrays["Classification"] == 12) & (not words)
         )
-        assert ("class kept (keep)" in said) == (not words)
+        assert ("class kept (keep)" in output) == (not words)
         reliability[words] = np.asarray(out.Reliability)
     others = arrays["Classification"] != 12
     assert np.array_equal(*(values[others] for values in reliability.values()))
@@ -261,8 +261,8 @@ def test_features_and_training_without_unwanted_points(tmp_path, capsys, write_l
             "neighborhoods": "k5",
             "feature_set": "covariance",
         }
-        made = ps.run_pipeline([str(source), planarity])
-        features.append(made.arrays[0]["Planarity_k5"])
+        job = ps.run_pipeline([str(source), planarity])
+        features.append(job.arrays[0]["Planarity_k5"])
         writer = {
             "type": "writers.classifiermodel",
             "filename": str(tmp_path / "m.model"),

@@ -225,10 +225,10 @@ def test_row(number, request, scenes, models, tmp_path, capfd):
         outputs[0].unlink()
         assert main([*command, "--resume"]) == 0, capfd.readouterr().err
         assert outputs[0].read_bytes() == before
-    found = columns(*np.concatenate([*map(read_back, outputs)]).T)
+    result = columns(*np.concatenate([*map(read_back, outputs)]).T)
     las = row["writer"] != "text"
     wanted = expected(row, files, model, las and laspy.read(outputs[0]).point_format.id < 6)
-    codes, right = found[:, 3].astype(int), wanted[:, 3].astype(int)
+    codes, right = result[:, 3].astype(int), wanted[:, 3].astype(int)
     assert np.array_equal(np.bincount(codes), np.bincount(right))
-    assert np.abs(found[:, :3] - wanted[:, :3]).max() <= 10.5  # a centimeter, in writers of LAS
+    assert np.abs(result[:, :3] - wanted[:, :3]).max() <= 10.5  # a centimeter, in writers of LAS
     assert (codes == right).mean() > (0.9 if las else 0.9999)

@@ -62,9 +62,9 @@ def test_the_table_holds(cloud, mode, token, size):
     enough = many >= 4  # PDAL leaves out points with fewer than three neighbors
     assert np.count_nonzero(enough) > 900
     for name, (named, modes, scaled) in TABLE.items():
-        mine = scaled(array[f"{name}_{suffix}"].astype(float), many)[enough]
-        same = np.allclose(mine, array[named][enough], rtol=2e-4, atol=2e-5)
-        assert same == (mode in modes), (name, mode, np.abs(mine - array[named][enough]).max())
+        inside = scaled(array[f"{name}_{suffix}"].astype(float), many)[enough]
+        same = np.allclose(inside, array[named][enough], rtol=2e-4, atol=2e-5)
+        assert same == (mode in modes), (name, mode, np.abs(inside - array[named][enough]).max())
 
 
 @pytest.mark.pdal
@@ -98,5 +98,5 @@ def test_the_table_of_the_docs_is_this_one():
         ]
         cells = [cell.strip() for cell in row.split("|")[1:-1]]
         assert f"`{named}`" in cells[1] or cells[1] == "the same", row
-        said = set(re.findall(r"`(\w+)`", cells[2])) or {"raw", "sqrt", "normalized"}
-        assert said == set(modes), row
+        output = set(re.findall(r"`(\w+)`", cells[2])) or {"raw", "sqrt", "normalized"}
+        assert output == set(modes), row

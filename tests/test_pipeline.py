@@ -120,16 +120,17 @@ def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     pipelines = [ps.Pipeline(each) for each in (stages, alone)]
     plain, tagged = (fuse_scripts(pipeline.expanded.stages) for pipeline in pipelines)
     assert tagged == pipelines[1].expanded.stages
-    several = [[one["stage"] for one in stage["pdalargs"]["stages"]] for stage in plain[1:]]
+    several = [[entry["stage"] for entry in stage["pdalargs"]["stages"]] for stage in plain[1:]]
     types = [stage["type"] for stage in stages[1:]]
     assert several == [types[:3], types[3:]]  # the classifier ends a row: it gives memory back
-    found, expected = ([pipeline.execute(), *pipeline.arrays][1] for pipeline in pipelines)
-    assert found["Slope"].any()
-    assert found["Ground"].any()
+    result, expected = ([pipeline.execute(), *pipeline.arrays][1] for pipeline in pipelines)
+    assert result["Slope"].any()
+    assert result["Ground"].any()
     for name in expected.dtype.names:
-        assert found[name].tobytes() == expected[name].tobytes(), name
+        assert result[name].tobytes() == expected[name].tobytes(), name
     reports = [
-        [[one.to_dict() for one in each] for _, each in pipeline.reports] for pipeline in pipelines
+        [[entry.to_dict() for entry in each] for _, each in pipeline.reports]
+        for pipeline in pipelines
     ]
     assert reports[0] == reports[1]
 
@@ -167,8 +168,8 @@ def test_codes_above_31_in_laz_14(tmp_path, write_las, wide_model, tiles):
             run_tiled(stages, 10_000, workers=0, per=tiles)
         else:
             ps.run_pipeline(stages)
-        (made,) = tmp_path.glob("out_*.laz")
-        las = laspy.read(made)
+        (outputs,) = tmp_path.glob("out_*.laz")
+        las = laspy.read(outputs)
         assert las.header.point_format.id == 7 and las.header.are_points_compressed
         assert np.flatnonzero(las.classification == 65).tolist() == [7] and las.withheld[7]
         if model:
@@ -176,7 +177,7 @@ def test_codes_above_31_in_laz_14(tmp_path, write_las, wide_model, tiles):
         else:
             assert np.array_equal(las.classification, arrays["Classification"])
         assert np.array_equal(las.gps_time, laspy.read(source).gps_time)
-        made.unlink()
+        outputs.unlink()
     assert [path.name for path in tmp_path.iterdir() if path.name[0] == "."] in (
         [],
         [".pdal-stages"],

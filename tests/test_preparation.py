@@ -18,34 +18,34 @@ _PATHS = ("filename", "mapping", "string")
 
 
 CARRIED = {name: kind.in_models for name, kind in stage_types().items() if kind.in_models} | {
-    name: tuple(one.name for one in options) for name, options in PDAL_OPTIONS.items()
+    name: tuple(entry.name for entry in options) for name, options in PDAL_OPTIONS.items()
 }
 
 
 def test_no_option_that_holds_a_path_is_carried():
     for kind in stage_types().values():
-        declared = {one.name: one.kind for one in kind.all_options()}
+        declared = {entry.name: entry.kind for entry in kind.all_options()}
         assert not any(declared[name] in _PATHS for name in kind.in_models), kind.type
         assert not {"threads", "horizontal_unit", "vertical_unit"} & set(kind.in_models)
         assert not (kind.in_models and "filename" in declared.values()), kind.type
 
 
 def test_one_spelling():
-    given = {
+    known = {
         **HAG,
         "cell": "2.0",
         "ground": "TRUE",
         "openings": "5, 17",
         "ignore": "7,Withheld[1:1]",
     }
-    assert check([given]) == [
+    assert check([known]) == [
         {**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": ["7", "Withheld[1:1]"]}
     ]
     assert same(
-        [given],
+        [known],
         [{**HAG, "cell": 2, "ground": True, "openings": [5, 17], "ignore": [7, "Withheld[1:1]"]}],
     )
-    assert check(check([given])) == check([given])
+    assert check(check([known])) == check([known])
     bracket = {**HAG, "ignore": "7,Z[0:2)"}
     assert check(check([bracket]))[0]["ignore"] == ["7", "Z[0:2)"]
     both = [{"type": "filters.smrf", "ignore": "Classification[7:7]"}, {"type": "filters.hag_nn"}]

@@ -107,8 +107,8 @@ def test_tiles_to_tiles(ready_town, ready_halves, ready_models, tmp_path):
     corners = set()
     for part in parts:  # tiles of one grid, none a sliver of half a meter
         cells = {axis: set(np.unique(np.asarray(part[axis]) // 40)) for axis in "xy"}
-        assert all(len(found) == 1 for found in cells.values()), cells
-        corners.add(tuple(found.pop() for found in cells.values()))
+        assert all(len(result) == 1 for result in cells.values()), cells
+        corners.add(tuple(result.pop() for result in cells.values()))
     assert len(corners) == 4
 
 
@@ -179,7 +179,7 @@ def raster(path):
 @pytest.mark.parametrize("program", ["pdal", "pdal-stages"])
 @pytest.mark.parametrize("everywhere", [(), ("Synthetic",)])
 def test_rasters_of_points_with_flags(tmp_path, write_las, pdal_program, program, everywhere):
-    made = []
+    outputs = []
     for point_format in (1, 6):
         source = flagged(write_las, tmp_path / f"{point_format}.las", point_format, everywhere)
         rasters = {kind: tmp_path / f"{kind}{point_format}.tif" for kind in ("surface", "terrain")}
@@ -189,8 +189,8 @@ def test_rasters_of_points_with_flags(tmp_path, write_las, pdal_program, program
             subprocess.run([*command, *words(source, more=more)], check=True, capture_output=True)
         else:
             run("terrain-and-surface", source, more=more)
-        made += map(raster, rasters.values())
-    for old, new in zip(made[:2], made[2:], strict=True):
+        outputs += map(raster, rasters.values())
+    for old, new in zip(outputs[:2], outputs[2:], strict=True):
         assert len(old) in range(39**2, 42**2) and np.array_equal(old, new)
         assert np.abs(old[old != -9999]).max() < 1
 

@@ -61,16 +61,16 @@ def test_the_networks_recipe():
 
 @pytest.mark.parametrize("name", [*RECIPES])
 def test_what_is_given_beside_a_recipe_replaces_its_value(name):
-    given = {"type": "writers.classifiermodel", "filename": "a.model", "recipe": name, "target": 6}
+    known = {"type": "writers.classifiermodel", "filename": "a.model", "recipe": name, "target": 6}
     if "binary" not in name:
-        del given["target"]
-    stage = stage_from({**given, "voxel": 0.5, "count": 77})
+        del known["target"]
+    stage = stage_from({**known, "voxel": 0.5, "count": 77})
     assert (stage.voxel, stage.count) == (0.5, 77)
     for option, (value, where) in RECIPES[name].options.items():
         assert where
         if option not in ("voxel", "alsnet"):
-            found = stage.options[option]
-            assert found == (77 if option == "count" else _plain(value)), option
+            result = stage.options[option]
+            assert result == (77 if option == "count" else _plain(value)), option
     assert f"  {name} " in describe_recipes() and NOT_STATED in describe_recipes()
 
 

@@ -77,9 +77,14 @@ def test_units_of_two_kinds(tmp_path, inputs, one, two):
     for way in ways(tmp_path, inputs(one, two)):
         with pytest.raises(StageError, match="the inputs have different units of length") as caught:
             way()
-        said = str(caught.value)
-        assert "0.304801 m" in said and "1 m" in said and "in0.las" in said and "in1.las" in said
-        assert ("as there is no spatial reference" in said) == (two is None)
+        message = str(caught.value)
+        assert (
+            "0.304801 m" in message
+            and "1 m" in message
+            and "in0.las" in message
+            and "in1.las" in message
+        )
+        assert ("as there is no spatial reference" in message) == (two is None)
     assert not list(tmp_path.glob("o_*")) and not (tmp_path / "whole.las").exists()
 
 
@@ -141,9 +146,11 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
     whole.execute()
     writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
     for messages in (whole.messages, run_tiled([*stages, writer], 40, workers=0).messages):
-        said = [one for one in messages if "assumed to have that of the other inputs" in one]
-        assert len(said) == (1 if any(references) else 0)
-        for line in said:
+        message = [
+            entry for entry in messages if "assumed to have that of the other inputs" in entry
+        ]
+        assert len(message) == (1 if any(references) else 0)
+        for line in message:
             assert (
                 f"{tmp_path / 'in1.las'}, {tmp_path / 'in3.las'} have no spatial reference" in line
             )
@@ -156,12 +163,12 @@ def test_an_output_without_a_reference_is_said(tmp_path, inputs):
         {"type": "filters.hag_minima"},
         {"type": "writers.las", "filename": str(tmp_path / "o_#.las"), "forward": "all"},
     ]
-    for options, given in (({}, False), ({"default_srs": METERS}, True)):
+    for options, known in (({}, False), ({"default_srs": METERS}, True)):
         run = run_tiled([{**stages[0], **options}, *stages[1:]], 40, workers=0)
-        said = " ".join(run.messages)
-        assert ("the output gets none: --readers.las.default_srs=EPSG:CODE" in said) != given
+        message = " ".join(run.messages)
+        assert ("the output gets none: --readers.las.default_srs=EPSG:CODE" in message) != known
         out = laspy.read(tmp_path / "o_in1.las")
-        assert any(one.user_id == "LASF_Projection" for one in out.vlrs) == given
+        assert any(entry.user_id == "LASF_Projection" for entry in out.vlrs) == known
 
 
 def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, capsys):
@@ -210,7 +217,7 @@ KINDS = [
 def referenced(path, reference):
     """Give a LAS file a spatial reference; its coordinates stay."""
     las = laspy.read(path)
-    las.vlrs[:] = [one for one in las.vlrs if one.user_id != "LASF_Projection"]
+    las.vlrs[:] = [entry for entry in las.vlrs if entry.user_id != "LASF_Projection"]
     las.header.global_encoding.wkt = isinstance(reference, str)
     if isinstance(reference, str):
         las.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(reference))
@@ -233,15 +240,17 @@ def test_commands_and_stages_take_the_same_units(
         tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), 6 if minor == 4 else 1
     )
     referenced(path, reference)
-    found = reference_of_file(str(path))
-    assert (found.units.horizontal, found.units.vertical) == pytest.approx(units)
+    reference_values = reference_of_file(str(path))
+    assert (reference_values.units.horizontal, reference_values.units.vertical) == pytest.approx(
+        units
+    )
     seen = []
     monkeypatch.setattr(
         HagMinima, "run", lambda self, points, context: seen.append(points.units) or {}
     )
     ps.run_pipeline([str(path), {"type": "filters.hag_minima"}])
-    assert seen == [found.units]
-    part = horizontal_part(found.wkt)
+    assert seen == [reference_values.units]
+    part = horizontal_part(reference_values.wkt)
     assert part.startswith("PROJCS[") and part.endswith("]") and "VERT" not in part
     assert units_of_wkt(part).horizontal == pytest.approx(units[0])
     assert reference_of_file(str(path), "ft", "m").units == Units(FOOT, 1.0)
@@ -313,8 +322,8 @@ def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, wri
     assert run("classify", path, out, "--objects", tmp_path / "c.gpkg")[0] == 0
     by_stage(out, "d.gpkg")
     same(buildings("c.gpkg"), buildings("d.gpkg"))
-    found = laspy.read(out)
-    assert 3 < np.percentile(found.HeightAboveGround, 99) < np.ptp(z)
+    written = laspy.read(out)
+    assert 3 < np.percentile(written.HeightAboveGround, 99) < np.ptp(z)
 
 
 @pytest.mark.parametrize(("slope", "top"), [(0.0, 40.0), (0.7, 26.0)])

@@ -92,13 +92,13 @@ def on_top(base, keep=None, n=40, **more):
 
 def test_a_file_holds_the_base(base, tmp_path):
     model = on_top(base)
-    assert [one.name for one in model.passes] == ["random_forest"] * 2 + ["refined_forest"]
+    assert [entry.name for entry in model.passes] == ["random_forest"] * 2 + ["refined_forest"]
     assert model.voxel == base.voxel and model.halo_m > base.halo_m
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
     xyz, _, dimensions = scene(seed=7, n=4000)
-    one, two = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
-    assert np.array_equal(one.probabilities, two.probabilities)
+    entry, two = (m.predict(xyz, dimensions, probabilities=True) for m in (model, again))
+    assert np.array_equal(entry.probabilities, two.probabilities)
     again.save(tmp_path / "n.model")
     assert (tmp_path / "n.model").read_bytes() == (tmp_path / "m.model").read_bytes()
     assert "refined forest" in str(again)
@@ -108,9 +108,9 @@ def leaves(value, at=()):
     """Yield the path of everything in a manifest; of a list, its first entry."""
     yield at
     inside = enumerate(value[:1]) if isinstance(value, list) else ()
-    for key, one in value.items() if isinstance(value, dict) else inside:
+    for key, single in value.items() if isinstance(value, dict) else inside:
         if key != "arrays":
-            yield from leaves(one, (*at, key))
+            yield from leaves(single, (*at, key))
 
 
 def test_odd_numbers_anywhere_in_a_manifest(base, tmp_path):
@@ -135,8 +135,8 @@ def test_odd_numbers_anywhere_in_a_manifest(base, tmp_path):
                 model = load_model(tmp_path / "odd.model")
                 str(model)
                 if at[0] in ("passes", "priors"):
-                    found = model.predict(xyz, dimensions, probabilities=True).probabilities
-                    assert np.allclose(found.sum(axis=1), 1.0, atol=1e-6), (at, odd)
+                    prediction = model.predict(xyz, dimensions, probabilities=True).probabilities
+                    assert np.allclose(prediction.sum(axis=1), 1.0, atol=1e-6), (at, odd)
             except StageError as error:
                 refused += 1
                 assert "odd.model" in str(error), (at, odd)
@@ -167,8 +167,8 @@ def test_a_new_class_is_learnt(base, new):
     assert set(model.codes.tolist()) == {*base.codes.tolist(), new}
     if new == 1:  # and is one for who trains on top of it, even if its label often tells nothing
         assert new in label_classes([cloud], TrainingOptions(**FEW, base=model)).classes.codes
-    found = model.predict(xyz, dimensions).classification
-    assert (found == label).mean() > (
+    predicted = model.predict(xyz, dimensions).classification
+    assert (predicted == label).mean() > (
         base.predict(xyz, dimensions).classification == label
     ).mean() + 0.05
 
@@ -187,8 +187,8 @@ def test_every_label_counts(base):
         TrainingCloud(xyz, label, dimensions, mask=few > 0),
     ):
         model = train([cloud], options, progress=False)
-        told = sum(one["available"] for one in model.info["classes"])
-        assert told == voxels
+        reported = sum(entry["available"] for entry in model.info["classes"])
+        assert reported == voxels
 
 
 def test_what_cannot_be_built_on(base):
@@ -224,7 +224,7 @@ def test_a_manifest_that_contradicts_itself(base, tmp_path, change):
     manifest = json.loads(json.dumps(model.manifest()))
     change(manifest["passes"])
     with pytest.raises(ModelError):
-        model_file.write(tmp_path / "m", manifest, [one.arrays() for one in model.passes])
+        model_file.write(tmp_path / "m", manifest, [entry.arrays() for entry in model.passes])
         load_model(tmp_path / "m")
 
 
@@ -258,9 +258,9 @@ def test_equals_the_rule_by_hand(base):
     columns = reference(xyz, of_the_base(base, xyz, dimensions), rows, last.context)
     values = computed(last.features, xyz, dimensions)[rows]
     grown = last.forest.predict_proba(np.hstack([values, columns]))
-    own = columns[:, : len(base.codes)].astype(float)
-    own /= own.sum(axis=1, keepdims=True)
-    p = by_hand(own, grown, last.blend.before, list(last.blend.labeled), last.blend.trusted)
+    ours = columns[:, : len(base.codes)].astype(float)
+    ours /= ours.sum(axis=1, keepdims=True)
+    p = by_hand(ours, grown, last.blend.before, list(last.blend.labeled), last.blend.trusted)
     got = model.predict(xyz, dimensions, probabilities=True).probabilities[rows]
     assert np.allclose(got, p, atol=1e-6)
 
@@ -283,15 +283,15 @@ def test_through_pdal(tmp_path, write_las):
     }
     heights = ps.load_model("standard").info["preparation"]
     ps.run_pipeline([str(source), *heights, {**writer, "classes": "2,6,11", "count": 200}])
-    made = ps.load_model(model)
-    assert made.codes.tolist() == [2, 5, 6, 11]
-    assert made.info["base"]["name"] == "standard" and len(made.info["base"]["sha256"]) == 64
+    loaded = ps.load_model(model)
+    assert loaded.codes.tolist() == [2, 5, 6, 11]
+    assert loaded.info["base"]["name"] == "standard" and len(loaded.info["base"]["sha256"]) == 64
     assert (
-        f"on top of       standard, the passes before (SHA-256 {made.info['base']['sha256']})"
-        in str(made)
+        f"on top of       standard, the passes before (SHA-256 {loaded.info['base']['sha256']})"
+        in str(loaded)
     )
-    assert made.info["preparation"] == ps.load_model("standard").info["preparation"]
+    assert loaded.info["preparation"] == ps.load_model("standard").info["preparation"]
     classify = {"type": "filters.modelclassifier", "model": str(model)}
     ps.run_pipeline([str(source), *heights, classify, str(tmp_path / "out.las")])
-    found = np.asarray(laspy.read(tmp_path / "out.las").classification)
-    assert 11 in found and ((found == 6) == (label == 6)).mean() > 0.9
+    predicted = np.asarray(laspy.read(tmp_path / "out.las").classification)
+    assert 11 in predicted and ((predicted == 6) == (label == 6)).mean() > 0.9

@@ -176,10 +176,10 @@ def test_odd_accuracies_make_a_page(a):
 
 
 def embedded(text):
-    found = re.findall(r'src="data:image/png;base64,([^"]+)"', text)
+    images = re.findall(r'src="data:image/png;base64,([^"]+)"', text)
     return [
         np.asarray(Image.open(io.BytesIO(base64.b64decode(data, validate=True))).convert("RGB"))
-        for data in found
+        for data in images
     ]
 
 

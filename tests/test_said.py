@@ -87,12 +87,12 @@ def test_what_cannot_run_is_not_valid(cloud, tmp_path, run_job, stage, says):
 
 def test_dimensions_that_a_file_or_a_stage_brings_are_valid(tmp_path, run_job, write_las):
     xyz = dict(zip("XYZ", np.random.default_rng(0).uniform(0, 9, (3, 50)), strict=True))
-    mine = write_las(
+    inside = write_las(
         tmp_path / "mine.las", {**xyz, "Reference": np.full(50, 2, "u1")}, point_format=6
     )
     plain = write_las(tmp_path / "plain.las", xyz, point_format=6)
     ferry = {"type": "filters.ferry", "dimensions": "Classification=>Reference"}
-    for stages in ([mine], [plain, ferry]):
+    for stages in ([inside], [plain, ferry]):
         assert run_job([*stages, {"type": "filters.accuracy"}], command="validate")[0] == 0
     assert run_job([plain, {"type": "filters.accuracy"}], command="validate")[0] == 1
 

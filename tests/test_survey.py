@@ -34,21 +34,21 @@ OPTIONS = ("--filters.hag_minima.cell=5", "--no-progress")
 def survey(tmp_path_factory, write_las):
     """A town as one file, as four that meet inside it, and a model; one of the four has an extra dimension of its own."""
     base = tmp_path_factory.mktemp("survey")
-    made, xyz, keep = clouds.town()
+    points, xyz, keep = clouds.town()
     arrays = {
         **dict(zip("XYZ", xyz[keep].T, strict=True)),
         "Classification": np.where(np.arange(keep.sum()) % 97, 1, 7).astype("u1"),
-        "GpsTime": made.gps_time[keep],
+        "GpsTime": points.gps_time[keep],
     }
     how = {"point_format": 6, "wkt": WKT, "scale": 0.001, "offset": (499_000.0, 5_399_000.0, 0.0)}
     write_las(base / "town.laz", arrays, **how)
     (base / "in").mkdir()
     east, north = arrays["X"] >= 500_047.0, arrays["Y"] >= 5_400_041.0
     for number in range(4):
-        mine = (east == bool(number & 1)) & (north == bool(number & 2))
-        part = {name: values[mine] for name, values in arrays.items()}
+        inside = (east == bool(number & 1)) & (north == bool(number & 2))
+        part = {name: values[inside] for name, values in arrays.items()}
         if number == 0:
-            part["Amplitude"] = np.arange(mine.sum(), dtype="f4")
+            part["Amplitude"] = np.arange(inside.sum(), dtype="f4")
         write_las(base / "in" / f"t{number}.{'las' if number == 1 else 'laz'}", part, **how)
     clouds.model(base / "m.model", "c1,s2", "covariance")
     return base
@@ -100,10 +100,10 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(
         "t2.laz",
         "t3.laz",
     ]
-    one = values(whole)
+    single = values(whole)
     other = values(*target.glob("t*"))
-    for name in one:
-        assert np.array_equal(one[name], other[name]), name
+    for name in single:
+        assert np.array_equal(single[name], other[name]), name
     extra = {
         p.name: sorted(laspy.read(p).point_format.extra_dimension_names) for p in target.glob("t*")
     }
@@ -123,19 +123,19 @@ def test_a_survey_has_no_seams_and_a_second_run_does_what_is_missing(
         for axis in ("X", "Y", "Z", "gps_time"):
             assert np.array_equal(one_file[axis], other_file[axis])
     # Every file is said when it is there, with its classes; the table has them all.
-    said = dict(re.findall(r"(t\d)\.la.: ([\d,]+) points; ", out))
-    assert {name: int(n.replace(",", "")) for name, n in said.items()} == {
+    output = dict(re.findall(r"(t\d)\.la.: ([\d,]+) points; ", out))
+    assert {name: int(n.replace(",", "")) for name, n in output.items()} == {
         path.stem: len(laspy.read(path)) for path in target.glob("t*")
     }
-    codes, counts = np.unique(one["classification"], return_counts=True)
+    codes, counts = np.unique(single["classification"], return_counts=True)
     table = {
         int(c): int(n.replace(",", ""))
         for c, n in re.findall(r"^ +(\d+) .*?([\d,]+)$", out, re.MULTILINE)
     }
     assert table == dict(zip(codes.tolist(), counts.tolist(), strict=True))
-    found = json.loads((tmp_path / "m.json").read_text())
-    assert len(found["outputs"]) == 4 and sum(o["written"] for o in found["outputs"]) == len(
-        one["classification"]
+    data = json.loads((tmp_path / "m.json").read_text())
+    assert len(data["outputs"]) == 4 and sum(o["written"] for o in data["outputs"]) == len(
+        single["classification"]
     )
 
     before = contents(target)
@@ -191,10 +191,10 @@ def test_a_report_needs_no_tiles(survey, classify, whole, tmp_path):
 def test_one_output_for_each_tile(survey, classify, whole, tmp_path):
     code, _, err = classify(survey / "in", tmp_path / "out/", "--tile", 45, "--per", "tile")
     assert code == 0, err
-    made = list((tmp_path / "out").glob("*.laz"))
-    assert len(made) == 6 and all(re.fullmatch(r"\d+_\d+\.laz", path.name) for path in made)
+    outputs = list((tmp_path / "out").glob("*.laz"))
+    assert len(outputs) == 6 and all(re.fullmatch(r"\d+_\d+\.laz", path.name) for path in outputs)
     for name, array in values(whole).items():
-        assert np.array_equal(array, values(*made)[name]), name
+        assert np.array_equal(array, values(*outputs)[name]), name
 
 
 def test_a_cloud_beyond_the_memory_is_cut(survey, classify, whole, tmp_path):
@@ -236,15 +236,15 @@ def test_the_side_of_tiles_keeps_to_the_memory(density, memory, halo):
         Extent(int(density * 10**6), (i * 1000.0, 0.0, (i + 1) * 1000.0, 1000.0))
         for i in range(100)
     ]
-    found = Density.measure(extents)
+    result = Density.measure(extents)
     options = TilingOptions(memory=int(memory), workers=None)
     try:
-        chosen, _ = choose_tiles(options, found, halo, True)
+        chosen, _ = choose_tiles(options, result, halo, True)
     except OptionError:
-        least = worker_bytes(found.read_by(1.0, halo), found.largest) + PARENT
+        least = worker_bytes(result.read_by(1.0, halo), result.largest) + PARENT
         assert least > memory  # nothing would have fitted
         return
-    used = PARENT + chosen.workers * worker_bytes(found.read_by(chosen.tile, halo), found.largest)
+    used = PARENT + chosen.workers * worker_bytes(result.read_by(chosen.tile, halo), result.largest)
     assert used <= memory and chosen.workers >= 1 and chosen.tile > 0
 
 

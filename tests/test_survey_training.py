@@ -52,10 +52,10 @@ def test_surveys_of_two_reference_systems_are_left_out_in_turn(tmp_path, write_l
     out = capsys.readouterr().out
     assert "surveys held out" in out.splitlines()[0]
     info = ps.load_model(tmp_path / "m.model").info
-    found = info["accuracy"]["cross_validation"]
-    assert (found["by"], found["folds"]) == ("surveys", 3)
-    assert found["chosen"]["overall_accuracy"] > 0.9
-    assert [one["name"] for one in info["training"]["clouds"]] == ["t0", "t1", "t2"]
+    score = info["accuracy"]["cross_validation"]
+    assert (score["by"], score["folds"]) == ("surveys", 3)
+    assert score["chosen"]["overall_accuracy"] > 0.9
+    assert [entry["name"] for entry in info["training"]["clouds"]] == ["t0", "t1", "t2"]
 
     wide = ["--filters.hag_morphological.window=20", "--writers.classifiermodel.dimensions=Ground"]
     assert main([*words, *QUICK_WORDS, *telling, *wide, "--surveys"]) == 0
@@ -79,9 +79,9 @@ def test_it_is_said_that_there_is_no_score_and_what_to_label_next(tmp_path, writ
         main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS])
         == 0
     )
-    said = capsys.readouterr()
-    assert "there is no score on ground held out" in said.err and "6 Building" in said.err
-    assert "Label next" in said.err and "not scored" in said.out
+    output = capsys.readouterr()
+    assert "there is no score on ground held out" in output.err and "6 Building" in output.err
+    assert "Label next" in output.err and "not scored" in output.out
     info = ps.load_model(tmp_path / "m.model").info
     assert info["accuracy"]["cross_validation"] is None and "sureness" not in info
     assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS,

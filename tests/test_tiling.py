@@ -35,15 +35,15 @@ def model_file(tmp_path_factory, pdal_module):
 @pytest.fixture(scope="session")
 def town_file(tmp_path_factory, write_las):
     """A town with a hole and points on edges, with an extra dimension."""
-    made, xyz, keep = clouds.town()
+    points, xyz, keep = clouds.town()
     arrays = {
         "X": xyz[keep, 0],
         "Y": xyz[keep, 1],
         "Z": xyz[keep, 2],
-        "Intensity": made.intensity[keep],
-        "Classification": made.classification[keep],
-        "GpsTime": made.gps_time[keep],
-        "TrueHeight": made.height_above_ground[keep],
+        "Intensity": points.intensity[keep],
+        "Classification": points.classification[keep],
+        "GpsTime": points.gps_time[keep],
+        "TrueHeight": points.height_above_ground[keep],
     }
     path = tmp_path_factory.mktemp("tiling") / "town.laz"
     return write_las(
@@ -103,8 +103,8 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
 def test_pdals_filters_see_one_file_at_a_time(tmp_path, random_cloud, write_las):
     """As in a pipeline without tiles, until a stage of ours merges the files."""
     xyz = random_cloud(4_000, seed=2, extent=(40, 40, 3))
-    for name, mine in (("a", xyz[:, 0] < 20), ("b", xyz[:, 0] >= 20)):
-        write_las(tmp_path / f"{name}.las", dict(zip("XYZ", xyz[mine].T, strict=True)))
+    for name, inside in (("a", xyz[:, 0] < 20), ("b", xyz[:, 0] >= 20)):
+        write_las(tmp_path / f"{name}.las", dict(zip("XYZ", xyz[inside].T, strict=True)))
     filters = [
         {"type": "filters.radialdensity", "radius": 2.0},
         {"type": "filters.hag_minima", "cell": 3},
@@ -162,7 +162,7 @@ def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole
     out = tmp_path / "out.laz"
     assert not run_tiled(clouds.stages([town_file], out, model_file), 60, workers=0).failures
     clouds.same_points(whole, out)
-    one, two = laspy.read(whole).header, laspy.read(out).header
+    first, two = laspy.read(whole).header, laspy.read(out).header
     for name in (
         "mins",
         "maxs",
@@ -170,7 +170,7 @@ def test_large_files_are_written_in_parts(tmp_path, town_file, model_file, whole
         "generating_software",
         "point_count",
     ):
-        assert np.all(getattr(one, name) == getattr(two, name)), name
+        assert np.all(getattr(first, name) == getattr(two, name)), name
     # Automatic offsets would differ from part to part: such a file is written at once.
     stages = clouds.stages(
         [town_file], tmp_path / "auto.las", model_file, offset_x="auto", forward="vlr"
@@ -212,16 +212,16 @@ def test_input_files_that_do_not_match_the_tiles(tmp_path, town_file, model_file
     ends = np.cumsum([0, *(np.count_nonzero(part == n) for n in range(3))])
     names = {"classification": "Classification", "gps_time": "GpsTime", "intensity": "Intensity"}
     for number in range(3):
-        made, given_ = (
+        output, given_ = (
             laspy.read(tmp_path / f"c_part{number}.laz"),
             laspy.read(folder / f"part{number}.laz"),
         )
         expected = arrays[ends[number] : ends[number + 1]]
-        assert np.array_equal(made.points.array["X"], given_.points.array["X"])
-        assert np.array_equal(made.header.offsets, given_.header.offsets)
-        assert made.header.point_format.id == given_.header.point_format.id
+        assert np.array_equal(output.points.array["X"], given_.points.array["X"])
+        assert np.array_equal(output.header.offsets, given_.header.offsets)
+        assert output.header.point_format.id == given_.header.point_format.id
         for name in ("classification", "HeightAboveGround", "Reliability", "gps_time", "intensity"):
-            assert np.array_equal(made[name], expected[names.get(name, name)]), (number, name)
+            assert np.array_equal(output[name], expected[names.get(name, name)]), (number, name)
     run = run_tiled(
         [*pipeline[:-1], {**pipeline[-1], "filename": str(tmp_path / "t_#.laz")}],
         30,
@@ -303,8 +303,8 @@ def test_flag_bits_of_old_formats_stay_and_are_not_counted(
     assert not run.failures
     counted = np.zeros(256, int)
     for name in names.split():
-        made = laspy.read(tmp_path / f"o_{name}.laz")
-        codes = np.asarray(made.classification)
+        written = laspy.read(tmp_path / f"o_{name}.laz")
+        codes = np.asarray(written.classification)
         counted += np.bincount(codes, minlength=256)
         assert not codes[number % 2 == 1].any()  # withheld points keep theirs
         for flag, dimension in (
@@ -312,7 +312,7 @@ def test_flag_bits_of_old_formats_stay_and_are_not_counted(
             ("synthetic", "Synthetic"),
             ("key_point", "KeyPoint"),
         ):
-            assert np.array_equal(made[flag], flags[dimension]), (name, flag)
+            assert np.array_equal(written[flag], flags[dimension]), (name, flag)
     assert run.summary["classes"] == {str(c): int(counted[c]) for c in np.flatnonzero(counted)}
     assert set(run.summary["classes"]) == {"0", "2", "5", "6"}
 
@@ -534,21 +534,23 @@ def test_reports(tmp_path, town_file, model_file):
     assert dry["points"] == len(laspy.read(town_file)) and dry["disk_gb"] > 0
     assert main([*words, *names, "--metadata", str(tmp_path / "run.metadata")]) == 1
     assert json.loads((tmp_path / "run.metadata").read_text())["failures"]
-    told = json.loads((tmp_path / "r.json").read_text())
-    assert told["states"]["failed"] == 0 and told["failures"][0]["what"] == str(broken)
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["states"]["failed"] == 0 and report["failures"][0]["what"] == str(broken)
     assert (
-        sum(told["classes"].values()) == told["points"] == len(laspy.read(tmp_path / "c_town.laz"))
+        sum(report["classes"].values())
+        == report["points"]
+        == len(laspy.read(tmp_path / "c_town.laz"))
     )
-    assert sum(tile["points"] for tile in told["tiles"]) == told["points"]
+    assert sum(tile["points"] for tile in report["tiles"]) == report["points"]
     text = (tmp_path / "r.html").read_text()
-    assert "broken_town.laz" in text and "Ground" in text and f"{told['points']:,}" in text
+    assert "broken_town.laz" in text and "Ground" in text and f"{report['points']:,}" in text
     assert "<script" not in text and "http" not in text.split("</style>")[1]
     assert main([*words, *names, "--resume"]) == 1
     text = (tmp_path / "r.html").read_text()
-    assert f"{len(told['tiles'])} kept from an earlier run" in text and "job.json" in text
+    assert f"{len(report['tiles'])} kept from an earlier run" in text and "job.json" in text
     assert (
         Path(model_file).name in text
-        and f"{told['points']:,} more kept from an earlier run" in text
+        and f"{report['points']:,} more kept from an earlier run" in text
     )
 
 
@@ -558,7 +560,7 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
     folder = tmp_path / "in"
     folder.mkdir()
     kinds_of = {"a": (6, 0.01, 500_000.0), "b": (8, 0.001, 500_040.0), "c": (3, 0.01, 0.0)}
-    made = {}
+    output = {}
     for number, (name, (kind, scale, offset)) in enumerate(kinds_of.items()):
         xyz = (
             np.round(
@@ -572,7 +574,7 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
         if kind == 8:
             arrays["Infrared"] = rng.integers(0, 65536, 800)
         write_las(folder / f"{name}.laz", arrays, kind, offset=(offset, 0, 0), scale=scale)
-        made[name] = arrays
+        output[name] = arrays
     task = ClassifyTask(
         (str(folder),), str(tmp_path / "out"), options=TilingOptions(tile=40, per="tile", workers=0)
     )
@@ -584,11 +586,11 @@ def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, w
         (tile.header.version.minor, tile.point_format.id, tile.header.scales[0]) for tile in tiles
     } == {(4, 8, 0.001)}
     got = np.concatenate([np.round(np.asarray(tile.x) * 1000) for tile in tiles])
-    want = np.concatenate([np.round(arrays["X"] * 1000) for arrays in made.values()])
+    want = np.concatenate([np.round(arrays["X"] * 1000) for arrays in output.values()])
     assert np.array_equal(np.sort(got), np.sort(want))
-    for field, name, of in (("nir", "Infrared", "b"), ("red", "Red", "bc")):
+    for field, name, part in (("nir", "Infrared", "b"), ("red", "Red", "bc")):
         kept = np.concatenate([np.asarray(tile[field]) for tile in tiles])
-        assert kept.astype(int).sum() == sum(int(made[each][name].sum()) for each in of)
+        assert kept.astype(int).sum() == sum(int(output[each][name].sum()) for each in part)
 
 
 @pytest.mark.parametrize("at_once", [10_000, 50])
@@ -603,7 +605,7 @@ def test_a_reference_that_stands_after_the_points(
     records = [laspy.VLR("LASF_Projection", 2112, "", wkt), laspy.VLR("mine", 7, "", b"hello")]
     las.header.global_encoding.wkt, las.evlrs = True, laspy.vlrs.vlrlist.VLRList(records)
     las.write(tmp_path / "in.las")
-    made = []
+    outputs = []
     for name, run in (
         ("whole", ps.run_pipeline),
         ("tiles", lambda job: run_tiled(job, 20, workers=0)),
@@ -611,12 +613,12 @@ def test_a_reference_that_stands_after_the_points(
         out = str(tmp_path / f"{name}.las")
         run([str(tmp_path / "in.las"), {"type": "filters.hag_minima", "cell": 5},
              {"type": "writers.las", "filename": out, "forward": "all", "extra_dims": "all"}])  # fmt: skip
-        made.append(laspy.read(out))
-    heights = [np.asarray(one["HeightAboveGround"]) for one in made]
+        outputs.append(laspy.read(out))
+    heights = [np.asarray(entry["HeightAboveGround"]) for entry in outputs]
     assert np.array_equal(*heights) and heights[0].any()
-    for one in made:
+    for entry in outputs:
         assert b"hello" in {
-            record.record_data_bytes() for record in [*one.vlrs, *(one.evlrs or [])]
+            record.record_data_bytes() for record in [*entry.vlrs, *(entry.evlrs or [])]
         }
 
 
@@ -630,6 +632,10 @@ def test_odd_headers_are_said_of_the_inputs_alone(tmp_path, town_file):
         writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
         job = [str(tmp_path / inputs), {"type": "filters.hag_minima", "cell": 5}, writer]
         run = run_tiled(job, 30, workers=0, dry_run=dry)
-        said = [message for message in run.messages if "box in its header" in message]
-        assert not run.failures and len(said) == 1 and said[0].startswith(f"{tmp_path}/odd0.laz: ")
-        assert more in said[0]
+        messages_text = [message for message in run.messages if "box in its header" in message]
+        assert (
+            not run.failures
+            and len(messages_text) == 1
+            and messages_text[0].startswith(f"{tmp_path}/odd0.laz: ")
+        )
+        assert more in messages_text[0]

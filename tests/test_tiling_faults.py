@@ -194,8 +194,8 @@ def test_resume_does_only_what_changed(tmp_path, expected, folder):
 
     assert again() == {"done": 0, "kept": 8, "failed": 0, "west": "kept", "east": "kept"}
     (tmp_path / "o_west.las").unlink()
-    found = again()
-    assert (found["west"], found["east"]) == ("done", "kept") and found["done"] == 4
+    result = again()
+    assert (result["west"], result["east"]) == ("done", "kept") and result["done"] == 4
     notes = sorted((tmp_path / ".pdal-stages" / "kept").iterdir())
     assert {path.suffix for path in notes} == {".json"}
     for number, path in enumerate(notes):
@@ -260,13 +260,13 @@ def test_the_workers_stop_too(tmp_path, folder, expected):
 
 def _workers(parent: int) -> list[int]:
     """Children that are workers, or about to become ones, not programs that were asked something."""
-    found = []
+    results = []
     for status in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
-            mine = int(status.read_text().rpartition(")")[2].split()[1]) == parent
-            if mine and b"spawn_main" in (status.parent / "cmdline").read_bytes():
-                found.append(int(status.parent.name))
-    return found
+            inside = int(status.read_text().rpartition(")")[2].split()[1]) == parent
+            if inside and b"spawn_main" in (status.parent / "cmdline").read_bytes():
+                results.append(int(status.parent.name))
+    return results
 
 
 def _lives(process: int) -> bool:
@@ -414,8 +414,8 @@ def test_damaged_results_are_made_anew(tmp_path, folder, expected, monkeypatch):
     for note in result.parent.glob(
         "*.json"
     ):  # of inputs; those of tiles are held against their marks
-        if "cells" in (found := json.loads(note.read_text())):
-            note.write_text(json.dumps({**found, "count": "x"}))
+        if "cells" in (data_values := json.loads(note.read_text())):
+            note.write_text(json.dumps({**data_values, "count": "x"}))
     run = run_tiled(stages, 20, workers=0, resume=True)
     assert (
         run.failures and "cannot be read back" in run.failures[0][1]

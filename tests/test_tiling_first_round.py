@@ -34,13 +34,13 @@ def test_the_lowest_points_of_cells(cell):
     x[:5] += 1e7  # strays
     z[7] = -1e7
     use = rng.random(3000) < 0.9
-    found = lowest_of_cells(x, y, z, use, cell)
+    lowest = lowest_of_cells(x, y, z, use, cell)
     best: dict[tuple[int, int], tuple] = {}
     for n in np.flatnonzero(use & (np.abs(z) < 1e6)):
         key = (int(np.floor(x[n] / cell)), int(np.floor(y[n] / cell)))
         best[key] = min(best.get(key, (np.inf,)), (z[n], x[n], y[n]))
-    assert {(z[n], x[n], y[n]) for n in found} == set(best.values())
-    assert len(found) == len(best)
+    assert {(z[n], x[n], y[n]) for n in lowest} == set(best.values())
+    assert len(lowest) == len(best)
     assert lowest_of_cells(x, y, z, np.zeros(3000, bool), cell).size == 0
 
 
@@ -52,8 +52,8 @@ def survey(tmp_path_factory, write_las):
     rng = np.random.default_rng(0)
     codes = np.where((height < 0) & (rng.random(len(x)) < 0.5), 7, 1).astype(np.uint8)
     paths = []
-    for name, mine in (("west", x < 270), ("east", x >= 270)):
-        arrays = {"X": x[mine], "Y": y[mine], "Z": z[mine], "Classification": codes[mine]}
+    for name, inside in (("west", x < 270), ("east", x >= 270)):
+        arrays = {"X": x[inside], "Y": y[inside], "Z": z[inside], "Classification": codes[inside]}
         paths.append(str(write_las(folder / f"{name}.las", arrays)))
     return paths
 
@@ -80,14 +80,14 @@ def of_files(folder, name):
     "before", [[{"type": "filters.detachednoise"}], [{"type": "filters.range", "limits": "Z[60:]"}]]
 )
 def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
-    made = in_tiles(survey, [*before, HEIGHTS], tmp_path / "out")
-    assert not made.failures
+    run = in_tiles(survey, [*before, HEIGHTS], tmp_path / "out")
+    assert not run.failures
     whole = np.concatenate(ps.run_pipeline([*survey, *before, HEIGHTS]).arrays)
     for name in MADE:
         assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
-    read = sum(job.record["read"] for job in made.tiles)
-    own = sum(job.record["points"] for job in made.tiles)
-    assert read <= 1.01 * own  # what noise marked is kept
+    read = sum(job.record["read"] for job in run.tiles)
+    ours = sum(job.record["points"] for job in run.tiles)
+    assert read <= 1.01 * ours  # what noise marked is kept
     assert not list((tmp_path / "out" / ".pdal-stages" / "kept").glob("*.np[yz]"))
 
 
@@ -156,25 +156,25 @@ def blocks_of(points, options, near):
     """The cells of all blocks that points need, each made of the lowest points that it may look at."""
     cell = options.cell
     low = around_blocks(*points, np.ones(points.shape[1], bool), options).T
-    side, around = BLOCK_SIDE * cell, (reach_of_block(options) + 1) * cell
+    side, surroundings = BLOCK_SIDE * cell, (reach_of_block(options) + 1) * cell
     inside = by_block(*points, np.ones(points.shape[1], bool), cell)
-    found = []
+    results = []
     for i in range(int(near[0] // side), int(near[2] // side) + 1):
         for j in range(int(near[1] // side), int(near[3] // side) + 1):
             box = (
-                i * side - around,
-                j * side - around,
-                (i + 1) * side + around,
-                (j + 1) * side + around,
+                i * side - surroundings,
+                j * side - surroundings,
+                (i + 1) * side + surroundings,
+                (j + 1) * side + surroundings,
             )
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
-            mine = inside.get((i, j), np.empty((0, 3)))
-            found.append(
-                cells_of_block(low[:, seen].T, (i, j), options, [mine[::2], mine[1::2]]).in_parts(
-                    256
-                )
+            members = inside.get((i, j), np.empty((0, 3)))
+            results.append(
+                cells_of_block(
+                    low[:, seen].T, (i, j), options, [members[::2], members[1::2]]
+                ).in_parts(256)
             )
-    return GroundCells.of_blocks(found, len(options.openings))
+    return GroundCells.of_blocks(results, len(options.openings))
 
 
 def test_thousands_of_lone_points_are_refused_before_any_of_them_is_worked_on(tmp_path, write_las):
@@ -182,12 +182,12 @@ def test_thousands_of_lone_points_are_refused_before_any_of_them_is_worked_on(tm
     source = write_las(
         tmp_path / "in.las", {"X": column * 5000.0, "Y": row * 5000.0, "Z": row * 0.0}
     )
-    made = run_tiled(
+    job = run_tiled(
         [str(source), HEIGHTS, str(tmp_path / "o_#.las")], 1000, workers=0, progress=False
     )
     assert (
         "thousands of points lie alone, far from any other (found 4,100 of"
-        in made.unreadable[str(source)]
+        in job.unreadable[str(source)]
     )
     assert not list(tmp_path.glob("o_*"))
 
@@ -209,7 +209,7 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         x, y, z = x[kept], y[kept], z[kept]
     options = {"window": window, "openings": (5, 9), "slope_too": True, "cell": cell}
     whole = filtered_ground(x, y, z, **options)
-    made = FilterOptions(cell=cell, window=window, openings=(5, 9))
+    options_values = FilterOptions(cell=cell, window=window, openings=(5, 9))
     u, v = x - origin[0], y - origin[1]
     for box in (
         (430, 410, 520, 560),
@@ -218,14 +218,14 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
     ):
         away = np.maximum(np.maximum(box[0] - u, u - box[2]), np.maximum(box[1] - v, v - box[3]))
         near = away <= 3.0
-        wide = 3.0 + made.reach_of_cells * cell
-        around = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
-        around = [edge + origin[n % 2] for n, edge in enumerate(around)]
-        cells = blocks_of(np.array([x, y, z]), made, around)
-        some = filtered_ground(x[near], y[near], z[near], cells=cells, **options)
+        wide = 3.0 + options_values.reach_of_cells * cell
+        surroundings = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
+        surroundings = [edge + origin[n % 2] for n, edge in enumerate(surroundings)]
+        cells = blocks_of(np.array([x, y, z]), options_values, surroundings)
+        subset = filtered_ground(x[near], y[near], z[near], cells=cells, **options)
         core = away[near] < 0
         assert core.any()
-        for name, values in some.items():
+        for name, values in subset.items():
             assert np.array_equal(values[core], whole[name][near][core]), (box, name)
 
 

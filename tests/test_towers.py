@@ -26,7 +26,7 @@ def scene(name):
     return xyz, codes, height, find_wires(xyz, height, np.ones(len(xyz), bool))
 
 
-def found(xyz, height, wire):
+def detect(xyz, height, wire):
     return find_towers(xyz, height, wire, np.ones(len(xyz), bool))
 
 
@@ -40,7 +40,7 @@ def found(xyz, height, wire):
 )
 def test_supports_of_lines(name, share):
     xyz, codes, height, wire = scene(name)
-    tower = found(xyz, height, wire)
+    tower = detect(xyz, height, wire)
     true = np.flatnonzero(codes == 15)
     support = fcluster(linkage(xyz[true, :2], "single"), 8, "distance")
     held = [tower[true[support == k]].mean() >= 0.5 for k in range(1, support.max() + 1)]
@@ -53,7 +53,7 @@ def test_supports_of_lines(name, share):
 
 def test_without_wires_there_are_no_towers():
     xyz, codes, height, wire = scene("two lines beside each other")
-    assert not found(xyz, height, np.zeros(len(xyz), bool)).any()
+    assert not detect(xyz, height, np.zeros(len(xyz), bool)).any()
     assert not find_towers(xyz, height, wire, codes == 2).any()
     for few in (
         np.empty((0, 3)),
@@ -61,7 +61,7 @@ def test_without_wires_there_are_no_towers():
         np.random.default_rng(0).normal(0, 30, (300, 3)),
     ):
         for kind in (np.zeros(len(few), bool), np.ones(len(few), bool)):
-            assert not found(few, few[:, 2], kind).any()
+            assert not detect(few, few[:, 2], kind).any()
 
 
 def test_wires_that_do_not_rise_have_no_support():
@@ -69,15 +69,15 @@ def test_wires_that_do_not_rise_have_no_support():
     level = np.where(
         wire, xyz[:, 2] - height + 8.0, xyz[:, 2]
     )  # no sag: nothing tells where they are held
-    assert not found(np.column_stack([xyz[:, :2], level]), np.where(wire, 8.0, height), wire).any()
+    assert not detect(np.column_stack([xyz[:, :2], level]), np.where(wire, 8.0, height), wire).any()
 
 
 @pytest.mark.parametrize("name", ["two lines beside each other", "high voltage, uphill"])
 def test_order_of_points_and_tiles_change_nothing(name):
     xyz, _, height, wire = scene(name)
-    whole = found(xyz, height, wire)
+    whole = detect(xyz, height, wire)
     order = np.random.default_rng(0).permutation(len(xyz))
-    assert np.array_equal(found(xyz[order], height[order], wire[order]), whole[order])
+    assert np.array_equal(detect(xyz[order], height[order], wire[order]), whole[order])
     middle = np.median(xyz[whole, 1])
     for low in (middle - 40.0, middle - 3.5, middle + 11.0):
         core = (xyz[:, 1] >= low) & (xyz[:, 1] < low + 30)
@@ -85,7 +85,7 @@ def test_order_of_points_and_tiles_change_nothing(name):
             xyz[:, 1] < low + 30 + towers.RULES.reach_m
         )
         assert near.sum() < 0.8 * len(xyz)
-        assert np.array_equal(found(xyz[near], height[near], wire[near])[core[near]], whole[core])
+        assert np.array_equal(detect(xyz[near], height[near], wire[near])[core[near]], whole[core])
 
 
 def test_a_real_tower(data_dir):
@@ -113,7 +113,7 @@ def test_the_stage_gives_towers_their_class():
     stage = Wires({"towers": True, "tower_code": 65})
     points = stage.points(arrays)
     after = stage.run(points, WHOLE_CLOUD)["Classification"]
-    tower = found(xyz, height, wire)
+    tower = detect(xyz, height, wire)
     assert np.array_equal(after, np.where(tower, 65, np.where(wire, 14, before)))
     assert points.report.figures["towers"] == tower.sum() > 1000
     assert (

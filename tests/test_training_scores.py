@@ -36,8 +36,8 @@ def test_train_takes_folders_and_says_an_honest_score_first(tmp_path, write_las,
     assert out.startswith("files held out")
     assert "files held out" not in err  # once is enough
     assert "t0.laz, t1.laz" in out
-    found = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
-    assert (found["by"], found["folds"]) == ("groups", 2) and found["chosen"]["trees"] == 2
+    score = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
+    assert (score["by"], score["folds"]) == ("groups", 2) and score["chosen"]["trees"] == 2
 
 
 @pytest.mark.pdal
@@ -55,11 +55,11 @@ def test_training_by_pipeline_prints_its_score(tmp_path, write_las, run_job):
 @pytest.mark.pdal
 def test_a_class_in_one_file_alone(tmp_path, write_las, capsys):
     """Held out with its file it would not be known: blocks instead, and a word on why."""
-    one, other = scene(1), scene(2, 60.0)
+    first, other = scene(1), scene(2, 60.0)
     other["Classification"][other["Classification"] == 6] = 5
     files = [
         write_las(tmp_path / name, points, point_format=1)
-        for name, points in (("a.laz", one), ("b.laz", other))
+        for name, points in (("a.laz", first), ("b.laz", other))
     ]
     assert main(words(tmp_path, *files)) == 0
     out = capsys.readouterr()
@@ -80,8 +80,8 @@ def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, run_job):
     writer |= {"count": 100, "groups": "PointSourceId", **QUICK}
     code, _, err = run_job([cloud, writer])
     assert code == 0 and "PointSourceId held out" in err
-    found = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
-    assert (found["groups"], found["folds"], found["gap"]) == ("PointSourceId", 4, 0.0)
+    score = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
+    assert (score["groups"], score["folds"], score["gap"]) == ("PointSourceId", 4, 0.0)
 
     xyz = np.column_stack([points[k] for k in "XYZ"])
     quick = {**QUICK, "dimensions": (), "passes": 2, "folds": 3}
@@ -92,8 +92,8 @@ def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, run_job):
     assert "Tile" not in model.required_dimensions
     without = ps.TrainingOptions("k8", **quick, count=100)
     same = ps.train(xyz, points["Classification"], without, dimensions=dimensions, progress=False)
-    for one, other in zip(model.passes, same.passes, strict=True):  # the score alone is another
-        assert all(np.array_equal(a, other.arrays()[key]) for key, a in one.arrays().items())
+    for first, other in zip(model.passes, same.passes, strict=True):  # the score alone is another
+        assert all(np.array_equal(a, other.arrays()[key]) for key, a in first.arrays().items())
     with pytest.raises(DimensionError, match="Tile"):
         ps.train([ps.TrainingCloud(xyz, points["Classification"])], options, progress=False)
 
@@ -106,8 +106,8 @@ def test_surveys_are_held_out_where_there_are_several(tmp_path):
         clouds.append(ps.TrainingCloud(xyz, arrays["Classification"], name=f"s{number}"))
     options = ps.TrainingOptions("k8", **{**QUICK, "dimensions": ()}, count=200)
     model = ps.train(clouds, options, progress=False)
-    found = model.info["accuracy"]["cross_validation"]
-    assert (found["by"], found["folds"]) == ("surveys", 3) and str(model).startswith(
+    score = model.info["accuracy"]["cross_validation"]
+    assert (score["by"], score["folds"]) == ("surveys", 3) and str(model).startswith(
         "surveys held out"
     )
     without = ps.train(
@@ -116,8 +116,8 @@ def test_surveys_are_held_out_where_there_are_several(tmp_path):
         progress=False,
     )
     assert without.info["accuracy"]["cross_validation"] is None
-    for one, other in zip(model.passes, without.passes, strict=True):  # the score chooses nothing
-        assert all(np.array_equal(a, other.arrays()[key]) for key, a in one.arrays().items())
+    for first, other in zip(model.passes, without.passes, strict=True):  # the score chooses nothing
+        assert all(np.array_equal(a, other.arrays()[key]) for key, a in first.arrays().items())
     model.save(tmp_path / "m.model")
     assert (
         ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]["by"] == "surveys"

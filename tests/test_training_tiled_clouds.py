@@ -54,8 +54,8 @@ def same_forests(cloud, options, side, folder):
     assert not (folder / "raw").exists()
     assert tiles.info["classes"] == whole.info["classes"]
     assert tiles.info["training"]["clouds"] == whole.info["training"]["clouds"]
-    for one, other in zip(tiles.passes, whole.passes, strict=True):
-        for name, array in one.arrays().items():
+    for first, other in zip(tiles.passes, whole.passes, strict=True):
+        for name, array in first.arrays().items():
             assert np.array_equal(array, other.arrays()[name]), name
     assert tiles.info["densities"]["low"] == pytest.approx(whole.info["densities"]["low"], rel=0.3)
 

@@ -39,18 +39,18 @@ def town(tmp_path_factory, write_las):
     east, north = xyz[:, 0] > 500_028.0, xyz[:, 1] > 5_400_033.0
     number = random.integers(1, 3, len(xyz)).astype(np.uint8)
     for k, point_format in enumerate(FORMATS):
-        mine = (east * 2 + north) == k
-        points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")}
+        inside = (east * 2 + north) == k
+        points = {axis: xyz[inside, n] for n, axis in enumerate("XYZ")}
         points |= {
             "Classification": np.where(
-                random.random(mine.sum()) < 0.02, 7, MADE().classification[mine]
+                random.random(inside.sum()) < 0.02, 7, MADE().classification[inside]
             )
         }
         points |= {
-            "ReturnNumber": number[mine],
-            "NumberOfReturns": np.full(mine.sum(), 2, np.uint8),
+            "ReturnNumber": number[inside],
+            "NumberOfReturns": np.full(inside.sum(), 2, np.uint8),
         }
-        points |= {"PointSourceId": random.integers(1, 4, mine.sum()).astype(np.uint16)}
+        points |= {"PointSourceId": random.integers(1, 4, inside.sum()).astype(np.uint16)}
         points["Classification"] = points["Classification"].astype(np.uint8)
         write_las(
             folder / f"t{k}.laz",
@@ -63,19 +63,19 @@ def town(tmp_path_factory, write_las):
 
 def both(town, tmp_path, run, *more, files=("",)):
     """The forests of one run in one piece and one in tiles, and what the two said."""
-    models, said = [], []
+    models, output = [], []
     for name, tiles in (("whole", ()), ("tiles", ("--tile", "23.5", "--workers", "0"))):
-        words = ["train", *(town / one for one in files), "--model", tmp_path / f"{name}.model"]
-        code, *told = run(*words, *WORDS, *tiles, *more)
-        assert code == 0, told
+        words = ["train", *(town / entry for entry in files), "--model", tmp_path / f"{name}.model"]
+        code, *reported = run(*words, *WORDS, *tiles, *more)
+        assert code == 0, reported
         model = ps.load_model(tmp_path / f"{name}.model")
-        arrays = [array.tolist() for one in model.passes for array in one.arrays().values()]
+        arrays = [array.tolist() for entry in model.passes for array in entry.arrays().values()]
         models.append(
             (arrays, model.classes, model.info["classes"], model.info["training"]["clouds"])
         )
-        said.append(told)
+        output.append(reported)
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
-    return models, said
+    return models, output
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_surveys_that_do_not_see_each_other(town, tmp_path, run):
     assert whole == tiles
     info = ps.load_model(tmp_path / "tiles.model").info
     assert info["accuracy"]["cross_validation"]["by"] == "surveys"
-    assert [one["name"] for one in info["training"]["clouds"]] == ["west", "t2", "t3"]
+    assert [entry["name"] for entry in info["training"]["clouds"]] == ["west", "t2", "t3"]
 
 
 def test_one_file_and_feet(tmp_path, run, write_las):
@@ -189,13 +189,13 @@ def corrected(tmp_path_factory, write_las):
     east, north = xyz[:, 0] > 500_028.0, xyz[:, 1] > 5_400_033.0
     near = np.hypot(xyz[:, 0] - 500_025.0, xyz[:, 1] - 5_400_030.0) < 22.0
     for k in range(4):
-        mine = (east * 2 + north) == k
-        points = {axis: xyz[mine, n] for n, axis in enumerate("XYZ")} | {
-            "Classification": codes[mine]
+        inside = (east * 2 + north) == k
+        points = {axis: xyz[inside, n] for n, axis in enumerate("XYZ")} | {
+            "Classification": codes[inside]
         }
-        points["Reliability"] = random.choice([0.5, 0.96, 1.0], mine.sum()).astype(np.float32)
+        points["Reliability"] = random.choice([0.5, 0.96, 1.0], inside.sum()).astype(np.float32)
         if k < 3:
-            points["Checked"] = near[mine].astype(np.uint8)
+            points["Checked"] = near[inside].astype(np.uint8)
         write_las(folder / f"c{k}.laz", points, point_format=6, offset=(500_000 + k, 5_400_000, k))
     return folder
 

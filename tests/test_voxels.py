@@ -23,13 +23,13 @@ def crowd(seed=0, n=6000, side=12.0, dense=4.0):
 @pytest.mark.parametrize("side", [0.25, 0.3, 1.0, 2.5])
 def test_one_of_each_voxel(side):
     xyz = crowd(n=2500)
-    found = represent(xyz, side)
+    voxels = represent(xyz, side)
     voxel = [tuple(np.floor(p * (1.0 / side))) for p in xyz]
-    assert found is not None
-    points, place = found.members(np.arange(len(found.rows)))
+    assert voxels is not None
+    points, place = voxels.members(np.arange(len(voxels.rows)))
     assert sorted(points) == list(range(len(xyz)))
-    assert all(voxel[p] == voxel[r] for p, r in zip(points, found.rows[place], strict=True))
-    assert len(found.rows) == len(set(voxel))
+    assert all(voxel[p] == voxel[r] for p, r in zip(points, voxels.rows[place], strict=True))
+    assert len(voxels.rows) == len(set(voxel))
 
 
 @settings(deadline=None, max_examples=20)
@@ -58,8 +58,8 @@ def test_any_order_and_any_tile(seed, side):
 def test_points_asked_for():
     xyz = crowd()
     rows = np.flatnonzero(np.arange(len(xyz)) % 5 == 0)
-    found = represent(xyz, 0.25, (), rows)
-    points, _ = found.members(found.wanted)
+    voxels = represent(xyz, 0.25, (), rows)
+    points, _ = voxels.members(voxels.wanted)
     assert np.array_equal(np.sort(points), rows)
 
 
@@ -83,32 +83,32 @@ def test_members_get_the_same(model, how, tmp_path):
     xyz = crowd(3)
     where = xyz[:, 0] < 600_006.0
     old = np.full(len(xyz), 9)
-    found = model.predict(xyz, {}, where, current=old, **how)
+    prediction = model.predict(xyz, {}, where, current=old, **how)
     few = represent(xyz, 0.25)
     thin = model.predict(xyz[few.rows], {}, where[few.rows], current=old[few.rows], **how)
-    assert (found.classification[~where] == 9).all()
+    assert (prediction.classification[~where] == 9).all()
     stands = few.rows
     both = where[stands]
     for name in ("classification", "reliability", "margin", "probabilities"):
-        a, b = getattr(found, name), getattr(thin, name)
+        a, b = getattr(prediction, name), getattr(thin, name)
         if a is not None:
             assert np.array_equal(a[stands][both], b[both])
     points, place = few.members(np.arange(len(few.rows)))
     inside = where[points] & where[stands[place]]
     assert np.array_equal(
-        found.reliability[points][inside], found.reliability[stands[place]][inside]
+        prediction.reliability[points][inside], prediction.reliability[stands[place]][inside]
     )
-    assert found.report.figures["representatives"] == len(few.rows)
-    assert found.report.figures["classified"] + len(found.unsure) == where.sum()
+    assert prediction.report.figures["representatives"] == len(few.rows)
+    assert prediction.report.figures["classified"] + len(prediction.unsure) == where.sum()
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
     assert again.voxel == 0.25
     assert np.array_equal(
-        again.predict(xyz, {}, where, current=old, **how).classification, found.classification
+        again.predict(xyz, {}, where, current=old, **how).classification, prediction.classification
     )
     order = np.random.default_rng(0).permutation(len(xyz))
     shuffled = model.predict(xyz[order], {}, where[order], current=old, **how)
-    assert np.array_equal(shuffled.classification, found.classification[order])
+    assert np.array_equal(shuffled.classification, prediction.classification[order])
 
 
 def test_tile_is_the_whole(model):
@@ -133,11 +133,11 @@ def test_features_of_dense_clouds(pdal_module):
     stage = ps.Filter.multiscalefeatures(**options, where="X < 600006")
     job = pdal_module.Pipeline(stage.stages, arrays=[array])
     job.execute()
-    found = job.arrays[0]
+    result = job.arrays[0]
     points, place = few.members(np.arange(len(few.rows)))
     plain = compute_features(xyz[few.rows], neighborhoods="s1,k10", feature_set="Linearity")
     inside = xyz[points, 0] < 600_006
     assert np.array_equal(
-        found["Linearity_k10"][points[inside]], plain["Linearity_k10"][place[inside]]
+        result["Linearity_k10"][points[inside]], plain["Linearity_k10"][place[inside]]
     )
-    assert (found["Linearity_k10"][points[~inside]] == 0).all()
+    assert (result["Linearity_k10"][points[~inside]] == 0).all()

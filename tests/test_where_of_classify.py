@@ -41,11 +41,11 @@ def test_wires_of_points_that_the_model_gives_another_class(tmp_path, run, write
     words = ("classify", source, tmp_path / "out.las", "--wires", *tiles)
     assert run(*words)[0] == 0
     every = classes(tmp_path / "out.las")
-    code, said, err = run(*words, *WHERE)
+    code, output, err = run(*words, *WHERE)
     assert code == 0, err
-    found = classes(tmp_path / "out.las")
-    assert np.array_equal(found, every) and found[0] == 7
-    assert (found[codes == 14] == 14).mean() > 0.9 and "wires (wires)" in said
+    codes_values = classes(tmp_path / "out.las")
+    assert np.array_equal(codes_values, every) and codes_values[0] == 7
+    assert (codes_values[codes == 14] == 14).mean() > 0.9 and "wires (wires)" in output
     las = laspy.read(tmp_path / "out.las")
     assert np.array_equal(las.synthetic, flags) and np.array_equal(las.key_point, flags[::-1])
     kept = laspy.read(source)
@@ -53,9 +53,9 @@ def test_wires_of_points_that_the_model_gives_another_class(tmp_path, run, write
     kept.classification[left_out] = 9
     kept.write(source)
     assert run(*words, *WHERE, *(("--resume",) if tiles else ()))[0] == 0
-    found = classes(tmp_path / "out.las")
-    assert (found[left_out] == 9).all() and not (found[~left_out] == 9).any()
-    assert np.array_equal(found[~left_out], every[~left_out])  # they are still neighbors
+    codes_values = classes(tmp_path / "out.las")
+    assert (codes_values[left_out] == 9).all() and not (codes_values[~left_out] == 9).any()
+    assert np.array_equal(codes_values[~left_out], every[~left_out])  # they are still neighbors
 
 
 def test_bridges_and_polygons_of_points_that_the_model_gives_another_class(

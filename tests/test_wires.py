@@ -20,8 +20,8 @@ from pdal_stages.structures.wires import find_wires
 from pdal_stages.terrain.heights import filtered_ground
 
 
-def f1(found, true):
-    return 2 * (found & true).sum() / max(found.sum() + true.sum(), 1)
+def f1(detect, true):
+    return 2 * (detect & true).sum() / max(detect.sum() + true.sum(), 1)
 
 
 @functools.cache
@@ -65,17 +65,17 @@ def scene(seed=0, density=8.0, side=150):
     return np.round(np.vstack(parts), 3), np.concatenate(codes)
 
 
-def found(xyz, use=None):
+def detect(xyz, use=None):
     return find_wires(xyz, xyz[:, 2], np.ones(len(xyz), bool) if use is None else use)
 
 
 def test_wires_are_found_and_nothing_else():
     xyz, codes = scene(1)
-    wire = found(xyz)
+    wire = detect(xyz)
     assert f1(wire, codes == 14) > 0.95
     assert (wire & (codes != 14)).sum() < 0.0005 * len(xyz)
     left = codes != 14
-    assert not found(xyz[left]).any()
+    assert not detect(xyz[left]).any()
 
 
 @settings(max_examples=3, deadline=None)
@@ -83,23 +83,23 @@ def test_wires_are_found_and_nothing_else():
 def test_order_and_shifts_by_whole_cells_change_nothing(seed, cells):
     xyz, _ = scene(seed % 2, 2.0)
     xyz = np.floor(xyz * 1024) / 1024
-    wire = found(xyz)
+    wire = detect(xyz)
     order = np.random.default_rng(seed).permutation(len(xyz))
-    assert np.array_equal(found(xyz[order]), wire[order])
+    assert np.array_equal(detect(xyz[order]), wire[order])
     shifted = xyz + np.array([*cells, 0])
     assert np.array_equal(find_wires(shifted, xyz[:, 2], np.ones(len(xyz), bool)), wire)
 
 
 def test_a_tile_with_its_surroundings_gets_what_the_whole_gets():
     xyz, _ = scene(0)
-    whole = found(xyz)
+    whole = detect(xyz)
     for low in (2.0, 5.5, 40.0):
         core = (xyz[:, 0] >= low) & (xyz[:, 0] < low + 20)
         near = (xyz[:, 0] >= low - wires.RULES.reach_m) & (
             xyz[:, 0] < low + 20 + wires.RULES.reach_m
         )
         assert near.sum() < len(xyz) and whole[core].any()
-        assert np.array_equal(found(xyz[near])[core[near]], whole[core])
+        assert np.array_equal(detect(xyz[near])[core[near]], whole[core])
 
 
 def test_degenerate_clouds_and_points_left_out():
@@ -109,9 +109,9 @@ def test_degenerate_clouds_and_points_left_out():
         np.full((50, 3), 9.0),
         np.random.default_rng(0).normal(0, 50, (500, 3)),
     ):
-        assert not found(xyz).any()
+        assert not detect(xyz).any()
     xyz, codes = scene(0)
-    assert not found(xyz, codes != 14).any()
+    assert not detect(xyz, codes != 14).any()
 
 
 def edge(kind, density, seed=0):
@@ -167,7 +167,7 @@ def test_the_stage_gives_wires_their_class():
     stage = Wires({})
     points = stage.points(arrays)
     after = stage.run(points, WHOLE_CLOUD)["Classification"]
-    wire = found(xyz) & (before != 12)
+    wire = detect(xyz) & (before != 12)
     assert np.array_equal(after, np.where(wire, 14, before))
     assert points.report.figures["wires"] == wire.sum()
     assert stage.halo_m() == wires.RULES.reach_m < 90 and max(stage.written_classes()) == 14

@@ -16,21 +16,21 @@ CELL = 5
 
 def town(size: float = 90.0, density: float = 2.5, seed: int = 5):
     """A small town with a hole, and points exactly on the edges of 30 m tiles."""
-    made = ps.make_town(size, density, seed=seed)
-    xyz = made.xyz.copy()
+    points = ps.make_town(size, density, seed=seed)
+    xyz = points.xyz.copy()
     x, y = xyz[:, 0] - 500_000.0, xyz[:, 1] - 5_400_000.0
     for value, axis in ((10.0, 0), (40.0, 0), (70.0, 0), (30.0, 1), (60.0, 1)):
         near = np.abs((x, y)[axis] - value) < 0.1
         xyz[near, axis] = value + (500_000.0, 5_400_000.0)[axis]
     hole = (x > 39.0) & (x < 71.0) & (y > 59.0)  # a whole tile and a little more
-    return made, xyz, ~hole
+    return points, xyz, ~hole
 
 
 def model(
     path: Path, neighborhoods: str = "c1,s2,kopt", feature_set: str = "covariance,geometric,D1_3_c1"
 ) -> Path:
     """A small model, trained on another town."""
-    made = ps.make_town(60.0, 2.5, seed=9)
+    points = ps.make_town(60.0, 2.5, seed=9)
     options = ps.TrainingOptions(
         neighborhoods=neighborhoods,
         feature_set=feature_set.split(","),
@@ -39,8 +39,8 @@ def model(
         count=150,
         trees=6,
     )
-    heights = hag_minima(*made.xyz.T, cell=CELL)
-    cloud = ps.TrainingCloud(made.xyz, made.classification, {"HeightAboveGround": heights})
+    heights = hag_minima(*points.xyz.T, cell=CELL)
+    cloud = ps.TrainingCloud(points.xyz, points.classification, {"HeightAboveGround": heights})
     ps.train([cloud], options, progress=False).save(path)
     return path
 
@@ -63,11 +63,11 @@ def stages(inputs, output, model_file, **writer):
 
 def same_points(a: Path, b: Path) -> None:
     """Two files hold the same points in the same order, byte for byte, under the same header."""
-    one, two = laspy.read(a), laspy.read(b)
-    assert one.points.array.dtype == two.points.array.dtype
-    for name in one.points.array.dtype.names:
-        different = np.count_nonzero(one.points.array[name] != two.points.array[name])
-        assert different == 0, f"{name} differs in {different} of {len(one)} points"
+    first, two = laspy.read(a), laspy.read(b)
+    assert first.points.array.dtype == two.points.array.dtype
+    for name in first.points.array.dtype.names:
+        different = np.count_nonzero(first.points.array[name] != two.points.array[name])
+        assert different == 0, f"{name} differs in {different} of {len(first)} points"
     for name in (
         "scales",
         "offsets",
@@ -76,14 +76,14 @@ def same_points(a: Path, b: Path) -> None:
         "system_identifier",
         "global_encoding",
     ):
-        left, right = getattr(one.header, name), getattr(two.header, name)
+        left, right = getattr(first.header, name), getattr(two.header, name)
         if name == "global_encoding":
             left, right = left.value, right.value
         assert np.all(left == right), name
-    assert one.header.point_format.id == two.header.point_format.id
+    assert first.header.point_format.id == two.header.point_format.id
     texts = [
         [v.record_data_bytes() for v in las.header.vlrs if v.record_id == 2112]
-        for las in (one, two)
+        for las in (first, two)
     ]
     assert texts[0] == texts[1]
 
