@@ -146,7 +146,7 @@ def edge(kind, density, seed=0):
 )
 def test_what_hides_the_ground_is_no_wire(kind, density):
     xyz = edge(kind, density)
-    assert found(xyz).sum() <= 0.001 * len(xyz)
+    assert detect(xyz).sum() <= 0.001 * len(xyz)
 
 
 def test_a_street_of_poles_in_the_town():
