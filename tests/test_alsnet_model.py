@@ -197,7 +197,7 @@ def test_a_network_is_no_second_pass(tmp_path):
     manifest = model_of(net).manifest()
     manifest["passes"] *= 2
     model_file.write(tmp_path / "two.model", manifest, [net.arrays()] * 2)
-    with pytest.raises(ModelError, match="must read context"):
+    with pytest.raises(ModelError, match="none follows a network"):
         load_model(tmp_path / "two.model")
 
 
