@@ -159,14 +159,13 @@ def _find_in_piece(cloud, cell_of, high, near, window, rules) -> NDArray[np.bool
     on_line[high] = good[layer]
     places = _in_cells(cloud[near_all])
     clear = _hide_nothing(layers, good, line, places, begin, on_line[near_all], rules)
-    first, second = _pair_on_lines(layers, good, line, rules.half_m, rules)
-    seen = good[second]
-    first, second, count = first[seen], second[seen], len(good)
-    share = np.bincount(first, clear[second], count) / np.maximum(
-        np.bincount(first, None, count), 1
-    )
+    first, second, away = _pair_on_lines(layers, good, line, rules)
+    seen, count = good[second], len(good)
+    on_line_of = np.bincount(first[seen], None, count)
+    share = np.bincount(first[seen], clear[second[seen]], count) / np.maximum(on_line_of, 1)
     good &= share >= rules.min_clear_share
-    first, second = _pair_on_lines(layers, good, line, rules.hop_m, rules)
+    near_pair = (away <= rules.hop_m) & good[first]
+    first, second = first[near_pair], second[near_pair]
     linked = good[second]
     part = np.empty(len(good), np.int64)
     parts = number_sets(first[linked], second[linked], part)
@@ -294,14 +293,15 @@ def _hide_nothing(layers, good, line, places, begin, on_line, rules):
 
 
 @njit
-def _pair_on_lines(layers, good, line, reach_m, rules):
+def _pair_on_lines(layers, good, line, rules):
     """Return pairs (k,), (k,) of layers with lines and of those on them, themselves included.
 
-    Those at most `reach_m` away along the line.
+    Their distances (k,) along the line, in meters, come third: at most `half_m`.
     """
     place, cells, start, h, w = layers
     first, second = np.empty(1024, np.int64), np.empty(1024, np.int64)
-    count, reach = 0, int(reach_m / CELL_M) + 1
+    distance = np.empty(1024)
+    count, reach = 0, int(rules.half_m / CELL_M) + 1
     for n in range(len(good)):
         if not good[n]:
             continue
@@ -315,13 +315,14 @@ def _pair_on_lines(layers, good, line, reach_m, rules):
                     aside = dy * line[n, 0] - dx * line[n, 1]
                     above = place[m, 2] - place[n, 2] - line[n, 2] * along
                     away = abs(along)
-                    if away > reach_m or abs(aside) > rules.beside_m:
+                    if away > rules.half_m or abs(aside) > rules.beside_m:
                         continue
                     if abs(above) > rules.near_m + rules.max_bend * away:
                         continue
                     if count == len(first):
                         first = np.concatenate((first, first))
                         second = np.concatenate((second, second))
-                    first[count], second[count] = n, m
+                        distance = np.concatenate((distance, distance))
+                    first[count], second[count], distance[count] = n, m, away
                     count += 1
-    return first[:count], second[:count]
+    return first[:count], second[:count], distance[:count]

@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from ..base.errors import OptionError, PipelineError, StageError
 from ..base.octree_check import check_ept, read_ept
 from ..base.units import Units
 from ..pipeline import pdal as pdal_env
+from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import (
     LAS_READERS,
     ept_address,
@@ -29,6 +31,7 @@ from ..pipeline.inputs_outputs import (
 )
 from ..pipeline.las_output import replaced
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
+from ..stages.registry import stage_from, stage_types
 from .checkpoint import fingerprint
 from .options import Density, Extent, TilingOptions, block_bytes, choose_tiles, tiles_per_square
 from .plan import TilePlan, outputs_for
@@ -228,13 +231,9 @@ class Survey:
         self.indexes: dict[str, CloudIndex] = {}
         self.sources = find_sources(plan.readers)
         self.paths = [source.path for source in self.sources]
-        others = named_files([*plan.head, *plan.tail])
+        self._others = files_read_by([*plan.head, *plan.tail])
         #: Sizes and times of inputs, and of other files that stages read, at the start of the run.
-        self.stamps = {path: stamp(path) for path in [*self.paths, *others]}
-        #: Digests of the other files; a folder has its size and time.
-        self._contents: dict[str, Any] = {
-            path: digest_of(path) if os.path.isfile(path) else stamp(path) for path in others
-        }
+        self.stamps = {path: stamp(path) for path in [*self.paths, *self._others]}
         self._read_headers()
         files_of_las = [source.path for source in self.sources if source.kind == "las"]
         self.messages += replaced(files_of_las, plan.makes)
@@ -355,9 +354,19 @@ class Survey:
         self._boxes = np.array(boxes, np.float64)
         self.bounds: Box = union(boxes)
 
+    @cached_property
+    def _contents(self) -> dict[str, Any]:
+        """Return the digests of the files that stages read; a folder has its size and time.
+
+        A run that is only planned (``--dry-run``) does not read them.
+        """
+        return {
+            path: digest_of(path) if os.path.isfile(path) else stamp(path) for path in self._others
+        }
+
     def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
         """Return names and contents (digests) of the models, maps and other files of stages."""
-        return [[path, self._contents[path]] for path in named_files(stages)]
+        return [[path, self._contents[path]] for path in files_read_by(stages)]
 
     def seen(self, sources: list[InputSource]) -> list[Any]:
         """Return names, readers and contents of inputs: digests, or sizes and times without."""
@@ -410,6 +419,13 @@ class Survey:
             "inputs": len(self.sources),
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
         }
+
+
+def files_read_by(stages: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the files that stages read: models, maps and what else PDAL's options name."""
+    ours = [stage_from(stage) for stage in stages if stage["type"] in stage_types()]
+    files = [path for stage in ours for path in stage_files(stage) if os.path.exists(path)]
+    return list(dict.fromkeys([*named_files(stages), *files]))
 
 
 def digest_of(path: str | os.PathLike) -> str:
