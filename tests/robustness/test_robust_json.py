@@ -34,9 +34,7 @@ REFUSED = {
     "half a surrogate pair": (b'["a.las",\n"\\ud800.las"]', ["line 2", "not valid UTF-8"]),
     "NUL in a name": (b'["a\\u0000.las", "b.las"]', ["line 1", "NUL"]),
     "a point cloud": (b"LASF\xff", ["a point cloud, not a pipeline"]),
-    "Latin-1 text": ('["Gr\u00fcn.las"]'.encode("latin-1"), ["not UTF-8", "byte 4 is 0xfc", "Save "
-                                                                                            "it as "
-                                                                                            "UTF-8"]),
+    "Latin-1 text": ('["Gr\u00fcn.las"]'.encode("latin-1"), ["not UTF-8", "byte 4 is 0xfc", "Save it as UTF-8"]),
     "a LAS file as the pipeline": (b"LASF\x00\x00\xff\xfe" + b"\x00" * 300, ["not"]),
     "nested 100,000 deep": (b"[" * 100_000, ["not valid JSON"]),
     "a million opened comments": (b"[" + b"/*" * 1_000_001, ["does not end"]),

@@ -224,8 +224,7 @@ DAMAGED = {
     "point length of 0": (".las 3", header("length", 0), "shorter than their format"),
     "point format 77": (".las 3", header("format", 77 & 63), "point format is not known"),
     "version 1.9": (".las 3", header("minor", 9), "version is not known"),
-    "a million records before the points": (".las 3", header("vlrs", 10**6), "more records than "
-                                                                             "there is room for"),
+    "a million records before the points": (".las 3", header("vlrs", 10**6), "more records than there is room for"),
     "scale of NaN": (".las 3", header("scale", float("nan")), "not valid numbers"),
     "a scale that is no length": (".las 6", lambda d: d.__setitem__(slice(149, 155), bytes(6)), "not valid numbers"),
     "header of an older version": (".las 6", header("header", 227), "its header is too short"),
@@ -237,12 +236,9 @@ DAMAGED = {
     "LAZ: cut in the points": (".laz 3", lambda d: d[: len(d) // 2], "it is cut short"),
     "LAZ: cut in the chunk table": (".laz 3", lambda d: d[:-4], "LAS file"),
     "LAZ: chunk table beyond the end": (".laz 3", lambda d: struct.pack_into("<q", d, struct.unpack_from("<I", d, 96)[0], 10**12), "cut short"),
-    "LAZ: more points in the header": (".laz 3", header("count", 60_000), "60,000 counted, 50,000 "
-                                                                          "held"),
+    "LAZ: more points in the header": (".laz 3", header("count", 60_000), "60,000 counted, 50,000 held"),
     "LAZ: a million chunks": (".laz 3", lambda d: struct.pack_into("<I", d, table(d) + 4, 10**6), "more chunks than there is room for"),
-    "LAZ: no chunks": (".laz 3", lambda d: struct.pack_into("<I", d, table(d) + 4, 0), "do not "
-                                                                                       "fill the "
-                                                                                       "file"),
+    "LAZ: no chunks": (".laz 3", lambda d: struct.pack_into("<I", d, table(d) + 4, 0), "do not fill the file"),
     "LAZ: chunk table of version 7": (".laz 3", lambda d: struct.pack_into("<I", d, table(d), 7), "unknown version"),
     "LAZ: another size in the chunk table": (".laz 3", lambda d: d.__setitem__(table(d) + 9, d[table(d) + 9] ^ 0x40), "LAS file"),
     "LAZ: no record of the compression": (".laz 3", lambda d: d.__setitem__(d.index(b"laszip "

@@ -42,17 +42,14 @@ def _ept(**changed) -> bytes:
 LISTS = {
     "tile index that names no file": ("index.geojson", _features(), ["no column 'location'"]),
     "tile index that names a number": ("index.geojson", _features(5), ["is not a file's name"]),
-    "tile index that names what is not there": ("index.geojson", _features("no.las"), ["No such "
-                                                                                       "file", "no.las"]),
-    "tile index that names itself": ("index.geojson", _features("index.geojson"), ["not a LAS or "
-                                                                                   "LAZ file"]),
+    "tile index that names what is not there": ("index.geojson", _features("no.las"), ["No such file", "no.las"]),
+    "tile index that names itself": ("index.geojson", _features("index.geojson"), ["not a LAS or LAZ file"]),
     "tile index nested 100,000 deep": ("index.geojson", b"[" * 100_000, ["cannot be read"]),
     "tile index that is no database": ("index.gpkg", b"no database", ["cannot be read"]),
     "EPT that is no JSON": ("ept.json", b"no", ["cannot be read"]),
     "EPT without bounds": ("ept.json", _ept(boundsConforming=[]), ["cannot be read"]),
     "EPT beyond its octree": ("ept.json", _ept(boundsConforming=[-1e12, -1e12, 0, 1e12, 1e12, 9]), ["its points lie outside its octree"]),
-    "EPT whose coordinates PDAL would round": ("ept.json", _ept(dataType="binary"), ["to whole "
-                                                                                     "numbers"]),
+    "EPT whose coordinates PDAL would round": ("ept.json", _ept(dataType="binary"), ["to whole numbers"]),
     "EPT of -5 points": ("ept.json", _ept(points=-5), ["not a valid description"]),
     "EPT without its data": ("ept.json", _ept(), ["the EPT source is damaged"]),
 }  # fmt: skip

@@ -195,8 +195,7 @@ def test_figures_of_any_size(command, tmp_path, model):
 #: What would touch FILE; test_preparation.py has more.
 HOSTILE = {
     "runs Python": {"type": "filters.python", "function": "f", "module": "m",
-                    "source": "import pathlib\npathlib.Path('FILE').unlink()\ndef f(a, b): return "
-                              "True"},
+                    "source": "import pathlib\npathlib.Path('FILE').unlink()\ndef f(a, b): return True"},
     "empties a file by a log of PDAL's": {"type": "filters.smrf", "log": "FILE"},
     "is another name for a filter": {"type": "filters.hag_minima ", "log": "FILE"},
     "nests a pipeline": {**HAG, "inputs": [{"type": "writers.las", "filename": "FILE"}]},

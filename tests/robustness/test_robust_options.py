@@ -32,19 +32,14 @@ WRONG = {
     "unknown neighborhood": (FEATURES, {"neighborhoods": "q5"}, ["unknown neighborhood", "q5"]),
     "contradictory neighborhood": (FEATURES, {"neighborhoods": "kopt(100,10)"}, ["kopt(100,10)"]),
     "unknown feature": (FEATURES, {"feature_set": "Linarity"}, ["unknown feature", "Linearity"]),
-    "where that does not parse": (HEIGHTS, {"where": "Z >> 3"}, ["'where' expression", "at "
-                                                                                       "character 4"]),
+    "where that does not parse": (HEIGHTS, {"where": "Z >> 3"}, ["'where' expression", "at character 4"]),
     "where that is no condition": (HEIGHTS, {"where": "Z + 3"}, ["gives a number, not true or false"]),
-    "where nested 1,000 deep": (HEIGHTS, {"where": "(" * 1000 + "Z>1" + ")" * 1000}, ["nested too "
-                                                                                      "deeply"]),
-    "unknown unit": (HEIGHTS, {"horizontal_unit": "foots"}, ["not a known length unit", "Did you "
-                                                                                        "mean"]),
+    "where nested 1,000 deep": (HEIGHTS, {"where": "(" * 1000 + "Z>1" + ")" * 1000}, ["nested too deeply"]),
+    "unknown unit": (HEIGHTS, {"horizontal_unit": "foots"}, ["not a known length unit", "Did you mean"]),
     "label mapping to no class": (TRAIN, {"filename": "m", "classes": {"2,3": "Grond"}}, ["Grond"]),
     "label mapped twice": (TRAIN, {"filename": "m", "classes": {"2": 2, "2,3": 5}}, ["label twice"]),
     "binary without a target": (TRAIN, {"filename": "m", "strategy": "binary"}, ["needs 'target'"]),
-    "none of the choices": (TRAIN, {"filename": "m", "strategy": "multi"}, ["must be one of", "Did "
-                                                                                              "you "
-                                                                                              "mean"]),
+    "none of the choices": (TRAIN, {"filename": "m", "strategy": "multi"}, ["must be one of", "Did you mean"]),
     "number in superscript": (TRAIN, {"filename": "m", "trees": "\u00b2"}, ["'trees'"]),
     "share of 2": (TRAIN, {"filename": "m", "max_samples": 2}, ["option 'max_samples'", "at most 1"]),
     "no file name": (TRAIN, {}, ["option 'filename' is required"]),
@@ -69,22 +64,18 @@ def test_wrong_options(command, tmp_path, monkeypatch, case):
 
 STAGES = {
     "unknown stage of ours": ([{"type": "filters.hagminima"}], ["line 3", "filters.hagminima", "filters.hag_minima"]),
-    "reader for a filter": ([{"type": "readers.hag_minima"}], ["line 3", "Did you mean "
-                                                                         "'filters.hag_minima'?"]),
-    "unknown stage": ([{"type": "filters.reprojektion"}], ["line 3", "Did you mean "
-                                                                     "'filters.reprojection'?"]),
+    "reader for a filter": ([{"type": "readers.hag_minima"}], ["line 3", "Did you mean 'filters.hag_minima'?"]),
+    "unknown stage": ([{"type": "filters.reprojektion"}], ["line 3", "Did you mean 'filters.reprojection'?"]),
     "unknown option of PDAL's stage": ([{"type": "filters.range", "limit": "Z[0:1]"}], ["line 3", "Unexpected argument 'limit'"]),
     "wrong value of PDAL's option": ([{"type": "filters.outlier", "mean_k": "x"}], ["line 3", "mean_k"]),
     "type that is a number": ([{"type": 5}], ["line 3", "'type' is text", "5"]),
     "inputs that is no tag": ([{**HAG, "inputs": ["nix"]}], ["undefined stage tag 'nix'"]),
     "stage that is a number": ([7], ["line 3", "a stage is an object, or a file name", "7"]),
     "dimension that is missing": ([{"type": ACCURACY}], ["'Reference' is missing", "filters.ferry"]),
-    "where with a missing dimension": ([{**HAG, "where": "Hight > 2"}], ["names the dimension "
-                                                                         "'Hight'"]),
+    "where with a missing dimension": ([{**HAG, "where": "Hight > 2"}], ["names the dimension 'Hight'"]),
     "two writers of one file": ([HAG, OUT], ["two output files are the same file"]),
     "output named as a folder": ([{**OUT, "filename": "."}], ["names a folder"]),
-    "output name of 300 characters": ([{**OUT, "filename": "x" * 296 + ".las"}], ["longer than 255 "
-                                                                                  "bytes"]),
+    "output name of 300 characters": ([{**OUT, "filename": "x" * 296 + ".las"}], ["longer than 255 bytes"]),
     "input that is not there": ([{"type": "readers.las", "filename": "nix.las"}], ["nix.las"]),
     "more features than LAS describes": ([{"type": FEATURES, "neighborhoods": "weinmann2018", "feature_set": "all"}, {**OUT, "filename": "p.las", "extra_dims": "all"}], ["LAS cannot hold so many"]),
 }  # fmt: skip
@@ -109,23 +100,15 @@ OVERRIDES = {
 USAGE = {
     "unknown command": (["pipelines"], "Did you mean 'pipeline'?"),
     "unknown choice": (["classify", "a.las", "out", "--per", "fil"], "Did you mean 'file'?"),
-    "options of stages for a model": (["model", "no.model", "--filters.x.y=1"], "takes no stage "
-                                                                                "options"),
+    "options of stages for a model": (["model", "no.model", "--filters.x.y=1"], "takes no stage options"),
     "accuracy of two files": (["accuracy", "c.las", "c.las"], "--reference FILE, of the same points"),
-    "unknown dimension": (["accuracy", "c.las", "--reference-dimension", "Clasification"], "Did "
-                                                                                           "you "
-                                                                                           "mean "
-                                                                                           "'Classification'?"),
+    "unknown dimension": (["accuracy", "c.las", "--reference-dimension", "Clasification"], "Did you mean 'Classification'?"),
     "scheduler without its protocol": (["classify", "c.las", "o", "--scheduler", "localhost"], "For example tcp://localhost:8786"),
     "a buffer larger than the Earth": (["pipeline", "job.json", "--tile", "50", "--buffer", "1e308"], "1e+09 meters"),
     "unknown flag": (["validate", "job.json", "--strict"], "unrecognized arguments: --strict"),
     "no pipeline file": (["pipeline"], "no pipeline file was given"),
-    "options of a stage that is not there": (["options", "filters.hag_minimum"], "Did you mean "
-                                                                                 "'filters.hag_minima'?"),
-    "classify a file that is not there": (["classify", "nowhere.laz", "b.las"], "nowhere.laz: "
-                                                                                "there is no such "
-                                                                                "file or folder. "
-                                                                                "Check the path"),
+    "options of a stage that is not there": (["options", "filters.hag_minimum"], "Did you mean 'filters.hag_minima'?"),
+    "classify a file that is not there": (["classify", "nowhere.laz", "b.las"], "nowhere.laz: there is no such file or folder. Check the path"),
     "train on a mistyped file": (["train", "jbo.json", "--model", "m"], "Did you mean 'job.json'?"),
     "metadata in a folder that is not there": (["pipeline", "job.json", "--metadata", "no/m.json"], "metadata file does not exist"),
     **{word: (["pipeline", "job.json", word], says) for word, says in OVERRIDES.items()},

@@ -176,8 +176,7 @@ REPLACING = [
     ([*ACCURACY, "--json", "b.las"], OTHER),
     ([*ACCURACY, "--json", "x", "--html", "x"], "is the json file too"),
     (["objects", "a.las", "t.gpkg", "--metadata", "a.las"], OTHER),
-    (["objects", "a.las", "t.gpkg", "--metadata", "t.gpkg"], "the metadata file is the objects "
-                                                             "file too"),
+    (["objects", "a.las", "t.gpkg", "--metadata", "t.gpkg"], "the metadata file is the objects file too"),
     *((["train", "a.las", "--base", "m.model", "--model", name], INPUT) for name in ("m.model", "link.model", "hard.model")),
     (["train", "a.las", "--base", "link.model", "--model", "m.model"], INPUT),
     (["pipeline", "base.json"], INPUT),
@@ -187,9 +186,7 @@ REPLACING = [
     *((["classify", *names, "o/", "--model", "m.model", "--polygons", "poly.geojson=9", "--metadata", "poly.geojson"], INPUT)
       for names in (["a.las"], ["a.las", "b.las"])),
     ([*CLASSIFY, "o.las", "--polygons", "poly.geojson=9", "--objects", "poly.geojson"], INPUT),
-    ([*CLASSIFY, "o.las", "--objects", "x.geojson", "--metadata", "x.geojson"], "the objects file "
-                                                                                "is the metadata "
-                                                                                "file too"),
+    ([*CLASSIFY, "o.las", "--objects", "x.geojson", "--metadata", "x.geojson"], "the objects file is the metadata file too"),
     (["accuracy", "ti.geojson", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
     (["accuracy", "a.las", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
     (["objects", "ti.geojson", "t.gpkg", "--metadata", "ti.geojson"], INPUT),
