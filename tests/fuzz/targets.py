@@ -40,9 +40,7 @@ from pdal_stages.pipeline.json_source import (
     parse_pipeline,
 )
 from pdal_stages.tiling import inputs
-from pdal_stages.tiling import write_outputs as outputs
-from pdal_stages.tiling.checkpoint import Store
-from pdal_stages.tiling.sorted_points import Piece, sort_points
+from pdal_stages.tiling.sorted_points import sort_points
 from pdal_stages.tiling.tile_grid import TileGrid
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -179,63 +177,6 @@ def ept(data: bytes) -> str:
     extent = inputs.read_extent(inputs.InputSource(str(path), {"type": "readers.ept"}, "ept"))
     assert extent.count >= 0 and np.isfinite(extent.box).all()
     TileGrid(10.0).covering(extent.box)
-    return "read"
-
-
-# ---- what a tiled run keeps ---------------------------------------------------------------------------------
-
-_NOTES = {
-    "a": {"outputs": [["/no/such", 1, 2]], "points": 3, "fingerprint": "f"},
-    "b": {
-        "count": 3,
-        "box": [0, 0, 1, 1],
-        "tiles": [[0, 0, 3]],
-        "cells": [[0, 0, 0, 3]],
-        "fingerprint": "g",
-    },
-}
-
-
-def _notes() -> list[bytes]:
-    with Store(folder()) as keeping:
-        for name, note in _NOTES.items():
-            keeping.finish(name, str(note["fingerprint"]), note)
-        return [Path(keeping.path(name, ".json")).read_bytes() for name in _NOTES]
-
-
-@target(_notes)
-def store(data: bytes) -> str:
-    """Notes of a run: whatever is there, a note is an object or nothing."""
-    notes = []
-    with Store(folder()) as keeping:
-        for name in _NOTES:
-            Path(keeping.path(name, ".json")).write_bytes(data)
-            notes.append(keeping.note(name))
-            assert isinstance(notes[-1], dict)
-        if notes[0].get("outputs"):
-            assert keeping.finished("a", "f") is None  # whose file is not there
-    return "read" if any(notes) else "refused"
-
-
-_SOURCE = inputs.InputSource("/a.las", {"type": "readers.las"}, "las")
-
-
-def _results() -> list[bytes]:
-    rows = np.arange(40, dtype=np.int64)
-    piece = Piece(_SOURCE, "", rows, np.full(40, -1.0))
-    values = {"Classification": (rows % 7).astype(np.uint8), "H": rows / 7}
-    content = outputs.arrays_of([outputs.PieceResults(piece, rows, values)])
-    np.savez(folder() / "result.npz", **content)
-    return [(folder() / "result.npz").read_bytes()]
-
-
-@target(_results)
-def result(data: bytes) -> str:
-    """The results of a tile: what was changed is found, whatever it is."""
-    new = outputs.read_results([str(put("tile.npz", data))], _SOURCE, 40, 0, 40)
-    assert new.kept.all() and set(new.values) == {"Classification", "H"}
-    assert np.array_equal(new.values["Classification"][1], np.arange(40) % 7)
-    assert np.array_equal(new.values["H"][1], np.arange(40) / 7)
     return "read"
 
 

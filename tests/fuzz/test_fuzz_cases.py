@@ -20,8 +20,7 @@ CASES = sorted(
     path for path in (Path(__file__).resolve().parent / "cases").rglob("*") if path.is_file()
 )
 #: Changed inputs that are tried for each target, or seconds of them.
-TRIES = {"pipeline": 300, "model": 60, "cloud": 200, "index": 200, "ept": 200, "store": 200,
-         "result": 150, "network": 25}  # fmt: skip
+TRIES = {"pipeline": 300, "model": 60, "cloud": 200, "ept": 200, "network": 25}
 SECONDS = float(os.environ.get("PDAL_STAGES_FUZZ_SECONDS", 0))
 #: CPU seconds one input may take; beyond it is a finding.
 PATIENCE = 10.0
