@@ -54,7 +54,7 @@ def test_several_files_appear_together_or_not_at_all(tmp_path):
 
 
 def test_a_work_folder_is_one_that_is_swept(tmp_path):
-    """`train` and `adapt` use such a folder: what these leave when they are killed goes with the next file."""
+    """`train` uses such a folder: what these leave when they are killed goes with the next file."""
     with work_folder(tmp_path / "new.model") as folder:
         (folder / "points.npz").touch()
         sweep(tmp_path)

@@ -1,4 +1,4 @@
-"""Commands about models: train, adapt, score and describe them."""
+"""Commands about models: train, score and describe them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TRAINING_OPTIONS = (
 
 
 def add_commands(parser: Parser) -> None:
-    """Add ``models``, ``train``, ``adapt``, ``accuracy`` and ``model``."""
+    """Add ``models``, ``train``, ``accuracy`` and ``model``."""
     parser.command("models", _models, "List the models that come with the package")
 
     rare = ("neighborhoods", "feature_set", "count", "trees", "passes")
@@ -33,15 +33,6 @@ def add_commands(parser: Parser) -> None:
     surveys = "Files of one survey, north=north/*.laz; any other file counts as a survey by itself"
     add("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
     add_tile_sizes(parser.commands["train"])
-
-    what = "Fit a model to a survey without labels"
-    add = parser.command("adapt", _adapt, what, progress=True)
-    add("inputs", nargs="+", metavar="input", help=INPUTS)
-    add("--model", required=True, help="Model file to write, for classify --model")
-    add("--teacher", default="standard", metavar="MODEL", help="Model to learn from (standard)")
-    sure = "Least Reliability to learn from (0.7)"
-    add("--sure", type=float, default=0.7, metavar="SHARE", help=sure)
-    add_tile_sizes(parser.commands["adapt"])
 
     what = "Compare classes with a reference, points or objects"
     add = parser.command("accuracy", _accuracy, what, overrides=True, progress=True)
@@ -97,17 +88,6 @@ def _train(options: argparse.Namespace) -> None:
     print_messages(*(line for line in messages if not score or not line.endswith(score)))
     if text:
         print(text)
-
-
-def _adapt(options: argparse.Namespace) -> None:
-    from ..classifier.model import load_model
-    from ..tiling.train_survey import adapt
-
-    how = tiling_options(options)
-    with signals.sigterm_like_ctrl_c():
-        print_messages(*adapt(options.inputs, options.model, options.teacher, options.sure, how))
-    if Path(options.model).is_file():
-        print(load_model(options.model))
 
 
 def _accuracy(options: argparse.Namespace) -> None:

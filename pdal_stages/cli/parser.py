@@ -16,7 +16,7 @@ from ..base.version import __version__
 #: left out on purpose: like a word that is not a command, it imports all, as it describes all.
 COMMANDS = {
     "classify": ("classify",),
-    "models": ("models", "train", "adapt", "accuracy", "model"),
+    "models": ("models", "train", "accuracy", "model"),
     "pipelines": ("pipeline", "expand", "validate"),
     "installation": ("drivers", "options", "doctor", "plugin", "warmup"),
     "extras": ("objects", "review", "corrections", "demo"),

@@ -180,7 +180,6 @@ REPLACING = [
     *((["train", "a.las", "--base", "m.model", "--model", name], INPUT) for name in ("m.model", "link.model", "hard.model")),
     (["train", "a.las", "--base", "link.model", "--model", "m.model"], INPUT),
     (["pipeline", "base.json"], INPUT),
-    (["adapt", "a.las", "--teacher", "m.model", "--model", "hard.model"], INPUT),
     *((["classify", name, "o/", "--model", "m.model", "--metadata", name], INPUT) for name in ("ti.geojson", "two.geojson")),
     (["classify", "two.geojson", "o/", "--model", "m.model", "--report", "b.json", "--metadata", "two.geojson"], INPUT),
     *((["classify", *names, "o/", "--model", "m.model", "--polygons", "poly.geojson=9", "--metadata", "poly.geojson"], INPUT)
