@@ -17,12 +17,12 @@ import shapely
 
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
-from pdal_stages.objects.comparison import compare_buildings, match_by_overlap, match_by_place
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 from pdal_stages.synthetic import make_town
 from pdal_stages.synthetic.town import ORIGIN
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from object_accuracy import compare_buildings, match_by_overlap, match_by_place
 from town_truth import true_objects
 
 SIZE = 300.0

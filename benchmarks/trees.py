@@ -31,10 +31,10 @@ import laspy
 import numpy as np
 import scipy
 import shapely
+from object_accuracy import match_by_place
 
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.objects.cells import Kind
-from pdal_stages.objects.comparison import match_by_place
 from pdal_stages.objects.crowns import canopy
 
 #: Plots by which settings were chosen, and those that were only scored; points/m2 where they are

@@ -311,3 +311,15 @@ def test_bad_clouds_give_an_error_or_a_whole_file(tmp_path, codes, epsg, text, c
     else:
         assert code == 0
         assert all(not len(layer(target, name)[1]) for name in ("buildings", "trees", "decks"))
+
+
+@pytest.mark.data
+def test_delft_covers_official_outlines(tmp_path, run, data_dir):
+    """Houses stand wall to wall there, so they are covered rather than found one by one."""
+    assert run("objects", f"{data_dir}/delft/train.laz", tmp_path / "delft.gpkg")[0] == 0
+    official = layer(f"{data_dir}/delft/buildings_train.geojson")[1]
+    found = shapely.union_all(layer(tmp_path / "delft.gpkg", "buildings")[1])
+    covered = shapely.area(shapely.intersection(official, found)) / shapely.area(official)
+    assert np.mean(covered >= 0.8) >= 0.96
+    whole = shapely.union_all(official)
+    assert whole.intersection(found).area >= 0.96 * whole.area

@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 
 from ..base.errors import StageError
-from ..base.files import JSON, Output, check_outputs
 from ..base.messages import print_messages
 from . import signals
 from .parser import INPUTS, Parser, add_stage_options, stage_options
@@ -34,7 +33,7 @@ def add_commands(parser: Parser) -> None:
     add("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
     add_tile_sizes(parser.commands["train"])
 
-    what = "Compare classes with a reference, points or objects"
+    what = "Compare classes with a reference"
     add = parser.command("accuracy", _accuracy, what, overrides=True, progress=True)
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     reference = "True classes: the same points in their order"
@@ -43,8 +42,6 @@ def add_commands(parser: Parser) -> None:
     dimension = "Dimension to score (Classification)"
     add("--dimension", default="Classification", metavar="NAME", help=dimension)
     add("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
-    add("--objects", metavar="FILE", help="Compare objects: buildings (polygons) or trees (points)")
-    add("--area", metavar="FILE", help="With --objects: count only objects inside these polygons")
     add("--json", metavar="FILE", help="Write the figures to a JSON file")
     add("--html", metavar="FILE", help="Write a report to a web page")
 
@@ -93,11 +90,6 @@ def _train(options: argparse.Namespace) -> None:
 def _accuracy(options: argparse.Namespace) -> None:
     from ..pipeline.accuracy_files import compare_files
 
-    if options.objects:
-        _compare_objects(options)
-        return
-    if options.area:
-        raise StageError("--area needs --objects", found=options.area)
     if options.reference and options.model:
         raise StageError("--reference and --model exclude each other", found=options.model)
     other = "Classification" if options.reference or options.model else "Reference"
@@ -105,26 +97,6 @@ def _accuracy(options: argparse.Namespace) -> None:
     outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
     settings = *dimensions, options.overrides, options.model or ""
     print_messages(*compare_files(options.inputs, options.reference or (), *settings, **outputs))
-
-
-def _compare_objects(options: argparse.Namespace) -> None:
-    """``accuracy town.gpkg --objects reference.gpkg``."""
-    from ..base.files import write_json
-    from ..objects.comparison import compare_objects, table, to_json
-
-    if len(options.inputs) != 1 or options.reference or options.overrides or options.html:
-        raise StageError(
-            "--objects compares one vector file with another, and add --area and --json alone",
-            found=options.html or ", ".join(options.inputs),
-        )
-    judged, reference = options.inputs[0], options.objects
-    outputs = [Output(options.json, "json", JSON)] if options.json else []
-    check_outputs(outputs, [judged, reference, *([options.area] if options.area else [])])
-    figures, warnings = compare_objects(judged, reference, options.area)
-    print(table(figures), end="")
-    print_messages(*warnings)
-    if options.json:
-        write_json(options.json, to_json(figures), "json")
 
 
 def _model(options: argparse.Namespace) -> None:
