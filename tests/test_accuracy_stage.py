@@ -48,7 +48,7 @@ def models(tmp_path_factory):
     }
     for name, options in (
         ("classes", {"classes": {"2": 2, "3,5": "5 Anything green", "6": 6}}),
-        ("binary", {"strategy": "binary", "target": 6}),
+        ("binary", {"target": 6}),
         ("translated", {"classes": {"2": 5, "3,5": 4, "6": 2}}),
     ):
         train([cloud], TrainingOptions(**common, **options), progress=False).save(

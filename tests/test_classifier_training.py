@@ -233,7 +233,7 @@ def test_errors_say_what_was_found(labels, more, text):
 
 def test_binary():
     xyz, label, dimensions = scene()
-    options = TrainingOptions(**SMALL, strategy="binary", target=6)
+    options = TrainingOptions(**SMALL, target=6)
     model = train([TrainingCloud(xyz, label, dimensions)], options, progress=False)
     assert model.classes == [(1, "Background"), (6, "Building")]
     assert model.info["classes"][0]["labels"] == [2, 5]

@@ -123,7 +123,7 @@ def models(tmp_path_factory, write_las):
     for name, more in {
         "one pass": {"passes": 1},
         "two passes": {"passes": 2},
-        "binary": {"passes": 1, "strategy": "binary", "target": 6},
+        "binary": {"passes": 1, "target": 6},
     }.items():
         paths[name] = str(folder / f"{name.replace(' ', '-')}.model")
         train = {

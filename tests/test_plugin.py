@@ -199,7 +199,6 @@ def test_a_ready_pipeline_gives_the_same_bytes(
 QUICK_RECIPES = {
     "blomley2016": ["count=60", "trees_grid=4,8"],
     "weinmann2018": ["count=60", "trees=8"],
-    "weinmann2018-binary": ["count=60", "trees=8"],
     "he2017": ["count=60", "trees=20"],
     "winiwarter2019": ['alsnet={"configuration": "tiny", "points": 512, "epochs": 1}'],
 }
@@ -213,8 +212,6 @@ def test_the_papers_pipelines_train_and_apply(pipeline, ready_town, tmp_path, re
     model, out = tmp_path / "paper.model", tmp_path / "out.las"
     words = [f"--stage.input.filename={ready_town}", f"--stage.model.filename={model}"]
     words += [f"--stage.model.{word}" for word in (*QUICK_RECIPES[recipe], "classes=2,5,6")]
-    if recipe.endswith("binary"):
-        words.remove("--stage.model.classes=2,5,6")
     stages = with_words(f"paper-{recipe}", *words)
     pipeline(stages)
     apply = {"type": "filters.modelclassifier", "model": str(model)}
@@ -222,8 +219,6 @@ def test_the_papers_pipelines_train_and_apply(pipeline, ready_town, tmp_path, re
     before, after = laspy.read(ready_town), laspy.read(out)
     judged = np.isin(before.classification, [2, 5, 6])
     truth = np.asarray(before.classification)[judged]
-    if recipe.endswith("binary"):
-        truth = np.where(truth == 6, 6, 1)
     right = np.mean(np.asarray(after.classification)[judged] == truth)
     assert right > (0.3 if recipe == "winiwarter2019" else 0.8)
 

@@ -8,7 +8,7 @@ import pytest
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.random_forest import grow_forest
-from pdal_stages.classifier.recipes import NOT_STATED, RECIPES, describe_recipes, with_recipe
+from pdal_stages.classifier.recipes import RECIPES, describe_recipes, with_recipe
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import limit_to_percentiles
 from pdal_stages.classifier.training_options import feature_plan
@@ -25,7 +25,6 @@ TEXTS = {
         "scaling": "percentiles",
         "vote": "majority",
     },
-    "weinmann2018-binary": {"count": 100_000, "features": 560, "strategy": "binary"},
     "he2017": {"count": 1000, "features": 6, "trees": 200, "max_depth": "sqrt"},
 }
 
@@ -40,8 +39,7 @@ EVERYWHERE = {"sampling": "random", "passes": 1, "voxel": 0.0, "prior_weight": 0
 
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_recipe_is_what_the_text_says(name):
-    target = {"target": 6} if name.endswith("binary") else {}
-    options = TrainingOptions.from_recipe(name, **target)
+    options = TrainingOptions(**RECIPES[name])
     wanted = {**EVERYWHERE, **TEXTS[name]}
     assert len(feature_plan(options).names) == wanted.pop("features")
     assert {key: getattr(options, key) for key in wanted} == wanted
@@ -61,26 +59,21 @@ def test_the_networks_recipe():
 
 @pytest.mark.parametrize("name", [*RECIPES])
 def test_what_is_given_beside_a_recipe_replaces_its_value(name):
-    known = {"type": "writers.classifiermodel", "filename": "a.model", "recipe": name, "target": 6}
-    if "binary" not in name:
-        del known["target"]
+    known = {"type": "writers.classifiermodel", "filename": "a.model", "recipe": name}
     stage = stage_from({**known, "voxel": 0.5, "count": 77})
     assert (stage.voxel, stage.count) == (0.5, 77)
-    for option, (value, where) in RECIPES[name].options.items():
-        assert where
+    for option, value in RECIPES[name].items():
         if option not in ("voxel", "alsnet"):
             result = stage.options[option]
             assert result == (77 if option == "count" else _plain(value)), option
-    assert f"  {name} " in describe_recipes() and NOT_STATED in describe_recipes()
+    assert f"  {name}\n" in describe_recipes()
 
 
 def _plain(value):
     return list(value) if isinstance(value, tuple) else value
 
 
-def test_a_binary_recipe_asks_for_its_class():
-    with pytest.raises(OptionError, match="needs 'target'"):
-        TrainingOptions.from_recipe("weinmann2018-binary")
+def test_an_unknown_recipe_is_refused():
     with pytest.raises(OptionError, match="'recipe' must be one of"):
         with_recipe({"recipe": "weinman2018"})
 
@@ -153,7 +146,7 @@ def test_he2017_trains_and_classifies():
     ground = np.column_stack([rng.uniform(0, 30, (4000, 2)), rng.normal(0, 0.02, 4000)])
     trees = np.column_stack([rng.uniform(0, 30, (2000, 2)), rng.uniform(1, 6, 2000)])
     xyz, labels = np.concatenate([ground, trees]), np.repeat([2, 5], [4000, 2000])
-    options = TrainingOptions.from_recipe("he2017", count=300, folds=0)
+    options = TrainingOptions(**{**RECIPES["he2017"], "count": 300, "folds": 0})
     model = train(TrainingCloud(xyz, labels), options, progress=False)
     assert model.passes[0].forest.n_trees == 200 and model.passes[0].forest.depths.max() <= 2
     assert (model.predict(xyz).classification == labels).mean() > 0.97

@@ -69,7 +69,7 @@ def test_defaults(tmp_path, side):
     "more",
     [
         {"passes": 3, "context": ("own", "box2"), "voxel": 0.9},
-        {"strategy": "binary", "target": 6, "classes": {"2": 2, "5": 5, "6": 6}},
+        {"target": 6, "classes": {"2": 2, "5": 5, "6": 6}},
     ],
     ids=["three", "binary"],
 )

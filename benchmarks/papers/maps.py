@@ -19,6 +19,7 @@ from PIL import Image
 
 from pdal_stages import TrainingCloud, TrainingOptions, hag_minima, train
 from pdal_stages.accuracy.measures import Accuracy
+from pdal_stages.classifier.recipes import RECIPES
 from pdal_stages.reports.pictures import triptych
 
 #: Pixels of the longer side and colors of a picture: under 400 kB in a repository.
@@ -65,8 +66,8 @@ def main() -> None:
     options = parser.parse_args()
     for recipe in options.only:
         (training, test, classes), more = MAPS[recipe]
-        chosen = TrainingOptions.from_recipe(
-            recipe, folds=0, classes={str(code): code for code in classes}, **more
+        chosen = TrainingOptions(
+            **{**RECIPES[recipe], "folds": 0, "classes": list(classes), **more}
         )
         xyz, labels, dimensions = read(options.data, training)
         model = train(TrainingCloud(xyz, labels, dimensions, name=recipe), chosen)

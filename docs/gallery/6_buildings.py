@@ -14,7 +14,6 @@ learned, other = town(seed=3), town(seed=4)
 options = ps.TrainingOptions(
     neighborhoods="c1,c2,c5,s2",
     feature_set="covariance,geometric",
-    strategy="binary",
     target=6,
     count=3000,
     trees=50,

@@ -16,12 +16,14 @@ from ..base.errors import OptionError, suggest
 
 #: The largest code a point can carry.
 MAX_CODE = 255
+#: Code of all classes but the target of a binary task: ASPRS "Unclassified".
+BACKGROUND = 1
 
 #: ASPRS name, in small letters -> code.
 _CODES = {name.lower(): code for code, name in NAMES.items()}
 _CURE = (
     "Write classes as a list of codes, [2, 5, 6], or as labels and what they become: "
-    '{"2": "Ground", "3,4,5": "5 Vegetation", "6": 6, "9": "drop"}'
+    '{"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}. Other labels are left out'
 )
 
 
@@ -43,9 +45,9 @@ class ClassMap:
         ----------
         spec : None, str, list of codes or mapping
             None: every label as it is, except those `left_out`. A list: those labels as they
-            are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, a code with a
-            name (``"5 Trees"``), or ``"drop"``. Labels not mentioned are dropped. Text is a
-            comma-separated list.
+            are. A mapping: labels (``"3,4,5"``, ``"3-5"``) to a code, an ASPRS name, or a code with
+            a name (``"5 Trees"``). Labels not mentioned are dropped. Text is a comma-separated
+            list.
         labels_found : iterable of int
             Labels in the training clouds, for None.
         left_out : collection of int
@@ -64,10 +66,9 @@ class ClassMap:
         names: dict[int, str | None] = {}
         members: dict[int, list[int]] = {}
         for labels, value in pairs:
-            target = _target(value, labels)
-            if target is not None:
-                names[target[0]] = names.get(target[0]) or target[1]
-                members.setdefault(target[0], []).extend(labels)
+            code, name = _target(value)
+            names[code] = names.get(code) or name
+            members.setdefault(code, []).extend(labels)
         every = [label for labels, _ in pairs for label in labels]
         if len(every) > len(set(every)):
             twice = next(label for label in sorted(every) if every.count(label) > 1)
@@ -76,23 +77,19 @@ class ClassMap:
         named = tuple(names[code] or class_name(code) for code in codes)
         return cls(codes, named, tuple(tuple(sorted(members[code])) for code in codes))
 
-    def binary(self, target: int, background: int) -> ClassMap:
-        """Return one class against all the others, which become `background`."""
-        if target not in self.codes:
+    def binary(self, target: int) -> ClassMap:
+        """Return one class against all the others, which become :data:`BACKGROUND`."""
+        others = [code for code in self.codes if code != target]
+        if target not in self.codes or target == BACKGROUND or not others:
             raise OptionError(
-                "'target' is not one of the classes",
+                f"'target' must be one of several classes, and not {BACKGROUND}, which the others "
+                "become",
                 found=target,
                 cure=f"Choose one of {list(self.codes)}",
             )
-        if background == target:
-            raise OptionError("'background' and 'target' are the same code", found=target)
         i = self.codes.index(target)
-        rest = tuple(
-            sorted(label for k, part in enumerate(self.labels) if k != i for label in part)
-        )
-        if not rest:
-            raise OptionError("nothing is left: 'classes' names the target only", cure=_CURE)
-        both = sorted([(target, self.names[i], self.labels[i]), (background, "Background", rest)])
+        rest = tuple(sorted({label for part in self.labels for label in part} - {*self.labels[i]}))
+        both = sorted([(target, self.names[i], self.labels[i]), (BACKGROUND, "Background", rest)])
         return ClassMap(*zip(*both, strict=True))
 
     def index(self, labels: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
@@ -131,21 +128,16 @@ def _code(value: Any, what: str) -> int:
         raise
 
 
-def _target(value: Any, labels: tuple[int, ...]) -> tuple[int, str | None] | None:
-    """Return the code and name that a mapping's value stands for; None for dropped."""
-    if value is not None and not isinstance(value, str):
+def _target(value: Any) -> tuple[int, str | None]:
+    """Return the code and name that a mapping's value stands for."""
+    if not isinstance(value, str):
         return _code(value, "code"), None
-    word = " ".join((value or "drop").split())
-    if word.lower() in ("drop", ""):
-        return None
+    word = " ".join(value.split())
     if match := re.fullmatch(r"(\d{1,5})\s*[:=]?\s*(.*)", word):
         return _code(match[1], "code"), match[2] or None
-    if word.lower() in _CODES:
-        return _CODES[word.lower()], word
-    if len(labels) == 1 and labels[0] <= MAX_CODE:
-        return labels[0], word
-    raise OptionError(
-        f"'{word}' is not an ASPRS class, and several labels become it",
-        found=f"labels {list(labels)}",
-        cure=suggest(word.lower(), _CODES) + f"Say its code too: '5 {word}'",
-    )
+    if word.lower() not in _CODES:
+        raise OptionError(
+            f"'{word}' is not an ASPRS class",
+            cure=suggest(word.lower(), _CODES) + f"Say its code too: '5 {word}'",
+        )
+    return _CODES[word.lower()], word

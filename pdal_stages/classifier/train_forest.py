@@ -32,8 +32,6 @@ from .sampling import BLOCK_M, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
 
-#: Folds of the cross-validation by default (not tuned).
-DEFAULT_FOLDS = 5
 #: Trees of a forest that judges a fold, as a share of the final one's: five folds then cost about
 #: as much as it (not tuned).
 FOLD_TREES = 0.25
@@ -60,6 +58,8 @@ def outputs(options: TrainingOptions) -> list[Output]:
 
 def own_options(options: Any) -> None:
     """Return None: a forest has no options beside ``TrainingOptions``."""
+    if options:
+        raise OptionError("'alsnet' is for the algorithm of that name", found="random_forest")
 
 
 def inputs(options: TrainingOptions) -> tuple[str, ...]:
@@ -258,7 +258,6 @@ class ForestTraining:
         o, samples, codes = self.options, self.samples, self.codes
         if o.folds == 0:
             return None, {}
-        folds = o.folds or DEFAULT_FOLDS
         reaches = (each.reach or 0.0 for each in self.features.plan.neighborhoods)
         gap = max(reaches, default=0.0)
         group = samples.take(self._groups)
@@ -272,10 +271,12 @@ class ForestTraining:
             here = 0.0 if by == "surveys" else gap
             try:
                 if by == "blocks":
-                    blocks = Folds.of_blocks(self.xy, samples.label, samples.weight, folds, BLOCK_M)
+                    blocks = Folds.of_blocks(
+                        self.xy, samples.label, samples.weight, o.folds, BLOCK_M
+                    )
                     fold = blocks.points(self.xy)
                 else:
-                    fold = (index % folds).astype(np.int16)
+                    fold = (index % o.folds).astype(np.int16)
                 matrix = np.zeros((len(codes), len(codes)), np.int64)
                 each = self._without_each(self.first, fold, "cross-validation", here, len(codes))
                 for rows, forest in each:

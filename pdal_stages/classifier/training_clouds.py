@@ -24,7 +24,7 @@ from ..base.version import __version__
 from ..features.cell_means import density
 from ..features.point_grid import check_xyz
 from ..features.voxels import represent
-from .class_map import MAX_LABEL, ClassMap
+from .class_map import BACKGROUND, MAX_LABEL, ClassMap
 from .input_dimensions import list_values
 from .training_options import TrainingOptions
 
@@ -266,9 +266,9 @@ class Labeled:
             self.classes.codes, self.classes.names, self.classes.labels, counts, strict=True
         )
         return {
-            "strategy": options.strategy,
+            "strategy": "multiclass" if options.target is None else "binary",
             "target": options.target,
-            "background": options.background if options.strategy == "binary" else None,
+            "background": None if options.target is None else BACKGROUND,
             "classes": [
                 {"code": code, "name": name, "labels": list(labels), **counted}
                 for code, name, labels, counted in classes
@@ -300,8 +300,8 @@ def label_classes(
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(counts.items())[:20])
     listing = listing or "no points"
     classes = ClassMap.parse(options.classes, counts, _left_out(options))
-    if options.strategy == "binary" and options.target is not None:
-        classes = classes.binary(options.target, options.background)
+    if options.target is not None:
+        classes = classes.binary(options.target)
     for code, name, members in zip(classes.codes, classes.names, classes.labels, strict=True):
         if not any(counts.get(label) for label in members):
             raise OptionError(

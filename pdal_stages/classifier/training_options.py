@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 # ruff: noqa: RUF009  options are declared, nothing is shared
-import textwrap
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ..base import checks
@@ -17,7 +16,6 @@ from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
 from .class_map import MAX_LABEL
 from .context_features import OWN, Context
-from .recipes import with_recipe
 from .registry import FOREST, kinds, trainer_of
 
 #: Most passes that training makes: a third one gained nothing (docs/trials.md).
@@ -35,36 +33,23 @@ DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
-def _listed(value: Any) -> list[Any]:
-    """Return a list; a number is a list of one."""
-    return [value] if isinstance(value, int | float) else list(value)
+def _each(check: Callable[..., Any], *limits: float, **more: Any) -> Callable[..., Any]:
+    """Return a check of a number, or of each number in a list."""
 
+    def check_all(what: str, value: Any) -> tuple[Any, ...]:
+        numbers = [value] if isinstance(value, int | float) else value
+        return tuple(check(what, each, *limits, **more) for each in numbers)
 
-def _check_densities(what: str, value: Any) -> tuple[float, ...]:
-    return tuple(checks.number(what, each, 0, 10**6, above=True) for each in _listed(value))
-
-
-def _check_labels(what: str, value: Any) -> tuple[int, ...]:
-    return tuple(checks.whole(what, each, 0, MAX_LABEL) for each in _listed(value))
-
-
-def _check_tree_numbers(what: str, value: Any) -> tuple[int, ...]:
-    return tuple(sorted({checks.whole(what, each, 1, 10_000) for each in _listed(value)}))
-
-
-def _check_folds(what: str, value: Any) -> int:
-    if (folds := checks.whole(what, value, 0, 1000)) == 1:
-        raise OptionError(f"{what} must be 0 or at least 2", found=1)
-    return folds
+    return check_all
 
 
 def _check_voxel(what: str, value: Any) -> float:
-    return check_side(checks.number(what, value, 0, LARGEST, unit="m"))
+    return check_side(checks.number(what, value))
 
 
 @dataclass(frozen=True)
 class TrainingOptions(Settings):
-    """Options of training a model."""
+    """Options of training a model, those of ``writers.classifiermodel``, which describes them."""
 
     neighborhoods: Any = setting(
         ("s5", "k10", "k20", "k50"),
@@ -92,15 +77,8 @@ class TrainingOptions(Settings):
         '{"2": "Ground", "3,4,5": "5 Vegetation", "6": 6}; default: every label but 0, 1, 7, 12 '
         "and 18, and these where the base has them",
     )
-    strategy: str = setting(
-        "multiclass",
-        "string",
-        "All classes at once, or 'target' against all the others",
-        choices=("multiclass", "binary"),
-    )
-    target: int | None = setting(None, "integer", "Class to find with the binary strategy", 0, 255)
-    background: int = setting(
-        1, "integer", "Code given to all other classes with the binary strategy", 0, 255
+    target: int | None = setting(
+        None, "integer", "Class to tell from all the others, which become class 1", 0, 255
     )
     count: int = setting(
         40_000,
@@ -125,7 +103,7 @@ class TrainingOptions(Settings):
         "numbers",
         "Numbers of trees to choose from by out-of-bag accuracy on the samples, instead of 'trees'",
         may_be_empty=True,
-        check=_check_tree_numbers,
+        check=_each(checks.whole, 1, 10_000),
     )
     max_depth: str | None = setting(
         None,
@@ -177,7 +155,7 @@ class TrainingOptions(Settings):
         "Densities of thinned copies to train on as well, points/m2, so that the model also works "
         "on sparse clouds",
         may_be_empty=True,
-        check=_check_densities,
+        check=_each(checks.number, 0, 10**6, above=True),
     )
     voxel: float = setting(
         0.125,
@@ -193,15 +171,14 @@ class TrainingOptions(Settings):
         "list",
         "Labels of points to leave out, even as neighbors, unless 'classes' names them; default: "
         "noise",
-        check=_check_labels,
+        check=_each(checks.whole, 0, MAX_LABEL),
     )
-    folds: int | None = setting(
-        None,
+    folds: int = setting(
+        5,  # not tuned
         "integer",
-        "Folds of cross-validation by group, survey or block of ground; 0 for none; default: 5, "
-        "with a quarter of the trees",
+        "Folds of cross-validation by group, survey or block of ground, with a quarter of the "
+        "trees; 0 for none",
         *(0, 1000),
-        check=_check_folds,
     )
     groups: str = setting(
         "",
@@ -256,7 +233,8 @@ class TrainingOptions(Settings):
     def __post_init__(self) -> None:
         """Check all options, and fill in those that follow from others."""
         super().__post_init__()
-        self._check_algorithm()
+        checks.one_of("'algorithm'", self.algorithm, kinds())
+        self._set(alsnet=trainer_of(self.algorithm).own_options(self.alsnet))
         if self.base is not None:
             self._check_base()
         passes = DEFAULT_PASSES if self.base is None else 1
@@ -269,59 +247,30 @@ class TrainingOptions(Settings):
             raise OptionError(
                 "several passes need a context", found="an empty list", cure="Leave 'context' out"
             )
-        if self.strategy == "binary" and self.target is None:
-            raise OptionError("the binary strategy needs 'target', the code of the class to find")
-        if self.strategy == "multiclass" and self.target is not None:
-            raise OptionError("'target' applies only to strategy 'binary'", found=self.target)
         resolve_threads(self.threads)
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
-    def _check_algorithm(self) -> None:
-        checks.one_of("'algorithm'", self.algorithm, kinds())
-        for name in kinds():  # an algorithm's own options stand under its name
-            if name != self.algorithm and getattr(self, name, None):
-                raise OptionError(f"'{name}' is for algorithm '{name}'", found=self.algorithm)
-        options = trainer_of(self.algorithm).own_options(getattr(self, self.algorithm, None))
-        if options is not None:
-            self._set(**{self.algorithm: options})
-
     def _check_base(self) -> None:
-        passes = getattr(self.base, "passes", None)
-        if passes is None:
+        passes: Sequence[Any] = getattr(self.base, "passes", ())
+        if not 0 < len(passes) <= MOST_PASSES or passes[0].features is None:
             raise OptionError(
-                "'base' must be a model",
-                found=type(self.base).__name__,
-                cure="Load it with load_model",
+                f"a base must be a model of up to {MOST_PASSES} forests",
+                found=", ".join(each.name for each in passes) or repr(self.base)[:60],
+                cure="Load it with load_model; of a refined model take the one that it was built "
+                "on, with all labels together",
             )
-        if len(passes) > MOST_PASSES or self.base.gives_variance:
-            raise OptionError(
-                f"a base must be up to {MOST_PASSES} forests",
-                found=", ".join(each.name for each in passes),
-                cure="Start from the model that it was built on, with all labels together",
-            )
-        if (
-            self.algorithm != FOREST
-            or self.strategy != "multiclass"
-            or self.passes not in (None, 1)
-        ):
+        if self.algorithm != FOREST or self.target is not None or self.passes not in (None, 1):
             raise OptionError(
                 "on a 'base' there is one forest that knows all labeled classes",
-                found=f"algorithm {self.algorithm}, strategy {self.strategy}, passes {self.passes}",
+                found=f"algorithm {self.algorithm}, target {self.target}, passes {self.passes}",
                 cure="Leave these options out",
             )
         if self.context is not None and OWN not in Context.parse(self.context).tokens:
             raise OptionError(f"on a base, 'context' needs '{OWN}'", found=str(self.context)[:60])
         self._set(voxel=self.base.voxel)
-
-    @classmethod
-    def from_recipe(cls, recipe: str, **options: Any) -> TrainingOptions:
-        """Return the options of a recipe, a key of ``recipes.RECIPES``; `options` replace some."""
-        values = with_recipe({"recipe": recipe, **options})
-        del values["recipe"]
-        return cls(**values)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -334,16 +283,3 @@ def feature_plan(options: TrainingOptions) -> FeaturePlan:
     return FeaturePlan.parse(
         options.neighborhoods, feature_set=options.feature_set, dimensions=options.dimensions
     )
-
-
-def _documented() -> str:
-    """Return the docstring of the options, from their declarations."""
-    lines = ["Options of training a model.", "", "Attributes", "----------"]
-    for option in fields(TrainingOptions):
-        unit = f", {option.metadata['unit']}" if option.metadata.get("unit") else ""
-        text = textwrap.fill(f"{option.metadata['help']}.", 96)
-        lines += [f"{option.name} : {option.type}{unit}", textwrap.indent(text, "    ")]
-    return "\n".join([*lines, ""])
-
-
-TrainingOptions.__doc__ = _documented()

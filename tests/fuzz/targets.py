@@ -98,7 +98,7 @@ def _pipelines() -> list[bytes]:
         b'*/{"type":"writers.las","filename":"o#.las","extra_dims":"all",'
         b'"minor_version":4,"dataformat_id":6,"forward":"all"}]}',
         b'[{"type":"writers.classifiermodel","filename":"m.model","classes":{"2":"Ground","3,4,5":"5 Vegetation",'
-        b'"6":6},"strategy":"binary","target":2,"trees":10,"dimensions":["Intensity"]}]',
+        b'"6":6},"target":2,"trees":10,"dimensions":["Intensity"]}]',
     ]
 
 
