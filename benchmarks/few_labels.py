@@ -19,8 +19,8 @@ import laspy
 import numpy as np
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
+from pdal_stages.classifier.interface import preprocessing
 from pdal_stages.classifier.model import load_model
-from pdal_stages.classifier.registry import preprocessing
 
 #: File, what its labels become, codes that are dropped.
 SURVEYS = {

@@ -254,7 +254,7 @@ def test_where_no_torch_is_training_says_what_to_install(monkeypatch):
     "values, text",
     [
         ({"algorithm": "alsnett"}, "must be one of"),
-        ({"alsnet": {"epochs": 3}}, "for algorithm"),
+        ({"alsnet": {"epochs": 3}}, "for the algorithm"),
         ({"algorithm": "alsnet", "alsnet": {"epoch": 3}}, "Did you mean 'epochs'"),
         ({"algorithm": "alsnet", "alsnet": {"configuration": "tinny"}}, "tiny"),
         ({"algorithm": "alsnet", "alsnet": [1]}, "mapping"),

@@ -16,10 +16,9 @@ from sklearn.ensemble import RandomForestClassifier
 
 from pdal_stages.base.errors import ModelError, StageError
 from pdal_stages.classifier import model_file
-from pdal_stages.classifier.interface import ArrayRule
+from pdal_stages.classifier.interface import ArrayRule, classifier_of
 from pdal_stages.classifier.model_file import from_bytes, to_bytes
 from pdal_stages.classifier.random_forest import Forest
-from pdal_stages.classifier.registry import classifier_of
 
 FEATURES = 6
 

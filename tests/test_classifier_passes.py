@@ -136,8 +136,6 @@ def test_the_file_holds_all_passes(three, other, tmp_path):
         ["own", "columnvotes2"],
         ["own", "columnvotes2"],
     ]
-    assert set(again.importances("group", 1)) == {"covariance", "dimension", "context"}
-    assert sum(again.importances("neighborhood", 2).values()) == pytest.approx(1)
     assert "pass 3" in str(again) and "columnvotes2" in str(again)
 
 

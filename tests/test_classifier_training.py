@@ -164,18 +164,14 @@ def test_counts_scores_and_importances(trained):
     assert [entry["samples"] + entry["duplicates"] for entry in classes.values()] == [150] * 3
     score = trained.info["accuracy"]["cross_validation"]["chosen"]
     assert 0.8 < score["overall_accuracy"] <= 1 and set(score["f1"]) == {"2", "5", "6"}
-    for by in ("column", "feature", "group", "neighborhood"):
-        assert sum(trained.importances(by).values()) == pytest.approx(1)
-    assert set(trained.importances("neighborhood")) == {"c1", "s2", "kopt(5,20)", "(dimension)"}
-    assert set(trained.importances("group")) == {"covariance", "geometric", "shapes", "dimension"}
-    with pytest.raises(OptionError, match="grouped"):
-        trained.importances("color")
+    importances = trained.importances()
+    assert sum(importances.values()) == pytest.approx(1)
+    assert {"Linearity_c1", "D2_0_s2", "HeightAboveGround"} <= importances.keys()
     text = str(trained)
     for word in (
         "Ground",
         "Building",
         "kopt(5,20)",
-        "D2",
         "HeightAboveGround",
         "a.laz",
         "held out",

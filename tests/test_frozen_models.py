@@ -140,7 +140,6 @@ def test_the_shipped_model_is_described_in_words(capsys):
         "of points right, on ground it had not seen",
         "filters.hag_morphological (ground True, openings",
         f"version {model.info['algorithms']['filters.hag_morphological']} of its algorithm",
-        "12 features, Linearity, Planarity",
         "Montpellier, Delft, Seville",
         *(f"{code} {name}" for code, name in model.classes),
     ):

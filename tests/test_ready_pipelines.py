@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pdal_stages import run_tiled
-from pdal_stages.classifier.recipes import RECIPES
+from pdal_stages.classifier.training_options import RECIPES
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.pipeline.run import Pipeline

@@ -8,10 +8,14 @@ import pytest
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.random_forest import grow_forest
-from pdal_stages.classifier.recipes import RECIPES, describe_recipes, with_recipe
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import limit_to_percentiles
-from pdal_stages.classifier.training_options import feature_plan
+from pdal_stages.classifier.training_options import (
+    RECIPES,
+    describe_recipes,
+    feature_plan,
+    with_recipe,
+)
 from pdal_stages.cli import main
 from pdal_stages.features import FeaturePlan
 from pdal_stages.stages.registry import stage_from

@@ -21,8 +21,8 @@ from pdal_stages.base.errors import ModelError, OptionError, StageError
 from pdal_stages.classifier import model_file
 from pdal_stages.classifier.auto_context import classify
 from pdal_stages.classifier.context_features import count_shares
+from pdal_stages.classifier.feature_forest import Blend
 from pdal_stages.classifier.interface import PredictRequest
-from pdal_stages.classifier.refinement import Blend
 from pdal_stages.classifier.training_clouds import label_classes
 from pdal_stages.features import FeatureEngine
 

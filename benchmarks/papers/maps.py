@@ -19,7 +19,7 @@ from PIL import Image
 
 from pdal_stages import TrainingCloud, TrainingOptions, hag_minima, train
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.classifier.recipes import RECIPES
+from pdal_stages.classifier.training_options import RECIPES
 from pdal_stages.reports.pictures import triptych
 
 #: Pixels of the longer side and colors of a picture: under 400 kB in a repository.

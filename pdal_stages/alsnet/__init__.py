@@ -1,6 +1,6 @@
 """alsNet: PointNet++ for airborne laser scans [WM19], a kind of classifier of model files."""
 
-from ..classifier.registry import register_kind
+from ..classifier.interface import register_kind
 
 
 def _network():

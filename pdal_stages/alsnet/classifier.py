@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..base.errors import ModelError
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.input_dimensions import add_return_features, take_dimensions
-from ..classifier.interface import ArrayRule, Block, Column, InputPlan, PredictRequest
+from ..classifier.interface import ArrayRule, Block, InputPlan, PredictRequest
 from .batches import Batches, Pyramid, augment, build_pyramid, halo_m, random_order
 from .configuration import Configuration, parse_configuration
 from .network import NumpyNetwork, Weights, check_weights
@@ -93,10 +93,6 @@ class AlsNet:
             "copt_threshold": None,
             "feature_seed": 0,
         }
-
-    def columns(self, codes: Sequence[int]) -> list[Column]:
-        """Return the inputs."""
-        return [Column(name, name, "dimension", "(dimension)") for name in self.inputs]
 
     @property
     def plan(self) -> InputPlan:

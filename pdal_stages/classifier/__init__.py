@@ -1,6 +1,6 @@
 """Classifiers of points: the model file, the random forest, auto-context passes, and training."""
 
-from .registry import FOREST, register_kind
+from .interface import FOREST, register_kind
 
 
 def _forest():

@@ -62,17 +62,11 @@ class ReliabilityLimits:
             "(unclassified):"
         ]
         for code, limit in self.classes.items():
-            name = f"{code} {names.get(code, '')}".strip()
-            if limit.kept:
-                lines.append(
-                    f"  {name}: {100 * limit.kept:.1f} % keep it, from reliability "
-                    f"{limit.reliability:.2f} on"
-                )
-            else:
-                lines.append(
-                    f"  {name}: no point keeps it, as at most {100 * limit.accuracy:.1f} % of the "
-                    "most reliable were right"
-                )
+            cost = f"{100 * limit.kept:.1f} % keep it, from reliability {limit.reliability:.2f} on"
+            if not limit.kept:
+                right = f"at most {100 * limit.accuracy:.1f} % of the most reliable were right"
+                cost = f"no point keeps it, as {right}"
+            lines.append(f"  {code} {names.get(code, '')}".rstrip() + f": {cost}")
         return lines
 
 
@@ -94,8 +88,9 @@ class Calibration:
         """Count points: (n,) codes predicted, true codes, reliabilities, and weights."""
         place = np.floor(np.asarray(reliability, np.float64) * BINS)
         place = np.clip(place, 0, BINS - 1).astype(np.int64)
+        is_right = predicted == true
         for code in np.unique(predicted).tolist():
-            for table, chosen in ((self.right, predicted == true), (self.wrong, predicted != true)):
+            for table, chosen in ((self.right, is_right), (self.wrong, ~is_right)):
                 rows = (predicted == code) & chosen
                 counts = np.bincount(place[rows], None if weight is None else weight[rows], BINS)
                 table[code] = table.get(code, np.zeros(BINS)) + counts
@@ -131,12 +126,12 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for a manifest or a file."""
-        tables = {"right": self.right, "wrong": self.wrong}
+
+        def rounded(counts: npt.NDArray[np.float64]) -> list[float]:
+            return [float(f"{value:.{_DIGITS}g}") for value in counts]
+
         classes = {
-            str(code): {
-                name: [float(f"{value:.{_DIGITS}g}") for value in table[code]]
-                for name, table in tables.items()
-            }
+            str(code): {"right": rounded(self.right[code]), "wrong": rounded(self.wrong[code])}
             for code in sorted(self.right)
         }
         return {"about": self.about, "classes": classes}
@@ -180,16 +175,12 @@ def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
             return Calibration.from_dict(strict_json(beside.read_bytes()))
         except (OSError, ValueError, RecursionError) as error:
             raise ModelError("the calibration is damaged", where=str(beside), found=error) from None
-    cure = "Train it with folds (the default), on labels that lie in more than one place"
-    if info.get("teacher"):
-        cure = (
-            "Its labels are another model's answers; take one that was scored on a person's labels"
-        )
     raise OptionError(
         "how often this model is right at which Reliability is not known: it was never scored on "
         "ground held out",
         found=path,
-        cure=f"{cure}; or set a limit by hand: --filters.modelclassifier.reject_below=0.8",
+        cure="Train it with folds (the default), on a person's labels that lie in more than one "
+        "place; or set a limit by hand: --filters.modelclassifier.reject_below=0.8",
     )
 
 
@@ -219,9 +210,7 @@ def calibrate_on_base(
     points = known.points(known.right)
     scale = points / (counts.points(known.right) or points)
     for code in counts.right.keys() - known.right.keys():
-        known.right[code], known.wrong[code] = (
-            scale * counts.right[code],
-            scale * counts.wrong[code],
-        )
+        known.right[code] = scale * counts.right[code]
+        known.wrong[code] = scale * counts.wrong[code]
     known.about = f"its base ({known.about}), as its own labels lie where that was looked at"
     return known.to_dict()

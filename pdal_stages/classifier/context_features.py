@@ -105,23 +105,17 @@ class Context:
         """Meters, along x or y, to the farthest point that can matter."""
         return 2.0 * self.strip
 
-    def describe_columns(self, codes: Sequence[int]) -> list[tuple[str, str, str]]:
-        """Return name, feature and token of the columns, where the pass before has these classes.
-
-        The name is as in ``Probability_2_box0_5``, the feature ``Probability_2``.
-        """
-        columns = []
-        for token in self.tokens:
-            features: Sequence[str] = [f"Probability_{code}" for code in codes]
-            if token in self.segment_codes:
-                features = COLUMNS
-            end = token.replace(".", "_")
-            columns += [(f"{feature}_{end}", feature, token) for feature in features]
-        return columns
-
     def names(self, codes: Sequence[int]) -> tuple[str, ...]:
-        """Return the names of the columns, where the pass before has these classes."""
-        return tuple(name for name, _, _ in self.describe_columns(codes))
+        """Return the names of the columns, where the pass before has these classes.
+
+        They are as ``Probability_2_box0_5``.
+        """
+        names: list[str] = []
+        for token in self.tokens:
+            of_codes = [f"Probability_{code}" for code in codes]
+            features = COLUMNS if token in self.segment_codes else of_codes
+            names += [f"{feature}_{token.replace('.', '_')}" for feature in features]
+        return tuple(names)
 
     def cell_means(
         self,

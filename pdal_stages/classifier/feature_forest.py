@@ -12,16 +12,15 @@ import numpy.typing as npt
 from ..base.errors import ModelError
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.engine import FeatureBlock, Run
-from ..features.registry import BY_NAME
 from .context_features import OWN, Context
 from .input_dimensions import add_return_features, take_dimensions
-from .interface import ArrayRule, Column, PredictRequest
+from .interface import FOREST, REFINED_FOREST, ArrayRule, PredictRequest
 from .random_forest import Forest
-from .refinement import Blend
-from .registry import FOREST, REFINED_FOREST
 
 #: Blocks of features get so many megabytes at least, whatever the request says (not tuned).
 _LEAST_MB = 16.0
+#: Least sum of probabilities that is divided by.
+_SMALLEST = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +132,66 @@ class CloudFeatures:
 
 
 @dataclass(frozen=True, eq=False)
+class Blend:
+    """Rule of a forest that refines a trained model, its base: joins the probabilities of both.
+
+    Classes that only the base knows stay. Of the others the forest counts the more, the more labels
+    it was trained on.
+    """
+
+    before: tuple[int, ...]  #: classes of the pass before
+    labeled: tuple[int, ...]  #: classes of the forest, in the order of its columns
+    #: weight of the forest, 0 to 1, where both know a class; the base has the rest
+    trusted: float = 1.0
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any], codes: Sequence[int]) -> Blend:
+        """Return the blend that a manifest describes for a pass whose classes are `codes`.
+
+        ModelError where its classes contradict each other.
+        """
+        blend = cls(tuple(entry["before"]), tuple(entry["labeled"]), float(entry["trusted"]))
+        ascending = all(sorted(set(each)) == list(each) for each in (blend.before, blend.labeled))
+        if not ascending or blend.codes != list(codes):
+            raise ModelError("classes of a refined forest do not fit", found=str(entry)[:100])
+        return blend
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry of a manifest."""
+        classes = {"before": list(self.before), "labeled": list(self.labeled)}
+        return {**classes, "trusted": self.trusted}
+
+    @property
+    def codes(self) -> list[int]:
+        """Classes of the result."""
+        return sorted({*self.before, *self.labeled})
+
+    def __call__(
+        self, base: npt.NDArray[np.float64], forest: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
+        """Return probabilities (n, classes) in the order of :attr:`codes`.
+
+        Parameters
+        ----------
+        base : (n, before) float64
+            Probabilities of the pass before. Classes that only it knows keep theirs, and the
+            labeled ones share the rest.
+        forest : (n, labeled) float64
+            Probabilities of the forest.
+        """
+        out = np.zeros((len(base), len(self.codes)))
+        out[:, np.searchsorted(self.codes, self.before)] = base
+        columns = np.searchsorted(self.codes, self.labeled)
+        by_base = out[:, columns]
+        share = by_base.sum(axis=1, keepdims=True)
+        by_base = np.where(share > 0, by_base / np.maximum(share, _SMALLEST), forest)
+        kept = np.delete(out, columns, axis=1).sum(axis=1, keepdims=True)
+        mixed = self.trusted * forest + (1.0 - self.trusted) * by_base
+        out[:, columns] = np.maximum(1.0 - kept, 0.0) * mixed
+        return out
+
+
+@dataclass(frozen=True, eq=False)
 class FeatureForest:
     """A forest and what it reads."""
 
@@ -184,7 +243,7 @@ class FeatureForest:
         blend = {} if self.blend is None else self.blend.to_dict()
         return {
             "parameters": {**self.forest.parameters(), **blend},
-            "feature_names": [column.name for column in self.columns(codes)],
+            "feature_names": self.inputs(codes),
             "dimensions": list(self.plan.dimensions),
             "context": [] if self.context is None else list(self.context.tokens),
             **self.features.to_dict(),
@@ -198,22 +257,10 @@ class FeatureForest:
         """Return the classes of the pass before; `codes` are its own."""
         return list(codes if self.blend is None else self.blend.before)
 
-    def columns(self, codes: Sequence[int]) -> list[Column]:
-        """Return the inputs, in order; bins of a histogram are one feature."""
-        described: dict[int, tuple[str, str, str]] = {}
-        for part in self.plan.layout:
-            for name, number in part.at.items():
-                group = BY_NAME[name].group
-                feature = name.split("_")[0] if group == "shapes" else name
-                described[number] = (feature, group, part.neighborhood.token)
-        columns = [
-            Column(name, *described[number]) for number, name in enumerate(self.plan.features)
-        ]
-        columns += [Column(name, name, "dimension", "(dimension)") for name in self.plan.dimensions]
-        if self.context is not None:
-            read = self.context.describe_columns(self.classes_before(codes))
-            columns += [Column(name, feature, "context", token) for name, feature, token in read]
-        return columns
+    def inputs(self, codes: Sequence[int]) -> list[str]:
+        """Return the names of the inputs, in order."""
+        context = () if self.context is None else self.context.names(self.classes_before(codes))
+        return [*self.plan.names, *context]
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64] | None = None

@@ -1,17 +1,28 @@
-"""Interface of all kinds of classifiers: their request, results, and entries in model files."""
+"""Interface of all kinds of classifiers: their request and results, and how they are registered.
+
+Imports only go downward, so this room cannot import the network or the stages of pipelines. Such a
+room registers itself in its ``__init__``, which the package's own ``__init__`` imports. What it
+registers are functions that import the implementation when it is first needed, so that a forest is
+applied without the network's modules.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from ..base.errors import ModelError
 from ..base.report import Report
-from ..features import FeaturePlan
 from ..features.point_grid import CellGrid
+
+#: The kind of a forest on features.
+FOREST = "random_forest"
+#: The kind of a forest on features that refines the passes of another model.
+REFINED_FOREST = "refined_forest"
 
 
 class ArrayRule(NamedTuple):
@@ -28,15 +39,6 @@ class InputPlan:
     names: tuple[str, ...]  #: its inputs, in order
     dimensions: tuple[str, ...]  #: which of them are dimensions of the points
     halo_m: float  #: meters around a tile whose points the tile's results depend on
-
-
-class Column(NamedTuple):
-    """An input of a classifier, with the feature, the group and the neighborhood it belongs to."""
-
-    name: str
-    feature: str
-    group: str
-    neighborhood: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,54 +64,6 @@ class PredictRequest:
         return len(self.xyz) if self.rows is None else len(self.rows)
 
 
-class PassClassifier(Protocol):
-    """Classifier that is one pass of a model.
-
-    A kind that reads features and the context of the pass before has ``probabilities(values,
-    rows)``: (b, classes) from features and context (b, inputs) at `rows`, and
-    ``classes_before(codes)``: the classes of the pass before, where its own are `codes`. One that
-    reads the points themselves can only be the first pass, and has ``predict(request)``, which
-    yields a :class:`Block` after the other, with each row wanted once.
-    """
-
-    #: arrays that the kind stores in a model file; a name that ends in ``*`` stands for many
-    rules: ClassVar[Mapping[str, ArrayRule]]
-
-    @property
-    def name(self) -> str:
-        """The kind, as a manifest has it."""
-
-    @property
-    def plan(self) -> FeaturePlan | InputPlan:
-        """Inputs that it reads of the points."""
-
-    @property
-    def features(self) -> Any:
-        """Features that it reads; None for a kind that reads the points themselves."""
-
-    @property
-    def context(self) -> Any:
-        """Context that it reads of the pass before; None for none."""
-
-    @classmethod
-    def from_file(
-        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
-    ) -> PassClassifier:
-        """Return the classifier that a pass of a manifest describes.
-
-        ModelError where the entry contradicts itself.
-        """
-
-    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
-        """Return what a manifest says of it beside its arrays."""
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return its arrays, for the model file."""
-
-    def columns(self, codes: Sequence[int]) -> list[Column]:
-        """Return its inputs, in order."""
-
-
 class Block(NamedTuple):
     """Probabilities of some points."""
 
@@ -131,3 +85,82 @@ def weigh(
     p = p * factors
     p /= p.sum(axis=1, keepdims=True)
     return p
+
+
+_kinds: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {}
+_preprocessing: list[Callable[[], Any]] = []
+
+
+def register_kind(name: str, classifier: Callable[[], Any], trainer: Callable[[], Any]) -> None:
+    """Register a kind of classifier by the name that manifests and the option `algorithm` use.
+
+    Its classifier is a class, and an object of it one pass of a model, with
+
+    - ``rules``: name -> :class:`ArrayRule` of the arrays that the kind stores in a model file; a
+      name that ends in ``*`` stands for many;
+    - ``name``: the kind, as a manifest has it;
+    - ``plan``: the inputs that it reads of the points, a ``FeaturePlan`` or :class:`InputPlan`;
+    - ``features``: the features that it reads; None for a kind that reads the points themselves;
+    - ``context``: the context that it reads of the pass before, or None;
+    - ``from_file(entry, arrays, codes)``: the classifier that a pass of a manifest describes, with
+      classes `codes`; ModelError where the entry contradicts itself;
+    - ``to_file(codes)`` and ``arrays()``: what a model file stores of it.
+
+    A kind that reads features and context has ``probabilities(values, rows)``: (b, classes) from
+    features and context (b, inputs) at `rows`, and ``classes_before(codes)``: the classes of the
+    pass before, where its own are `codes`. One that reads the points themselves can only be the
+    first pass, and has ``predict(request)``, which yields a :class:`Block` after the other, with
+    each row wanted once.
+
+    Its trainer is a module with
+
+    - ``optional_inputs``: dimensions that training uses where the points have them, each with the
+      dimensions that it is computed from;
+    - ``own_options(options)``: the checked options that only this kind has, or None;
+    - ``inputs(options)``: the dimensions that the classifier will read;
+    - ``outputs(options)``: the files that training writes beside the model;
+    - ``train(clouds, options, progress)``: a ``Model``, trained on clouds that are prepared.
+    """
+    _kinds[name] = classifier, trainer
+
+
+def register_preprocessing(load: Callable[[], Any]) -> None:
+    """Register the module that knows the stages which compute a model's dimensions.
+
+    It has
+
+    - ``check(preparation)``: the stages in one spelling; ModelError for one that no model may have;
+    - ``algorithm_versions(preparation)``: the version of each stage's algorithm in this release;
+    - ``preparation_of(names)``: the stages that compute these dimensions, as far as they are
+      heights;
+    - ``made_of_coordinates(preparation, xyz, usable, threads, classes)``: the dimensions (n,) that
+      the stages compute from coordinates (n, 3) in meters.
+    """
+    _preprocessing.append(load)
+
+
+def kinds() -> tuple[str, ...]:
+    """Return the names of the kinds that can be trained."""
+    return tuple(_kinds)
+
+
+def classifier_of(name: str) -> Any:
+    """Return the class of a kind; ModelError for one that this release does not have."""
+    kind = FOREST if name == REFINED_FOREST else name
+    if kind not in _kinds:
+        raise ModelError(
+            "the model uses an algorithm this release does not know",
+            found=repr(name)[:60],
+            cure="Update pdal-stages",
+        )
+    return _kinds[kind][0]()
+
+
+def trainer_of(name: str) -> Any:
+    """Return the module that trains a kind, one of :func:`kinds`."""
+    return _kinds[name][1]()
+
+
+def preprocessing() -> Any:
+    """Return the module that was registered."""
+    return _preprocessing[-1]()

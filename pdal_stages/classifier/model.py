@@ -22,7 +22,7 @@ from ..features.voxels import Representatives, check_side, represent
 from . import model_description, model_file
 from .auto_context import WeightedPass, classify, plan_of
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
-from .interface import Column, InputPlan, PredictRequest
+from .interface import InputPlan, PredictRequest, classifier_of, preprocessing
 from .prediction import (
     PointRoles,
     Prediction,
@@ -34,13 +34,10 @@ from .prediction import (
     move_from_ground,
     reject,
 )
-from .registry import classifier_of, preprocessing
 
 #: How many times sparser or denser than those trained on a cloud may be without a warning (not
 #: tuned).
 DENSITY_TOLERANCE = 2.0
-#: What importances are summed by.
-GROUPINGS = ("column", "feature", "group", "neighborhood")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -144,34 +141,16 @@ class Model:
             )
         return warnings
 
-    def importances(self, by: str = "feature", number: int = -1) -> dict[str, float]:
+    def importances(self, number: int = -1) -> dict[str, float]:
         """Return the mean decrease in impurity by input, summing to 1, largest first.
 
-        Parameters
-        ----------
-        by : str
-            column, feature (over all neighborhoods, a histogram's bins together), group
-            (covariance, geometry, shape features and context), or neighborhood.
-        number : int
-            Which of the `passes`.
+        `number` tells which of the `passes`. ModelError for a network, which has none.
         """
-        values = self.info["passes"][number]["importances"]
-        if by not in GROUPINGS:
-            raise OptionError(
-                "importances are not grouped by that", found=by, cure=f"One of {GROUPINGS}"
-            )
-        if values is None:
+        entry = self.manifest()["passes"][number]
+        if entry["importances"] is None:
             raise ModelError("the model file holds no importances")
-        total: dict[str, float] = {}
-        for column, value in zip(self.columns[number], values, strict=True):
-            key = getattr(column, "name" if by == "column" else by)
-            total[key] = total.get(key, 0.0) + value
-        return dict(sorted(total.items(), key=lambda item: -item[1]))
-
-    @property
-    def columns(self) -> list[list[Column]]:
-        """The inputs of each pass, in order."""
-        return [each.columns(codes) for each, codes in zip(self.passes, self.codes_of, strict=True)]
+        shares = zip(entry["feature_names"], entry["importances"], strict=True)
+        return dict(sorted(shares, key=lambda item: -item[1]))
 
     def __repr__(self) -> str:
         """Return the kind and the codes in a line."""

@@ -23,17 +23,11 @@ _Rows = list[tuple[str, str]]
 
 def text(model: Model) -> str:
     """Return a page of text about a model. Names come from its file, so every row is escaped."""
-    info, several = model.info, len(model.passes) > 1
+    info = model.info
     rows = [*_measured(info), *_inputs(model), *_passes(model), *_training(model)]
     rows += [("warning", warning) for warning in model.outdated]
     lines = [score(info), "", *(f"{name:<16}{value}".rstrip() for name, value in rows), ""]
-    lines += [*_classes(info), ""]
-    for number, entry in enumerate(info["passes"]):
-        for by in ("group", "feature") if entry["importances"] is not None else ():
-            largest = list(model.importances(by, number).items())[:_TOP]
-            top = ", ".join(f"{name} {100 * share:.1f} %" for name, share in largest)
-            lines.append(f"pass {number + 1}: " * several + f"importance by {by:<8}{top}")
-    return "\n".join(map(one_line, lines))
+    return "\n".join(map(one_line, [*lines, *_classes(info), ""]))
 
 
 def _measured(info: Mapping[str, Any]) -> _Rows:
@@ -41,8 +35,7 @@ def _measured(info: Mapping[str, Any]) -> _Rows:
     if not info.get("sureness"):
         return []
     counts = Calibration.from_dict(info["sureness"])
-    shares = {code: counts.accuracy([code]) for code in sorted(counts.right)}
-    by_class = ", ".join(f"{code}: {_percent(share)}" for code, share in shares.items())
+    by_class = ", ".join(f"{c}: {_percent(counts.accuracy([c]))}" for c in sorted(counts.right))
     return [
         ("points right", f"{_percent(counts.accuracy(counts.right))}; of those given {by_class}"),
         ("", f"measured on {counts.about}"),
@@ -50,7 +43,7 @@ def _measured(info: Mapping[str, Any]) -> _Rows:
 
 
 def _inputs(model: Model) -> _Rows:
-    """Return dimensions, preprocessing, and features by neighborhood."""
+    """Return dimensions and preprocessing."""
     info, versions = model.info, model.info["algorithms"]
     rows = [("reads", ", ".join(["X, Y, Z", *model.required_dimensions]))]
     if model.optional_dimensions:
@@ -58,31 +51,29 @@ def _inputs(model: Model) -> _Rows:
     for stage in model.preparation:
         options = ", ".join(f"{k} {v}" for k, v in stage.items() if k != "type")
         version = f"version {versions.get(stage['type'], 'unknown')} of its algorithm"
-        rows.append(
-            ("preprocessing", f"{stage['type']}{f' ({options})' * bool(options)}, {version}")
-        )
+        rows.append(("preprocessing", f"{stage['type']} ({options or 'as it is'}), {version}"))
     if info.get("by_hand"):
         rows.append(("preprocessing", f"{', '.join(info['by_hand'])}, which the file cannot carry"))
-    features: dict[str, dict[str, None]] = {}
-    for column in (column for columns in model.columns for column in columns):
-        if column.group not in ("dimension", "context"):
-            features.setdefault(column.neighborhood, {})[column.feature] = None
-    tokens: dict[str, list[str]] = {}  # list of features -> neighborhoods that have it
-    for token, names in features.items():
-        tokens.setdefault(f"{len(names)} features, {', '.join(names)}", []).append(token)
-    return rows + [("features", f"{', '.join(alike)}: {names}") for names, alike in tokens.items()]
+    return rows
 
 
 def _passes(model: Model) -> _Rows:
-    """Return the size of each classifier and what it reads."""
+    """Return the size of each classifier, what it reads, and which inputs matter most."""
     rows = []
-    for number, entry in enumerate(model.manifest()["passes"], 1):
+    for number, entry in enumerate(model.manifest()["passes"]):
         sizes = [f"{v:,} {k}" for k, v in entry["parameters"].items() if isinstance(v, int)]
         text = f"{entry['algorithm'].replace('_', ' ')}, {', '.join(sizes)}"
         text += f"; reads {len(entry['feature_names'])} columns"
+        if entry["neighborhoods"]:
+            text += f" of {' '.join(entry['neighborhoods'])}"
         if entry["context"]:
-            text += f", among them of the pass before {' '.join(entry['context'])}"
-        rows.append((f"pass {number}", text))
+            text += f" and of the pass before {' '.join(entry['context'])}"
+        rows.append((f"pass {number + 1}", text))
+        if entry["importances"] is not None:
+            largest = list(model.importances(number).items())[:_TOP]
+            rows.append(
+                ("", f"importances {', '.join(f'{k} {_percent(share)}' for k, share in largest)}")
+            )
     return rows
 
 
@@ -91,31 +82,25 @@ def _training(model: Model) -> _Rows:
     info = model.info
     clouds = info["training"]["clouds"]
     heads = [cloud["name"].partition(", ")[0] for cloud in clouds]  # copies follow the comma
-    surveys = list(
-        dict.fromkeys(
-            cloud["name"] if heads.count(head) == 1 else head
-            for cloud, head in zip(clouds, heads, strict=True)
-        )
-    )
+    pairs = zip(clouds, heads, strict=True)
+    named = (cloud["name"] if heads.count(head) == 1 else head for cloud, head in pairs)
+    surveys = list(dict.fromkeys(named))
     more = f" and {len(surveys) - _SURVEYS} more (--showjson lists them)"
     names = ", ".join(surveys[:_SURVEYS]) + more * (len(surveys) > _SURVEYS)
     points = sum(cloud["points"] for cloud in clouds)
     size = f"{len(surveys)} surveys or files, {len(clouds)} clouds with copies, {points:,} points"
-    binary = f"binary, target {info['target']}, background {info['background']}"
-    sure = "what {0[name]} is sure of ({0[sure]:g} and more); no person's"
-    rows: list[tuple[str, Any, str]] = [
-        ("trained on", True, size),
-        ("", names, "{0}"),
-        ("labels", info.get("teacher"), sure),
-        ("on top of", info.get("base"), "{0[name]}, the passes before (SHA-256 {0[sha256]})"),
-        ("densities", range_text(info["densities"]), "{0} points/m2"),
-        ("voxel", model.voxel, "{0:g} m, which one point stands for"),
-        ("halo", model.halo_m, "{0:g} m around a tile"),
-        ("prior weight", info.get("priors"), "{0[weight]:g}"),
-        ("strategy", info["strategy"] == "binary", binary),
-        ("written by", info["created_by"].get("pdal_stages"), "pdal_stages {0}"),
+    rows = [("trained on", size), ("", names)]
+    if base := info.get("base"):
+        rows.append(("on top of", f"{base['name']}, the passes before (SHA-256 {base['sha256']})"))
+    if info["strategy"] == "binary":
+        rows.append(("strategy", f"binary, target {info['target']}"))
+    return [
+        *rows,
+        ("densities", f"{range_text(info['densities'])} points/m2"),
+        ("voxel", f"{model.voxel:g} m, which one point stands for"),
+        ("halo", f"{model.halo_m:g} m around a tile"),
+        ("written by", f"pdal_stages {info['created_by'].get('pdal_stages', 'unknown')}"),
     ]
-    return [(name, text.format(value)) for name, value, text in rows if value]
 
 
 def _classes(info: Mapping[str, Any]) -> list[str]:
@@ -139,7 +124,8 @@ def range_text(densities: Mapping[str, float]) -> str:
 def held_out(info: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the scores on ground that was held out; empty where there are none.
 
-    A network has its own; a forest has those of the cross-validation.
+    A network has its own; a forest has those of the cross-validation. A score against another
+    model's answers is not one.
     """
     if info.get("teacher"):
         return {}
@@ -150,16 +136,9 @@ def held_out(info: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def score(info: Mapping[str, Any]) -> str:
     """Return the score in a line, or why there is none."""
-    if teacher := info.get("teacher"):
-        return (
-            f"not scored     its labels are answers of {teacher['name']}; only labels of your own "
-            "tell how right it is"
-        )
     row = held_out(info)
     if not row and info.get("sureness"):
-        counts = Calibration.from_dict(info["sureness"])
-        share = _percent(counts.accuracy(counts.right))
-        return f"measured       {share} of points right, on ground it had not seen"
+        return f"measured       {_measured(info)[0][1]}, on ground it had not seen"
     if not row:
         why = "no score in the file (the shipped model: docs/models.md)"
         return f"not scored     {info['training'].get('unscored', why)}"

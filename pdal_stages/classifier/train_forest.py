@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,12 +22,11 @@ from ..features.return_features import SOURCES
 from .auto_context import FoldForests, WeightedPass, sample_context
 from .calibration import Calibration
 from .context_features import Context
-from .feature_forest import CloudFeatures, FeatureForest, Features
+from .feature_forest import Blend, CloudFeatures, FeatureForest, Features
 from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
 from .interface import PredictRequest, weigh
 from .model import Model
 from .random_forest import Forest, grow_forest
-from .refinement import Blend, describe_refinement, trust
 from .sampling import BLOCK_M, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
@@ -38,6 +37,9 @@ FOLD_TREES = 0.25
 #: Parts of the training ground held out in turn to train the passes after the first, where they are
 #: blocks; of whole surveys there are up to twice as many (not tuned).
 PASS_FOLDS = 5
+#: Labeled points of the rarest class with which a forest counts as much as its base (not
+#: tuned).
+EVEN = 30
 #: Key of the count of samples of tiles whose nearest neighbors lie beyond the halo of their
 #: features.
 SHORT = "short_of_neighbors"
@@ -111,8 +113,8 @@ class ForestTraining:
         #: What the first pass reads of the samples.
         self.first = self.values
         if self.base is not None:  # it has not seen the labels, so no ground need be held out
-            trusted = trust(int(np.bincount(self.samples.label).min()))
-            self.blend = Blend(tuple(known), tuple(self.codes), trusted)
+            fewest = int(np.bincount(self.samples.label).min())
+            self.blend = Blend(tuple(known), tuple(self.codes), fewest / (fewest + EVEN))
             self.first = _join_columns(self.values, self._context_of_samples())
         self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
         self.growth = self._growth()
@@ -441,3 +443,48 @@ def _join_columns(
 ) -> npt.NDArray[np.float32]:
     """Return both side by side, in Fortran order."""
     return np.asfortranarray(np.concatenate([values, more], axis=1))
+
+
+def describe_refinement(
+    base: Any, info: Mapping[str, Any], names: Mapping[int, str], codes: Sequence[int]
+) -> dict[str, Any]:
+    """Return the manifest's entries for a model that is a base's passes and a forest on top.
+
+    Parameters
+    ----------
+    base : Model
+    info : mapping
+        The entries that training of the forest on top gives alone.
+    names : mapping of int to str
+        Name of each class.
+    codes : sequence of int
+        Classes of the last pass.
+    """
+    counts = {"available": 0, "samples": 0, "duplicates": 0}
+    inherited = {entry["code"]: {"labels": entry["labels"]} for entry in base.info["classes"]}
+    trained = {entry["code"]: entry for entry in info["classes"]}
+    classes = [
+        {**counts, **inherited.get(code, {}), **trained.get(code, {})}
+        | {"code": code, "name": names[code]}
+        for code in codes
+    ]
+    scores = [
+        {**entry, "codes": own_codes}
+        for own_codes, entry in zip(base.codes_of, base.info["passes"], strict=True)
+    ]
+    if base.factors is not None:
+        scores[-1]["factors"] = base.factors.tolist()
+    both = info["densities"], base.info["densities"]
+    low, high = min(each["low"] for each in both), max(each["high"] for each in both)
+    return {
+        **info,
+        "strategy": "multiclass",
+        "target": None,
+        "background": None,
+        "classes": classes,
+        "priors": None,
+        "densities": {"low": low, "high": high},
+        "preparation": base.preparation,
+        "algorithms": base.info["algorithms"],
+        "passes": [*scores, *info["passes"]],
+    }

@@ -15,8 +15,8 @@ from ..base.errors import OptionError
 from ..features.point_grid import check_xyz
 from .context_features import Context
 from .input_dimensions import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS, required_dimensions
+from .interface import preprocessing, trainer_of
 from .model import Model
-from .registry import preprocessing, trainer_of
 from .training_clouds import TrainingCloud, prepared, spooled
 from .training_options import TrainingOptions, feature_plan
 

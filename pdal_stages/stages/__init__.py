@@ -1,6 +1,6 @@
 """Pipeline stages: one module for each type."""
 
-from ..classifier.registry import register_preprocessing
+from ..classifier.interface import register_preprocessing
 
 
 def _preprocessing():

@@ -231,7 +231,7 @@ class AccuracyStage(Stage):
         model = loaded_model(self.model_file) if self.model_file else None
         importances = None
         if model is not None and model.info["passes"][-1]["importances"]:  # networks have none
-            importances = model.importances("column")
+            importances = model.importances()
         shown = [
             Place(name, points.xyz[side.inside], side.reference, side.predicted)
             for (name, points), side in zip(parts, sides, strict=True)

@@ -24,14 +24,13 @@ from ..classifier.input_dimensions import (
     required_dimensions,
     take_dimensions,
 )
+from ..classifier.interface import kinds, trainer_of
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import digest_of, find
-from ..classifier.recipes import RECIPES, describe_recipes, with_recipe
-from ..classifier.registry import kinds, trainer_of
 from ..classifier.train_forest import SHORT
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
-from ..classifier.training_options import TrainingOptions
+from ..classifier.training_options import RECIPES, TrainingOptions, describe_recipes, with_recipe
 from .base import Stage, StageContext, files_read
 from .checked_points import SURE, CheckedChoice, CheckedPoints
 from .options import UNWANTED, Selection, declared_option, option

@@ -29,8 +29,8 @@ from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_repair import extra_dimensions
 from pdal_stages.classifier import model_file
+from pdal_stages.classifier.interface import classifier_of
 from pdal_stages.classifier.model import assemble
-from pdal_stages.classifier.registry import classifier_of
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import expand
 from pdal_stages.pipeline.json_source import (
@@ -267,7 +267,7 @@ def model(data: bytes) -> str:
     for classifier in loaded.passes:
         values = (
             np.random.default_rng(1)
-            .normal(size=(50, len(classifier.columns(codes))))
+            .normal(size=(50, len(classifier.inputs(codes))))
             .astype(np.float32)
         )
         shares = classifier.probabilities(values)
