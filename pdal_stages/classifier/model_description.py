@@ -138,7 +138,8 @@ def score(info: Mapping[str, Any]) -> str:
     """Return the score in a line, or why there is none."""
     row = held_out(info)
     if not row and info.get("sureness"):
-        return f"measured       {_measured(info)[0][1]}, on ground it had not seen"
+        share = _measured(info)[0][1].partition(";")[0]
+        return f"measured       {share} of points right, on ground it had not seen"
     if not row:
         why = "no score in the file (the shipped model: docs/models.md)"
         return f"not scored     {info['training'].get('unscored', why)}"
