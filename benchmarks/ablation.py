@@ -1,5 +1,4 @@
-"""What each rule and parameter of ground, noise, decks, wires and towers does to real labeled
-clouds.
+"""What each rule and parameter of ground, noise, decks and wires does to real labeled clouds.
 
     python benchmarks/ablation.py --data FOLDER [--of ground noise ...] [--only ROW ...] [--json
     FILE]
@@ -14,7 +13,7 @@ twelve surveys clips of 160 m
   not scored.
 - noise: 1 % of points put into each survey as `noise.py` does, and the published noise of surveys
 that have it.
-- decks, wires, towers: points of that class missed, and others taken for it, on all surveys.
+- decks, wires: points of that class missed, and others taken for it, on all surveys.
 Unclassified points are not
   scored, as cars and poles are among them.
 
@@ -44,7 +43,7 @@ from clouds import mislabeled, published
 from noise import injected
 from surveys import GROUND, SURVEYS, VEGETATION
 
-from pdal_stages.structures import decks, towers, wires
+from pdal_stages.structures import decks, wires
 from pdal_stages.terrain import (
     detached_noise,
     filtered_ground,
@@ -61,7 +60,7 @@ class Cloud(NamedTuple):
     kind: str  #: the column of the ground's table
     xyz: np.ndarray  #: (n, 3) meters
     truth: np.ndarray  #: (n,) 2 ground, 5 and 6 objects, 0 not scored
-    codes: np.ndarray  #: (n,) as published; 17 decks, 14 wires, 15 towers, 7 and 18 noise
+    codes: np.ndarray  #: (n,) as published; 17 decks, 14 wires, 7 and 18 noise
 
     def take(self, rows: np.ndarray) -> Cloud:
         return self._replace(xyz=self.xyz[rows], truth=self.truth[rows], codes=self.codes[rows])
@@ -198,7 +197,6 @@ class Heights(NamedTuple):
     cloud: Cloud
     height: np.ndarray
     ground: np.ndarray
-    wire: np.ndarray
 
     @classmethod
     def above(cls, cloud: Cloud) -> Heights:
@@ -206,8 +204,7 @@ class Heights(NamedTuple):
         cloud = cloud.take(~np.isin(cloud.codes, NOISE))
         values = filtered_ground(cloud.xyz)
         height, ground = values["HeightAboveGround"], values["Ground"] > 0
-        use = np.ones(len(height), bool)
-        return cls(cloud, height, ground, wires.find_wires(cloud.xyz, height, use))
+        return cls(cloud, height, ground)
 
     def error(self, detected: np.ndarray, code: int) -> float:
         """Return the error of a class; unclassified points are not scored."""
@@ -225,13 +222,6 @@ def wire_error(heights: Heights) -> float:
     """Return the error of wires."""
     xyz, use = heights.cloud.xyz, np.ones(len(heights.height), bool)
     return heights.error(wires.find_wires(xyz, heights.height, use, wires.RULES), 14)
-
-
-def tower_error(heights: Heights) -> float:
-    """Return the error of towers, with the wires as they are."""
-    xyz, use = heights.cloud.xyz, np.ones(len(heights.height), bool)
-    found = towers.find_towers(xyz, heights.height, heights.wire, use, towers.RULES)
-    return heights.error(found, 15)
 
 
 def no_outliers(raster: np.ndarray, cell: float) -> np.ndarray:
@@ -320,13 +310,6 @@ ROWS: dict[str, dict[str, Row]] = {
         "no gaps": rule(wires, hop_m=1.0),
         "no bend": rule(wires, max_bend=0.0),
     },
-    "towers": {
-        "as it is": Row(),
-        "wires need not rise": rule(towers, min_rise=-9.0),
-        "one size": rule(towers, max_arm_m=10.0),
-        "bodies of 3 cells": rule(towers, half_body=3),
-        "narrow at the top": rule(towers, top_radius_m=1.5),
-    },
 }
 
 
@@ -340,7 +323,7 @@ def errors_of(what: str, every: dict[str, Cloud], only: list[str]) -> dict[str, 
         score = noise_error
     else:
         inputs = {name: Heights.above(cloud) for name, cloud in every.items()}
-        score = {"decks": deck_error, "wires": wire_error, "towers": tower_error}[what]
+        score = {"decks": deck_error, "wires": wire_error}[what]
     errors: dict[str, dict[str, float]] = {}
     for words, row in ROWS[what].items():
         if only and words not in (*only, "as it is"):

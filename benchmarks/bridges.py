@@ -1,11 +1,9 @@
-"""Bridge decks, wires and towers: how many of their points are found, and how many others are taken
-for them.
+"""Bridge decks and wires: how many of their points are found, and how many others are taken for them.
 
 python benchmarks/bridges.py --data FOLDER
 
 Decks of scenes (tests/bridge_scenes.py; 8 points/m2), of the generated town and of the labeled
-clouds; wires of the town, of generated corridors (tests/corridor_scenes.py) and of those clouds.
-Cars, lamps and what was never labeled count neither way. `false` is the share of all points that
+clouds; wires of the town and of those clouds. Cars, lamps and what was never labeled count neither way. `false` is the share of all points that
 are wrongly taken; seconds are of one process.
 """
 
@@ -18,18 +16,14 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pdal_stages.structures.decks import find_decks
-from pdal_stages.structures.towers import find_towers
 from pdal_stages.structures.wires import find_wires
 from pdal_stages.synthetic import make_town
 from pdal_stages.terrain.heights import filtered_ground
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bridge_scenes import SCENES, scan
-from corridor_scenes import CORRIDORS
-from town_truth import true_objects
 
 CLOUDS = (
     "bridge/pont.laz", "bridge/ign_0299_6802.laz", "delft/train.laz", "forest/neon_osbs.laz", "isprs_filter/samp11.laz",
@@ -40,8 +34,6 @@ CLOUDS = (
     "rural/ahn3_achterhoek.laz", "rural/ahn4_powerline.laz", "rural/ign_0p3ppm2.laz", "rural/lidarhd_11ppm2.laz",
     "rural/lidarhd_57ppm2.laz", "rural/lidarhd_bank.laz", "seville/plazanueva.laz",
 )  # fmt: skip
-#: Points of a town's poles lie so near to where its cables end, meters; lamps and masts hold none.
-AT_POLE = 2.0
 #: Codes that are not real: noise, what was added by computer.
 DROPPED = (7, 18, 64, 65, 66, 67)
 
@@ -71,29 +63,12 @@ def decks(
 
 
 def wires(
-    name: str,
-    xyz: np.ndarray,
-    use: np.ndarray,
-    true: np.ndarray,
-    either: np.ndarray,
-    unknown: np.ndarray,
-    held: np.ndarray | None = None,
+    name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray
 ) -> None:
     height = filtered_ground(xyz, mask=use)["HeightAboveGround"]
     begin = time.process_time()
     wire = find_wires(xyz, height, use)
     row(name, "wire", wire, true, either, time.process_time() - begin)
-    if either.any() and wire.any():
-        begin = time.process_time()
-        tower = find_towers(xyz, height, wire, use)
-        row(
-            name,
-            "tower",
-            tower,
-            either if held is None else held,
-            unknown,
-            time.process_time() - begin,
-        )
 
 
 def main() -> None:
@@ -109,21 +84,7 @@ def main() -> None:
         town = make_town(300.0, density, seed, progress=False)
         true, use = town.classification, town.classification != 7
         decks(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 17, true == 1)
-        ends = true_objects(town.size, town.seed).cables[..., :2].reshape(-1, 2)
-        held = (true == 15) & (cKDTree(ends).query(town.xyz[:, :2])[0] < AT_POLE)
-        name = f"town {seed}, {density:g} points/m2"
-        wires(name, town.xyz, use, true == 14, true == 15, true == 14, held)
-    for density in (8.0, 2.0):
-        for name, corridor in CORRIDORS.items():
-            xyz, codes = corridor(density)
-            wires(
-                f"{name}, {density:g} points/m2",
-                xyz,
-                np.ones(len(xyz), bool),
-                codes == 14,
-                codes == 15,
-                np.isin(codes, (1, 14)),
-            )
+        wires(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 14, true == 15)
     for name in CLOUDS:
         las = laspy.read(folder / name)
         codes = np.asarray(las.classification)
@@ -132,7 +93,7 @@ def main() -> None:
         if "powerline" in name:
             use &= codes != 26
         decks(name, las.xyz, use, bridge, codes == 1)
-        wires(name, las.xyz, use, codes == 14, codes == 15, np.isin(codes, (1, 14)))
+        wires(name, las.xyz, use, codes == 14, codes == 15)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from pdal_stages.synthetic import make_town
 from pdal_stages.synthetic.town import ORIGIN
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from object_accuracy import compare_buildings, match_by_overlap, match_by_place
+from object_accuracy import compare_buildings, match_by_place
 from town_truth import true_objects
 
 SIZE = 300.0
@@ -70,18 +70,6 @@ def true_buildings(houses, step):
     return [shape.buffer(-0.3, join_style="mitre") for shape in joined]
 
 
-def true_spans(cables):
-    """A line of each span: its middle conductor; of `cables` (n, 2, 3) those of a span follow each
-    other."""
-    middle = cables[:, :, :2].mean(axis=1)
-    apart = np.flatnonzero(np.hypot(*np.diff(middle, axis=0).T) > 1.0) + 1
-    return [
-        shapely.LineString(span[len(span) // 2, :, :2])
-        for span in np.split(cables, apart)
-        if len(span)
-    ]
-
-
 def town(seed, codes=None, refuse=()):
     """Figures of a town, by its true classes or by others (`codes`: of a town its codes and
     reliabilities).
@@ -124,14 +112,6 @@ def town(seed, codes=None, refuse=()):
     extra = sorted(set(range(len(at))) - {a for a, _ in pairs})
     wrong = sum(alone[np.argmin(np.hypot(*(places - at[n]).T))] for n in extra)
     hit = sum(alone[b] for _, b in pairs)
-    paths = [shapely.LineString(path) for path in objects.tables[Kind.SPAN].paths]
-    true_paths = [line.intersection(square) for line in true_spans(true.cables)]
-    lines = [
-        [shapely.buffer(line, 1.0, cap_style="flat") for line in many]
-        for many in (paths, true_paths)
-    ]
-    lines[1] = [shape for shape in lines[1] if shape.area > 8]
-    rows["spans"] = 2 * len(match_by_overlap(*lines)) / sum(map(len, lines))
     rows["trees"] = 2 * len(pairs) / (len(at) + len(places)), 2 * hit / (hit + wrong + alone.sum())
     return rows
 
@@ -232,7 +212,7 @@ if __name__ == "__main__":
         "--refuse", default="", help="reasons of objects that are left out, parted by commas"
     )
     parser.add_argument(
-        "--flags", default="", help="more flags of classify, parted by commas: wires,towers"
+        "--flags", default="", help="more flags of classify, parted by commas: wires,bridges"
     )
     parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2, 3])
     options = parser.parse_args()
@@ -243,8 +223,6 @@ if __name__ == "__main__":
         for name, value in town(seed).items():
             if name == "trees":
                 print(f"town {seed}, trees: F1 {value[0]:.3f}, isolated ones {value[1]:.3f}")
-            elif name == "spans":
-                print(f"town {seed}, spans: F1 {value:.3f}")
             else:
                 got, seconds = value
                 objects = got["objects"]

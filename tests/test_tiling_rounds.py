@@ -114,7 +114,7 @@ def columns(path: Path) -> list[np.ndarray]:
 
 def test_an_interrupted_run_of_the_shipped_model_goes_on(tmp_path, capsys):
     """With wires and bridges, which look farther than a tile is wide."""
-    words = ["classify", str(CITY), "--wires", "--towers", "--bridges", "--no-progress"]
+    words = ["classify", str(CITY), "--wires", "--bridges", "--no-progress"]
     assert main([*words, str(tmp_path / "whole.laz")]) == 0
     out = tmp_path / "out"
     out.mkdir()

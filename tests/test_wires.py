@@ -7,7 +7,6 @@ import functools
 import laspy
 import numpy as np
 import pytest
-from corridor_scenes import CORRIDORS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -171,14 +170,6 @@ def test_the_stage_gives_wires_their_class():
     assert np.array_equal(after, np.where(wire, 14, before))
     assert points.report.figures["wires"] == wire.sum()
     assert stage.halo_m() == wires.RULES.reach_m < 90 and max(stage.written_classes()) == 14
-
-
-@pytest.mark.parametrize("name", ["highest voltage", "medium voltage in woods"])
-def test_generated_corridors(name):
-    xyz, codes = CORRIDORS[name](4.0)
-    wire = find_wires(xyz, filtered_ground(xyz)["HeightAboveGround"], np.ones(len(xyz), bool))
-    assert f1(wire, codes == 14) > 0.95
-    assert (wire & ~np.isin(codes, (14, 15))).sum() <= 0.0001 * len(xyz)
 
 
 def test_a_corridor(data_dir):

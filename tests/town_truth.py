@@ -48,7 +48,6 @@ class TrueObjects(NamedTuple):
 
     houses: list[House]
     trees: list[Tree]
-    cables: NDArray  # (n, 2, 3): start and end of every conductor between two poles
     decks: NDArray  # (n, 4, 2): corners
 
 
@@ -67,7 +66,7 @@ def true_objects(size: float, seed: int) -> TrueObjects:
         away = np.abs(places - ORIGIN[:2] - half)
         return bool((away <= half).all(axis=1).any())
 
-    houses, trees, cables, decks = [], [], [], []
+    houses, trees, decks = [], [], []
     for i, j in itertools.product(range(i0, i1 + 1), range(j0, j1 + 1)):
         site = filled_site(plan, i, j)
         for kind, *what in site.built:
@@ -86,18 +85,11 @@ def true_objects(size: float, seed: int) -> TrueObjects:
                 place = placed(site, [(a, b)])
                 if inside(place):
                     trees.append(Tree(float(place[0, 0]), float(place[0, 1]), height, radius))
-            elif kind == "cable":
-                ends = placed(site, [what[0][:2], what[1][:2]])
-                if inside(ends):
-                    z = np.array([[what[0][2]], [what[1][2]]]) + ORIGIN[2]
-                    cables.append(np.hstack([ends, z]))
             elif kind == "deck":
                 corners = placed(site, _corners(*what))
                 if inside(corners):
                     decks.append(corners)
-    return TrueObjects(
-        houses, trees, np.array(cables).reshape(-1, 2, 3), np.array(decks).reshape(-1, 4, 2)
-    )
+    return TrueObjects(houses, trees, np.array(decks).reshape(-1, 4, 2))
 
 
 def _corners(base: Footprint, wider_l: float = 0, wider_w: float = 0) -> list[tuple[float, float]]:

@@ -58,7 +58,6 @@ def add_commands(parser: Parser) -> None:
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
         ("--bridges", False, "Find bridge decks, class 17"),
         ("--wires", False, "Find wires, class 14; without it they become building"),
-        ("--towers", False, "Find wires, and their towers, class 15"),
     ):
         add(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
     polygons = (
@@ -88,8 +87,7 @@ def _request(options: argparse.Namespace, overrides: Sequence[Override]) -> Clas
         stage_options(options, *_CLASSIFIER_OPTIONS),
         noise=options.noise,
         bridges=options.bridges,
-        wires=options.wires or options.towers,
-        towers=options.towers,
+        wires=options.wires,
         polygons=tuple(options.polygons),
         given_ground=options.ground == "given",
     )

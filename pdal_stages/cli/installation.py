@@ -199,7 +199,6 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..objects.crowns import crown_cells
     from ..objects.roofs import roof_planes
     from ..structures.decks import find_decks
-    from ..structures.towers import find_towers
     from ..structures.wires import find_wires
     from ..synthetic import make_town
     from ..terrain import detached_noise, filtered_ground, hag_minima
@@ -210,13 +209,9 @@ def _warmup(options: argparse.Namespace) -> None:
     z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))
     on_ground = filtered_ground(x, y, z, openings=(5,), threads=1)["Ground"] > 0
     find_decks(x, y, z, np.ones(len(x), bool), on_ground)
-    # A wire that sags on both sides of a pole, so that the kernels for both run.
-    x, z = np.arange(-60.0, 60.0, 0.5), np.arange(0.0, 12.0, 0.5)
-    span = np.zeros((len(x) + len(z), 3))
-    span[: len(x), 0], span[:, 2] = x, np.concatenate((12.0 - abs(x) / 20.0, z))
-    every = np.ones(len(span), bool)
-    find_wires(span, span[:, 2], every)
-    find_towers(span, span[:, 2], np.arange(len(span)) < len(x), every)
+    x = np.arange(-60.0, 60.0, 0.5)
+    wire = np.column_stack((x, np.zeros_like(x), 12.0 - abs(x) / 20.0))
+    find_wires(wire, wire[:, 2], np.ones(len(x), bool))
     xyz = np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
     xyz[1] = xyz[0]  # one stands for both
     axes = np.ascontiguousarray(xyz.T)

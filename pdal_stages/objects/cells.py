@@ -27,8 +27,7 @@ class Kind(IntEnum):
     TREE = 2
     SPAN = 3
     DECK = 4
-    TOWER = 5
-    OTHER = 6  #: classes that form no object; they show that the laser saw something there
+    OTHER = 5  #: classes that form no object; they show that the laser saw something there
 
 
 #: ASPRS classes of each kind.
@@ -38,7 +37,6 @@ CLASSES: dict[Kind, tuple[int, ...]] = {
     Kind.TREE: (4, 5),
     Kind.SPAN: (13, 14),
     Kind.DECK: (17,),
-    Kind.TOWER: (15,),
 }
 #: Width of a cell of the ground, in cells of the other kinds: ground below objects is sparse.
 GROUND_WIDTH = 2

@@ -30,8 +30,6 @@ from .results import Objects, ObjectSettings, ObjectTable
 LOOKAHEAD = 64.0
 #: Side of a block, cells: several times as wide as the surroundings that are read again.
 BLOCK = 2048
-#: Distance around a tower within which wires end, meters.
-TOWER_RADIUS = 1.5
 #: Vegetation on a roof counts as roof up to this height above it (chimneys, gutters), meters.
 ROOF_TOLERANCE = 0.5
 #: Fewest cells of a span.
@@ -133,17 +131,15 @@ def _detect_surfaces(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_
 
 
 def _detect_spans(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
-    """Yield spans: wires, joined over gaps, between towers."""
+    """Yield spans: wires, joined over gaps."""
     settings = view.settings
     half_gap = round(settings.span_gap / 2 / settings.cell)
-    # A tower has at least the cells around it, or wires would be joined past it at their corners.
-    radius = max(1, round(TOWER_RADIUS / settings.cell))
 
     def mask_of(view: CellView) -> NDArray[np.bool_]:
-        tower, wire = (view.indices(each) >= 0 for each in (Kind.TOWER, kind))
+        wire = view.indices(kind) >= 0
         if half_gap:
-            wire = scipy.ndimage.binary_dilation(wire, NEIGHBORS, iterations=half_gap)
-        return wire & ~scipy.ndimage.binary_dilation(tower, NEIGHBORS, iterations=radius)
+            return scipy.ndimage.binary_dilation(wire, NEIGHBORS, iterations=half_gap)
+        return wire
 
     view, mask = view.widened_to_whole(core, mask_of)
     high = view.highest(kind)

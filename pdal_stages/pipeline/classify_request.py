@@ -50,7 +50,6 @@ class ClassifyRequest:
     noise: bool = True  #: mark low and high noise first
     bridges: bool = False  #: find bridge decks, where heights are those of `_GROUND`
     wires: bool = False  #: find wires, where heights are computed
-    towers: bool = False  #: find wires, and their towers
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     given_ground: bool = False  #: points of class 2 are the ground, and stay so
 
@@ -146,8 +145,7 @@ class ClassifyRequest:
         if self.bridges:
             stages.append({"type": "filters.bridges", **finders})
         if self.wires:
-            towers = {"towers": True} if self.towers else {}
-            stages.append({"type": "filters.wires", **finders, **towers})
+            stages.append({"type": "filters.wires", **finders})
         if self.polygons:
             polygons = {"type": "filters.polygons", "polygons": list(self.polygons)}
             stages.append({**polygons, **shared})

@@ -36,7 +36,6 @@ _CODES = {
     "trees": Kind.TREE,
     "wires": Kind.SPAN,
     "decks": Kind.DECK,
-    "towers": Kind.TOWER,
 }
 
 
@@ -52,7 +51,6 @@ class ObjectOptions:
     trees: list[int] = _codes("trees", "vegetation that trees are looked for in")
     wires: list[int] = _codes("wires", "wires")
     decks: list[int] = _codes("decks", "bridge decks")
-    towers: list[int] = _codes("towers", "towers, where spans of wires end")
     refuse: list[str] = option(
         "list",
         (),

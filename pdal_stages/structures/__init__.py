@@ -1,1 +1,1 @@
-"""Detect bridge decks, wires and towers by shape, each in a module with its thresholds."""
+"""Detect bridge decks and wires by shape, each in a module with its thresholds."""

@@ -58,7 +58,7 @@ class WireRules(NamedTuple):
     #: to this far above and below, and 2.25 m beside: the next wire but one hangs 2.4 m beside
     around_m: float = 1.6
     #: layers there, per layer on the line. At 0.1 roofs need no test of what is hidden, but wires
-    #: at the top of a tower go, and with them the tower (AHN4)
+    #: at the top of a tower go (AHN4)
     max_around_ratio: float = 0.34
     under_m: float = 1.0  #: what lies this much lower than a line is seen below it
     strip_m: float = 0.6  #: half the width of the strip below a line
@@ -72,7 +72,7 @@ class WireRules(NamedTuple):
     #: test 0.93 % of Seville's points are wires
     min_clear_share: float = 0.3
     min_length_m: float = 30.0  #: of connected lines: ridges and cables on masts are shorter
-    hop_m: float = 6.0  #: gaps in a wire, and how far it goes on into a tree or its tower
+    hop_m: float = 6.0  #: gaps in a wire, and how far it goes on into a tree or a tower
     #: more of `reach_m`, for the 5 x 5 cells around a layer and for whole cells; not tuned
     reach_margin_m: float = 6.0
 

@@ -85,7 +85,7 @@ class _Showing(Algorithm):
 class _Classifying(_Showing):
     command = "classify"
     listed = (
-        *("dimensions", "noise", "bridges", "wires", "towers"),
+        *("dimensions", "noise", "bridges", "wires"),
         *("vegetation_heights", "polygons", "where"),
     )
 
