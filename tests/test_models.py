@@ -58,7 +58,7 @@ def test_heights_are_made_as_in_training_beside_return_numbers():
     assert not np.array_equal(
         model.predict(xyz).reliability, model.predict(xyz, returns).reliability
     )
-    with pytest.raises(DimensionError, match=r"Leave out HeightAboveGround: .*hag_morphological"):
+    with pytest.raises(DimensionError, match=r"missing.*leave all heights out"):
         model.predict(xyz, {"HeightAboveGround": xyz[:, 2], **returns})
 
 

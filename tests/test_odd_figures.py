@@ -25,7 +25,7 @@ def test_figures_that_mean_nothing():
 
 def test_labels_of_another_number_of_points():
     xyz = np.random.default_rng(0).uniform(0, 9, (50, 3))
-    with pytest.raises(OptionError, match="one label for each of the 50 points"):
+    with pytest.raises(OptionError, match="one label per point"):
         ps.train(xyz, np.zeros(49, int), progress=False)
 
 

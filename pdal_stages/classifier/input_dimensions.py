@@ -23,13 +23,13 @@ OPTIONAL_DIMENSIONS = ("Ground", "HeightAboveOpening_5", "HeightAboveOpening_17"
 CHECKED = "Checked"
 
 _FROM_READER = "It comes from the reader; this source has none. Use a model trained without it"
+_FROM_HEIGHTS = (
+    "In a pipeline put filters.hag_morphological before this stage, or what the model was trained "
+    "with; in Python leave all heights out, or filtered_ground(xyz) makes this one"
+)
 #: Dimension -> what to do where it is missing.
 _CURES = {
-    "HeightAboveGround": (
-        "In Python filtered_ground(xyz) makes it; in a pipeline put filters.hag_morphological "
-        "before this stage, or "
-        "what the model was trained with"
-    ),
+    **dict.fromkeys((*DEFAULT_DIMENSIONS, *OPTIONAL_DIMENSIONS), _FROM_HEIGHTS),
     **dict.fromkeys(("Intensity", *return_features.SOURCES), _FROM_READER),
 }
 
@@ -39,20 +39,14 @@ def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
 
     These are neither coordinates nor return features.
     """
-    return tuple(
-        dict.fromkeys(
-            name
-            for name in names
-            if name not in COORDINATES and return_features.parse(name) is None
-        )
-    )
+    others = (name for name in names if return_features.parse(name) is None)
+    return tuple(dict.fromkeys(name for name in others if name not in COORDINATES))
 
 
 def optional_dimensions(names: Iterable[str]) -> tuple[str, ...]:
     """Return dimensions that features use where a cloud has them: return numbers."""
-    if any(return_features.parse(name) is not None for name in names):
-        return return_features.SOURCES
-    return ()
+    used = any(return_features.parse(name) is not None for name in names)
+    return return_features.SOURCES if used else ()
 
 
 def list_values(
@@ -70,10 +64,8 @@ def list_values(
     names = tuple(names)
     optional = (name for name in optional_dimensions(names) if name in dimensions)
     read = [*required_dimensions(names), *optional]
-    for name in read:
-        take_dimensions(
-            (name,), dimensions, n, rows, where
-        )  # one after the other: it may be a copy
+    for name in read:  # one after the other: it may be a copy
+        take_dimensions((name,), dimensions, n, rows, where)
     return [np.asarray(dimensions[name]) for name in read]
 
 

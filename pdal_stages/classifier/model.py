@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,13 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import DimensionError, ModelError, OptionError, suggest
+from ..base.errors import ModelError, OptionError, suggest
 from ..base.report import Report
 from ..features import FeaturePlan
 from ..features.cell_means import density
 from ..features.point_grid import check_xyz
 from ..features.registry import ALGORITHM_VERSION
-from ..features.voxels import Representatives, check_side, represent
+from ..features.voxels import check_side, represent
 from . import model_description, model_file
 from .auto_context import WeightedPass, classify, plan_of
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
@@ -210,17 +209,33 @@ class Model:
         **options
             See :class:`PredictionOptions`.
         """
-        how = self._check_options(PredictionOptions(**options))
+        how = PredictionOptions(**options)
+        if how.variance and self.passes[0].features is not None:
+            raise OptionError("only a network gives a variance", cure="Ask for the margin")
         xyz = check_xyz(xyz)
         roles = PointRoles.check(len(xyz), where, ignore, current, may_be_ground)
         dimensions = self._add_preprocessed(xyz, dict(dimensions or {}), roles, how.threads)
         columns = empty_columns(roles, len(self.classes), how)
-        representatives = self._represent(xyz, dimensions, roles)
+        values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.present)
+        representatives = represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
+        del values
         if representatives is not None:  # the coordinates of the others are not needed any more
             xyz = xyz[representatives.rows]
-        work = WorkingCloud.sort(xyz, self._cell, representatives, roles.wanted_rows)
+        features = self.passes[0].features
+        cell = 1.0 if features is None else features.plan.cell
+        work = WorkingCloud.sort(xyz, cell, representatives, roles.wanted_rows)
         del xyz
-        request = self._request(work, dimensions, how, progress)
+        names = (*self.required_dimensions, *self.optional_dimensions)
+        request = PredictRequest(
+            work.xyz,
+            work.take(names, dimensions),
+            work.wanted,
+            how.threads,
+            how.memory_mb,
+            None if work.stands_for_others else progress,
+            work.grid,
+            how.device,
+        )
         del dimensions
         self._classify(work, request, columns, progress)
         if roles.not_ground is not None:
@@ -233,15 +248,6 @@ class Model:
         report.merge(request.report)
         return Prediction(**columns, unsure=rejected, report=report)
 
-    def _check_options(self, options: PredictionOptions) -> PredictionOptions:
-        if options.variance and not self.gives_variance:
-            raise OptionError(
-                "only a network gives a variance over batches",
-                found=", ".join(each.name for each in self.passes),
-                cure="Ask for the margin, which every model gives",
-            )
-        return options
-
     def _add_preprocessed(
         self,
         xyz: npt.NDArray[np.float64],
@@ -251,63 +257,14 @@ class Model:
     ) -> dict[str, npt.ArrayLike]:
         """Return the dimensions (n,), and heights as computed in training where they miss.
 
-        DimensionError where only a part of what the stages compute is there: heights of two kinds
-        would be mixed.
+        None is computed where some are there: heights of two kinds would be mixed.
         """
-        missing = [name for name in self.required_dimensions if name not in dimensions]
-        if not missing:
+        if dimensions.keys() >= set(self.required_dimensions):
             return dimensions
         computed = preprocessing().made_of_coordinates(
             self.preparation, xyz, roles.usable, threads, roles.current
         )
-        both = sorted(computed.keys() & dimensions.keys())
-        if both and computed.keys() & set(missing):
-            raise DimensionError(
-                f"the dimension {missing[0]} is missing",
-                found=", ".join(dimensions),
-                cure=f"Leave out {', '.join(both)}: all are then made as in training, by "
-                f"{json.dumps(self.preparation[0])}",
-            )
-        return {**computed, **dimensions}
-
-    def _represent(
-        self,
-        xyz: npt.NDArray[np.float64],
-        dimensions: Mapping[str, npt.ArrayLike],
-        roles: PointRoles,
-    ) -> Representatives | None:
-        """Check all values, and return the points that stand for the others of their voxel."""
-        values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.present)
-        return represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
-
-    @property
-    def _cell(self) -> float:
-        """Side in meters of the cells that points are sorted by: those of the features."""
-        first = self.passes[0].features
-        return 1.0 if first is None else first.plan.cell
-
-    def _request(
-        self,
-        work: WorkingCloud,
-        dimensions: Mapping[str, npt.ArrayLike],
-        options: PredictionOptions,
-        progress: Any,
-    ) -> PredictRequest:
-        """Return the request for the points in work; its report holds how dense they are."""
-        names = (*self.required_dimensions, *self.optional_dimensions)
-        request = PredictRequest(
-            work.xyz,
-            work.take(names, dimensions),
-            work.wanted,
-            options.threads,
-            options.memory_mb,
-            None if work.stands_for_others else progress,
-            work.grid,
-            options.device,
-        )
-        if request.count:
-            request.report.figures["density"] = density(work.xyz)
-        return request
+        return dimensions if computed.keys() & dimensions.keys() else {**computed, **dimensions}
 
     def _classify(
         self,
@@ -316,30 +273,28 @@ class Model:
         columns: dict[str, npt.NDArray[Any]],
         progress: Any,
     ) -> None:
-        """Fill the columns (n, ...) of all points of the cloud, block by block."""
+        """Fill the columns (n, ...) of all points of the cloud, block by block.
+
+        Warns where the cloud is not as dense as those that the model was trained on.
+        """
         for block in classify(self.weighted_passes, request):
             rows_in_cloud, rows_in_block = work.members(block.rows)
             for name, values in decide(block, self.codes, columns).items():
                 columns[name][rows_in_cloud] = values[rows_in_block]
             if progress is not None and work.stands_for_others:
                 progress.update(len(rows_in_cloud))
-        self._check_density(request)
         request.report.warnings.extend(self.outdated)
-
-    def _check_density(self, request: PredictRequest) -> None:
-        """Warn where the cloud is not as dense as those that the model was trained on."""
-        figures, trained = request.report.figures, self.info["densities"]
-        if "density" not in figures:
+        if not request.count:
             return
-        points_per_m2 = figures["density"]
-        figures["density"] = round(points_per_m2, 3)
+        points_per_m2, trained = density(work.xyz), self.info["densities"]
+        request.report.figures["density"] = round(points_per_m2, 3)
         low, high = trained["low"] / DENSITY_TOLERANCE, trained["high"] * DENSITY_TOLERANCE
-        if low <= points_per_m2 <= high:
-            return
-        request.report.warnings.append(
-            f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
-            f"{model_description.range_text(trained)}. Expect lower accuracy, or train with 'thin'"
-        )
+        if not low <= points_per_m2 <= high:
+            request.report.warnings.append(
+                f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
+                f"{model_description.range_text(trained)}. Expect lower accuracy, or train with "
+                "'thin'"
+            )
 
 
 def load_model(path: str | os.PathLike) -> Model:
@@ -398,10 +353,8 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
         here, codes_here = f"pass {number + 1}", entry.get("codes") or codes
         if sorted(set(codes_here)) != codes_here:
             raise ModelError("a model's classes must ascend, each once", found=codes_here[:10])
-        for key, length in (
-            ("factors", len(codes_here)),
-            ("importances", len(entry["feature_names"])),
-        ):
+        lengths = {"factors": len(codes_here), "importances": len(entry["feature_names"])}
+        for key, length in lengths.items():
             if entry.get(key) is not None and len(entry[key]) != length:
                 raise ModelError(f"{here} must have {length} {key}", found=len(entry[key]))
         if bool(number) != bool(entry["context"]) or (number and passes[0].features is None):

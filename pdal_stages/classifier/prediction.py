@@ -92,9 +92,8 @@ class PointRoles:
     """Roles of the points of a cloud: to classify, only neighbors, or ignored."""
 
     wanted: npt.NDArray[np.bool_]  #: (n,) points to classify
-    present: (
-        npt.NDArray[np.int64] | None
-    )  #: (k,) rows in the cloud of points that are not ignored; None: all
+    #: (k,) rows in the cloud of points that are not ignored; None: all
+    present: npt.NDArray[np.int64] | None
     current: npt.NDArray[np.uint8] | None  #: (n,) class codes that the points have now
     not_ground: npt.NDArray[np.bool_] | None  #: (n,) points to classify that must not become ground
 
@@ -111,15 +110,15 @@ class PointRoles:
 
         OptionError for other shapes or types.
         """
-        wanted = np.ones(n, np.bool_) if where is None else _mask("where", where, n)
-        present = None
-        if ignore is not None and (ignored := _mask("ignore", ignore, n)).any():
+        wanted = np.ones(n, np.bool_) if where is None else _column("where", where, n, np.bool_)
+        present = codes = not_ground = None
+        if ignore is not None and (ignored := _column("ignore", ignore, n, np.bool_)).any():
             present = np.flatnonzero(~ignored)
             wanted = wanted & ~ignored
-        codes = None if current is None else _codes("current", current, n)
-        not_ground = None
+        if current is not None:
+            codes = _column("current", current, n, np.uint8)
         if may_be_ground is not None:
-            not_ground = wanted & ~_mask("may_be_ground", may_be_ground, n)
+            not_ground = wanted & ~_column("may_be_ground", may_be_ground, n, np.bool_)
         return cls(wanted, present, codes, not_ground)
 
     @property
@@ -142,26 +141,16 @@ class PointRoles:
         return 0 if self.present is None else len(self.wanted) - len(self.present)
 
 
-def _mask(name: str, values: npt.ArrayLike, n: int) -> npt.NDArray[np.bool_]:
+def _column(name: str, values: npt.ArrayLike, n: int, dtype: type) -> npt.NDArray[Any]:
+    """Return an argument as (n,) of a type; OptionError where its values do not fit."""
     array = np.asarray(values)
-    if array.shape != (n,) or array.dtype.kind != "b":
+    same_kind = (array.dtype == np.bool_) == (dtype is np.bool_)
+    if array.shape != (n,) or not same_kind or (array.astype(dtype, copy=False) != array).any():
         raise OptionError(
-            f"'{name}' must be one true or false per point",
+            f"'{name}' must be one {'code' if dtype is np.uint8 else 'true or false'} per point",
             found=f"{array.dtype} of shape {array.shape}",
         )
-    return array
-
-
-def _codes(name: str, values: npt.ArrayLike, n: int) -> npt.NDArray[np.uint8]:
-    array = np.asarray(values)
-    wrong = None
-    if array.shape != (n,) or array.dtype.kind not in "iu":
-        wrong = f"{array.dtype} of shape {array.shape}"
-    elif n and (array.min() < 0 or array.max() > 255):
-        wrong = f"{array.min()} to {array.max()}"
-    if wrong:
-        raise OptionError(f"'{name}' must be one class code per point", found=wrong)
-    return array.astype(np.uint8)
+    return array.astype(dtype, copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,9 +161,8 @@ class WorkingCloud:
     """
 
     xyz: npt.NDArray[np.float64]  #: (k, 3) meters
-    wanted: (
-        npt.NDArray[np.int64] | None
-    )  #: rows in work that stand for points to classify, ascending; None: all
+    #: rows in work that stand for points to classify, ascending; None: all
+    wanted: npt.NDArray[np.int64] | None
     grid: CellGrid  #: the index of `xyz`
     rows_in_cloud: npt.NDArray[Any]  #: (k,) of the points themselves
     _order: npt.NDArray[Any]  #: (k,) place of each among the representatives
@@ -222,11 +210,8 @@ class WorkingCloud:
         self, names: Iterable[str], dimensions: Mapping[str, npt.ArrayLike]
     ) -> dict[str, npt.ArrayLike]:
         """Return the values (k,) of those of the dimensions (n,) that are there."""
-        return {
-            name: np.asarray(dimensions[name])[self.rows_in_cloud]
-            for name in names
-            if name in dimensions
-        }
+        there = [name for name in names if name in dimensions]
+        return {name: np.asarray(dimensions[name])[self.rows_in_cloud] for name in there}
 
     def members(
         self, rows_in_work: npt.NDArray[np.int64]

@@ -66,26 +66,18 @@ class Forest:
         """Check the arrays, and lay out the nodes as they are walked."""
         sizes, count = self.tree_sizes, len(self.feature)
         shapes = ", ".join(f"{name} {getattr(self, name).shape}" for name in self.rules)
-        if (
-            not len(sizes)
-            or not count
-            or len(self.threshold) != count
-            or self.leaf_counts.ndim != 2
-        ):
+        if not len(sizes) or not count or len(self.threshold) != count:
             raise ModelError("the forest's arrays do not fit each other", found=shapes)
         if int(sizes.min()) < 1 or int(sizes.sum(dtype=np.int64)) != count:
             raise ModelError("the trees' sizes do not add up to the nodes", found=shapes)
         left, depths = _laid_out(sizes, self.feature, self.threshold, self.n_features)
-        leaves = int(np.count_nonzero(self.feature < 0))
+        leaf = self.feature < 0
+        leaves = int(np.count_nonzero(leaf))
         if leaves != len(self.leaf_counts):
-            raise ModelError(
-                "the number of leaves and the leaf table differ",
-                found=f"{leaves} and {len(self.leaf_counts)} rows",
-            )
+            raise ModelError("the number of leaves and the leaf table differ", found=shapes)
         totals = self.leaf_counts.sum(axis=1, dtype=np.uint64)
         if not totals.all():
             raise ModelError("a leaf holds no samples", found=f"leaf {int(np.argmin(totals))}")
-        leaf = self.feature < 0
         nodes = np.zeros(len(leaf), _NODE)
         nodes["threshold"] = np.where(leaf, np.nan, self.threshold)
         nodes["feature"] = np.where(leaf, 0, self.feature)
@@ -152,10 +144,8 @@ class Forest:
         """Return class probabilities (n, classes) of rows (n, features), as scikit-learn does."""
         values = np.ascontiguousarray(values, dtype=np.float32)
         if values.ndim != 2 or values.shape[1] != self.n_features:
-            raise ModelError(
-                f"it takes {self.n_features} features per point",
-                found=f"shape {values.shape}",
-            )
+            what = f"the forest takes {self.n_features} features per point"
+            raise ModelError(what, found=f"shape {values.shape}")
         out = np.zeros((len(values), self.n_classes))
         walk(values, self.tree_sizes, self._nodes, self._shares, out)  # type: ignore[attr-defined]
         return out / self.n_trees
@@ -210,9 +200,8 @@ def _laid_out(
             raise ModelError(what, found=f"tree {tree[first]}, node {node[first]}")
 
     split = feature >= 0
-    refuse(
-        (feature < -1) | (feature >= n_features), "a node asks for a feature that does not exist"
-    )
+    unknown = (feature < -1) | (feature >= n_features)
+    refuse(unknown, "a node asks for a feature that does not exist")
     refuse(split & ~np.isfinite(threshold), "a threshold is not a finite number")
     splits = np.concatenate(([0], np.cumsum(split)))  # before each node, in all trees
     before = splits[:-1] - splits[start][tree]
@@ -235,9 +224,8 @@ def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.N
     shares = tree.value[:, 0, :]
     # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are
     # whole.
-    counts = np.rint(
-        shares / shares.sum(axis=1, keepdims=True) * tree.weighted_n_node_samples[:, None]
-    )
+    shares = shares / shares.sum(axis=1, keepdims=True)
+    counts = np.rint(shares * tree.weighted_n_node_samples[:, None])
     left, right = tree.children_left, tree.children_right
     levels = [np.zeros(1, np.int64)]
     while len(splits := levels[-1][left[levels[-1]] >= 0]):

@@ -59,46 +59,34 @@ def train(
     preparation: list[dict[str, Any]] = []
     sources: Any = [clouds] if isinstance(clouds, TrainingCloud) else clouds
     if labels is not None:
-        xyz = check_xyz(clouds)
-        if np.shape(labels) != (len(xyz),):
-            raise OptionError(
-                f"there must be one label for each of the {len(xyz):,} points",
-                found=f"shape {np.shape(labels)}",
-            )
+        cloud = TrainingCloud(check_xyz(clouds), labels, dimensions or {})
         if dimensions is None:
             if tuple(options.dimensions) == DEFAULT_DIMENSIONS:
                 supported = trainer_of(options.algorithm).optional_inputs
                 more = (name for name in OPTIONAL_DIMENSIONS if name in supported)
                 options = replace(options, dimensions=(*DEFAULT_DIMENSIONS, *more))
-            preparation = preprocessing().preparation_of(required_dimensions(options.inputs))
-            usable = ~np.isin(np.asarray(labels), options.ignore)
-            dimensions = preprocessing().made_of_coordinates(
-                preparation, xyz, usable, options.threads
-            )
-        sources = [TrainingCloud(xyz, labels, dimensions)]
-    model = _train_prepared(sources, options, folder, progress)
-    if options.base is None:
-        model.record_preprocessing(preparation)
-    return model
-
-
-def _train_prepared(
-    sources: Iterable[TrainingCloud], options: TrainingOptions, folder: Path | None, progress: bool
-) -> Model:
-    """Train on the clouds without ignored points; those of an iterator are kept in files."""
+            stages = preprocessing()
+            preparation = stages.preparation_of(required_dimensions(options.inputs))
+            usable = ~np.isin(cloud.codes, options.ignore)
+            computed = stages.made_of_coordinates(preparation, cloud.xyz, usable, options.threads)
+            cloud = replace(cloud, dimensions=computed)
+        sources = [cloud]
     with tempfile.TemporaryDirectory(prefix="pdal-stages-") as temporary:
-        clouds: Iterable[TrainingCloud] = prepared(sources, options)
+        prepared_clouds: Iterable[TrainingCloud] = prepared(sources, options)
         if not isinstance(sources, list | tuple):
-            clouds = spooled(clouds, folder or Path(temporary))
-        usable = [cloud for cloud in clouds if cloud.points]
-        if not usable:
+            prepared_clouds = spooled(prepared_clouds, folder or Path(temporary))
+        usable_clouds = [cloud for cloud in prepared_clouds if cloud.points]
+        if not usable_clouds:
             left_out = ", ".join(map(str, options.ignore))
             raise OptionError(
                 "there are no points to train on",
                 cure=f"Give some; those of labels {left_out} are left out ('ignore') unless "
                 "'classes' names them",
             )
-        return trainer_of(options.algorithm).train(usable, options, progress)
+        model = trainer_of(options.algorithm).train(usable_clouds, options, progress)
+    if options.base is None:
+        model.record_preprocessing(preparation)
+    return model
 
 
 def reach(options: TrainingOptions) -> float:

@@ -50,9 +50,12 @@ class TrainingCloud:
     inside: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        """Make the coordinates float64, and name the survey."""
+        """Make the coordinates float64, name the survey, and count the labels."""
         object.__setattr__(self, "xyz", np.asarray(self.xyz, dtype=np.float64))
         object.__setattr__(self, "survey", self.survey or self.name)
+        if np.shape(self.labels) != (len(self.xyz),):
+            numbers = f"shape {np.shape(self.labels)} of {len(self.xyz):,} points"
+            raise OptionError("there must be one label per point", where=self.name, found=numbers)
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -118,9 +121,6 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     if options.classes is not None:
         named.update(label for part in ClassMap.parse(options.classes).labels for label in part)
     labels = cloud.codes
-    if len(labels) != len(cloud):
-        numbers = f"{len(labels)} and {len(cloud)}"
-        raise OptionError("labels and points differ in number", where=cloud.name, found=numbers)
     mask = None if cloud.mask is None else np.asarray(cloud.mask)
     if mask is not None and (mask.shape != labels.shape or mask.dtype != np.bool_):
         raise OptionError("the mask must be one true or false per point", where=cloud.name)
