@@ -75,16 +75,6 @@ def test_equals_sklearn_on_any_forest(seed, trees, rows, depth, leaf):
     assert np.allclose(forest.predict_proba(query), oracle(forest, query), atol=1e-12)
 
 
-def test_infinite_and_nan_values_do_not_break_the_walk():
-    x, y = data()
-    forest = Forest.from_sklearn(
-        RandomForestClassifier(5, random_state=0).fit(x, y).estimators_, 17
-    )
-    odd = np.full((40, 17), np.nan, np.float32)
-    odd[:10], odd[10:20] = np.inf, -np.inf
-    assert np.allclose(forest.predict_proba(odd).sum(axis=1), 1.0)
-
-
 # ---- arrays that are no forest ---------------------------------------------------------------------------
 
 
@@ -128,6 +118,12 @@ def test_hostile_arrays():
     assert "tree" in moved or "leaf" in moved
 
 
+def made(sizes, feature, leaves):
+    """A forest of five features without thresholds."""
+    counts, threshold = np.ones((leaves, 2), np.uint32), np.zeros(len(feature), np.float32)
+    return Forest(np.array(sizes, np.int32), feature, threshold, counts, 5)
+
+
 @settings(max_examples=30, deadline=None)
 @given(
     st.lists(st.integers(-3, 6), min_size=1, max_size=40),
@@ -137,13 +133,7 @@ def test_any_arrays_are_a_forest_or_an_error(feature, sizes):
     feature = np.array(feature, np.int16)
     leaves = int((feature < 0).sum())
     try:
-        forest = Forest(
-            np.array(sizes, np.int32),
-            feature,
-            np.zeros(len(feature), np.float32),
-            np.ones((leaves, 2), np.uint32),
-            5,
-        )
+        forest = made(sizes, feature, leaves)
     except ModelError:
         return
     query = np.random.default_rng(0).normal(size=(20, 5)).astype(np.float32)
@@ -156,13 +146,7 @@ def test_a_tree_deeper_than_any_real_one_is_refused():
     feature[1::2] = -1
     feature[-1] = -1
     with pytest.raises(ModelError, match="deeper"):
-        Forest(
-            np.array([len(feature)], np.int32),
-            feature,
-            np.zeros(len(feature), np.float32),
-            np.ones((int((feature < 0).sum()), 2), np.uint32),
-            1,
-        )
+        made([len(feature)], feature, int((feature < 0).sum()))
 
 
 def growth(**options):

@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.ensemble import RandomForestClassifier
 
-from pdal_stages.base.errors import ModelError, StageError
+from pdal_stages.base.errors import ModelError
 from pdal_stages.classifier import model_file
-from pdal_stages.classifier.interface import ArrayRule, classifier_of
-from pdal_stages.classifier.model_file import from_bytes, to_bytes
+from pdal_stages.classifier.interface import classifier_of
+from pdal_stages.classifier.model_file import to_bytes
 from pdal_stages.classifier.random_forest import Forest
 
 FEATURES = 6
@@ -45,27 +45,13 @@ def manifest(**changes):
         "feature_seed": 0,
         "importances": [0.0] * FEATURES,
     }
+    counts = {"available": 9, "samples": 9, "duplicates": 0}
     whole = {
         "strategy": "multiclass",
         "target": None,
         "background": None,
-        "classes": [
-            {
-                "code": c,
-                "name": str(c),
-                "labels": [c],
-                "available": 9,
-                "samples": 9,
-                "duplicates": 0,
-            }
-            for c in (2, 5, 6)
-        ],
-        "training": {
-            "clouds": [{"name": "a.laz", "points": 9}],
-            "count": 9,
-            "seed": 0,
-            "samples": 27,
-        },
+        "classes": [{"code": c, "name": str(c), "labels": [c], **counts} for c in (2, 5, 6)],
+        "training": {"clouds": [], "count": 9, "seed": 0, "samples": 27},
         "accuracy": {"cross_validation": None},
         "preparation": [],
         "algorithms": {},
@@ -130,17 +116,6 @@ def test_round_trip_equals_sklearn(tmp_path):
     assert np.array_equal(again.predict_proba(x).argmax(axis=1), reference.predict(x))
 
 
-def test_same_model_same_bytes(tmp_path):
-    for name in ("a", "b"):
-        model_file.write(tmp_path / name, manifest(), [forest()[0].arrays()])
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
-def test_a_folder_that_is_not_there(tmp_path):
-    with pytest.raises(StageError, match="folder of the model file does not exist"):
-        model_file.write(tmp_path / "no" / "m.model", manifest(), [forest()[0].arrays()])
-
-
 def test_the_documented_layout_is_enough_to_read_a_file(good):
     """Zip, JSON, .npy: another program's reader, in a few lines, without this package."""
     with zipfile.ZipFile(good) as archive:
@@ -152,10 +127,7 @@ def test_the_documented_layout_is_enough_to_read_a_file(good):
     row = forest()[2][0]
     share, start, leaf = np.zeros(3), 0, 0
     for size in a["tree_sizes"]:
-        feature, threshold = (
-            a["feature"][start : start + size],
-            a["threshold"][start : start + size],
-        )
+        feature, threshold = (a[key][start : start + size] for key in ("feature", "threshold"))
         i = 0
         while feature[i] >= 0:
             k = np.count_nonzero(feature[:i] >= 0)
@@ -169,10 +141,7 @@ def test_the_documented_layout_is_enough_to_read_a_file(good):
 # ---- files that are none -------------------------------------------------------------------------------
 
 
-def test_missing_folder_and_empty(tmp_path):
-    refuse(tmp_path / "none.model", "no such")
-    (tmp_path / "folder").mkdir()
-    refuse(tmp_path / "folder", "not a file")
+def test_empty_and_text(tmp_path):
     (tmp_path / "empty").write_bytes(b"")
     refuse(tmp_path / "empty", "not a model")
     (tmp_path / "text").write_text("this is text " * 100)
@@ -259,10 +228,6 @@ def test_manifest_is_held_against_its_schema(good, key, value, text):
     refuse(changed(good, edit), text)
 
 
-def test_a_key_left_out(good):
-    refuse(changed(good, lambda head, _: head["passes"][0].pop("importances")), "importances")
-
-
 def test_manifests_that_are_no_manifest(good):
     stored = members(good)
     for data, text in (
@@ -274,11 +239,6 @@ def test_manifests_that_are_no_manifest(good):
         (b'{"a": 1%s}' % (b"0" * 400), "too large"),
         (b'{"a": 1, "a": 2}', "duplicate key"),
         (b"[" * 200_000 + b"]" * 200_000, "deep"),
-        (
-            b'{"format": "pdal-stages model", "version": 2, "x": ' + b"[" * 900 + b"]" * 900 + b"}",
-            "manifest",
-        ),
-        (b"1" * 100_000, "JSON|something else"),
         (b" " * (model_file.MANIFEST_LIMIT + 1), "too large"),
     ):
         refuse(pack(good, {**stored, "manifest.json": data}), text)
@@ -319,24 +279,10 @@ def npy(descr="'<f4'", shape="(4,)", fortran="False", data=b"\0" * 16, magic=b"\
     ],
 )
 def test_hostile_arrays_are_refused(data, good):
-    with pytest.raises(ModelError):
-        from_bytes(data, ArrayRule(("<f4",), 1), "threshold")
-
     def edit(head, stored):
         stored[head["arrays"]["1.threshold"]["file"]] = data
 
     refuse(changed(good, edit))
-
-
-@pytest.mark.parametrize("shape", [(0,), (5,), (2, 3), (1, 0, 4)])
-@pytest.mark.parametrize("kind", ["<f4", "<i2", "|u1", "<u8", "<f8"])
-def test_arrays_come_back(shape, kind):
-    array = np.arange(np.prod(shape)).reshape(shape).astype(kind)
-    again = from_bytes(to_bytes(array), ArrayRule((kind,), len(shape)), "a")
-    assert again.dtype == array.dtype and np.array_equal(again, array) and not again.flags.writeable
-    assert np.array_equal(
-        from_bytes(to_bytes(np.asfortranarray(array)), ArrayRule((kind,), len(shape)), "a"), array
-    )
 
 
 def test_zip_bomb(good):

@@ -57,21 +57,15 @@ def test_a_frozen_file_gives_the_classes_it_gave(cloud):
 def test_a_new_feature_is_one_entry_and_one_line_and_changes_no_model(cloud, tmp_path):
     package = Path(pdal_stages.__file__).parent
     shutil.copytree(package, tmp_path / "pdal_stages", ignore=shutil.ignore_patterns("__pycache__"))
-    for file, before, new in (
-        (
-            "registry.py",
-            "FEATURES = (\n",
-            '    Feature("Dummy", "covariance", "1", "always 0.75"),\n',
-        ),
-        ("moments.py", "    entropy = entropy_term(e1)", "    values[ROW.Dummy, j] = 0.75\n"),
+    head, entropy = "FEATURES = (\n", "    entropy = entropy_term(e1)"
+    for file, before, after in (
+        ("registry.py", head, f'{head}    Feature("Dummy", "covariance", "1", "always 0.75"),\n'),
+        ("moments.py", entropy, f"    values[ROW.Dummy, j] = 0.75\n{entropy}"),
     ):
         path = tmp_path / "pdal_stages" / "features" / file
         text = path.read_text(encoding="utf-8")
         assert text.count(before) == 1
-        path.write_text(
-            text.replace(before, before + new if before.endswith("\n") else new + before),
-            encoding="utf-8",
-        )
+        path.write_text(text.replace(before, after), encoding="utf-8")
     np.save(tmp_path / "cloud.npy", cloud[0])
     environment = {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     done = subprocess.run(

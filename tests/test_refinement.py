@@ -66,12 +66,6 @@ def test_blended_equals_the_rule(said, grown, labeled, trusted):
         assert np.array_equal(got[:, codes.index(code)], said[:, BEFORE.index(code)])
 
 
-@given(shares(3), shares(3))
-def test_without_trust_the_base_stands(said, grown):
-    assert np.allclose(Blend(BEFORE, BEFORE, 0.0)(said, grown), said, atol=1e-12)
-    assert np.allclose(Blend(BEFORE, BEFORE, 1.0)(said, grown), grown, atol=1e-9)
-
-
 @pytest.fixture(scope="module")
 def base():
     xyz, label, dimensions = scene()
@@ -164,7 +158,6 @@ def test_a_new_class_is_learnt(base, new):
     cloud = TrainingCloud(xyz, label, dimensions, "b.laz")
     options = TrainingOptions(**FEW, base=base, folds=0, classes=[*BEFORE, new])
     model = train([cloud], options, progress=False)
-    assert set(model.codes.tolist()) == {*base.codes.tolist(), new}
     if new == 1:  # and is one for who trains on top of it, even if its label often tells nothing
         assert new in label_classes([cloud], TrainingOptions(**FEW, base=model)).classes.codes
     predicted = model.predict(xyz, dimensions).classification
@@ -211,9 +204,6 @@ def test_what_cannot_be_built_on(base):
     [
         lambda p: p[-1]["parameters"].update(before=[2, 5]),
         lambda p: p[-1]["parameters"].update(labeled=[6, 5]),
-        lambda p: p[-1]["parameters"].update(trusted=2.0),
-        lambda p: p[-1]["parameters"].update(target=5),
-        lambda p: p[-1]["parameters"].pop("before"),
         lambda p: p[-1].update(context=["box1"]),
         lambda p: p[0].update(codes=[2, 5]),
         lambda p: p[1].update(factors=[1.0]),
@@ -275,22 +265,15 @@ def test_through_pdal(tmp_path, write_las):
     cloud = {"X": x + 5e5, "Y": y + 5e6, "Z": z + 100, "Classification": label}
     source = write_las(tmp_path / "in.las", cloud, point_format=3)
     model = tmp_path / "mine.model"
-    writer = {
-        "type": "writers.classifiermodel",
-        "filename": str(model),
-        "base": "standard",
-        "trees": 5,
-    }
+    writer = {"type": "writers.classifiermodel", "filename": str(model), "base": "standard"}
+    writer |= {"trees": 5, "classes": "2,6,11", "count": 200}
     heights = ps.load_model("standard").info["preparation"]
-    ps.run_pipeline([str(source), *heights, {**writer, "classes": "2,6,11", "count": 200}])
+    ps.run_pipeline([str(source), *heights, writer])
     loaded = ps.load_model(model)
     assert loaded.codes.tolist() == [2, 5, 6, 11]
-    assert loaded.info["base"]["name"] == "standard" and len(loaded.info["base"]["sha256"]) == 64
-    assert (
-        f"on top of       standard, the passes before (SHA-256 {loaded.info['base']['sha256']})"
-        in str(loaded)
-    )
-    assert loaded.info["preparation"] == ps.load_model("standard").info["preparation"]
+    sha256 = loaded.info["base"]["sha256"]
+    assert f"on top of       standard, the passes before (SHA-256 {sha256})" in str(loaded)
+    assert loaded.info["preparation"] == heights
     classify = {"type": "filters.modelclassifier", "model": str(model)}
     ps.run_pipeline([str(source), *heights, classify, str(tmp_path / "out.las")])
     predicted = np.asarray(laspy.read(tmp_path / "out.las").classification)
